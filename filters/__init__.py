@@ -10,6 +10,7 @@ from filters.engine.belief import Belief, Innovation
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
+from filters.ensembles.rank_histogram import RankHistogramFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
@@ -65,6 +66,7 @@ __all__ = [
     "MultipleModelAdaptiveEstimator",
     "OpenLoop",
     "ParticleFilter",
+    "RankHistogramFilter",
     "RobustExtendedKalmanFilter",
     "SageHusaFilter",
     "SchmidtKalmanFilter",

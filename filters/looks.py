@@ -31,6 +31,7 @@ LOOKS: dict[str, tuple[str, Any]] = {
     "denkf": (MUSTARD, BOTH),
     "ienkf": (PLUM, BOTH),
     "enkf-n": (GREEN, TWO_DOTS),
+    "rhf": (RUST, TWO_DOTS),
     "pf": (GREEN, SOLID),
     "apf": (GREEN, DASHED),
     "gsf": (PLUM, DASHED),

@@ -11,6 +11,7 @@ from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
+from filters.ensembles.rank_histogram import RankHistogramFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
@@ -54,6 +55,7 @@ FILTERS: dict[str, type[Filter]] = {
         DeterministicEnsembleKalmanFilter,
         IteratedEnsembleKalmanFilter,
         FiniteSizeEnsembleFilter,
+        RankHistogramFilter,
         ParticleFilter,
         AuxiliaryParticleFilter,
         GaussianSumFilter,

@@ -51,6 +51,7 @@ WORDS = {
     "denkf": Words("good models, poor measurements", "N members", "30", "accurate sensors: P too wide"),
     "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong nonlinearity"),
     "enkf-n": Words("as `etkf`; N is small", "N members", "30", "a wrong model, taken for sampling error"),
+    "rhf": Words("states follow what is measured linearly", "N members", "60", "few members; many channels: slow"),
     "pf": Words("none on shape", "N weighted particles", "400", "few particles: one takes all the weight"),
     "apf": Words("none on shape", "N weighted particles", "600", "as `pf`, later"),
     "gsf": Words(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from filters.engine.belief import Kernels
 from filters.ensembles.inflation import inflated, relaxed
-from filters.filter import Filter
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
 from thruster_env.numerics.algebra.densities import log_density
@@ -51,12 +50,15 @@ def compare(model, x, z):
     return y - mean(y), C, v, S, R, log_density(v, S, seen)
 
 
-def check_page_is_all(filter_: Filter, where: str) -> None:
+def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
     """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
     if getattr(filter_, "rotations", 0):
         raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
-    if getattr(filter_, "by_parts", False):
-        raise ValueError(f"an ensemble {where} must have no radius, but got {filter_.radius:g}")  # type: ignore
+    if filter_.by_parts:
+        radius = getattr(filter_, "radius", 0.0)
+        given = f"{filter_.name!r}{f' with a radius of {radius:g}' if radius else ''}"
+        rule = f"an ensemble {where} must have a page for its whole update, as 'etkf' has"
+        raise ValueError(f"{rule}, but got {given}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +98,11 @@ class EnsembleFilter(FilterWithPage):
         object.__setattr__(self, "ensemble_size", size)
         object.__setattr__(self, "inflation", positive("inflation", self.inflation))
         object.__setattr__(self, "relaxation", relaxation)
+
+    @property
+    def by_parts(self) -> bool:
+        """Whether an update goes through states or channels, and is more than the page."""
+        return False
 
     @property
     def size(self) -> int:

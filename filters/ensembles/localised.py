@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from filters.engine.belief import Kernels
-from filters.ensembles.by_parts import kernels_by_parts
 from filters.ensembles.ensemble import EnsembleFilter
-from thruster_env.numerics.checks import positive, shown
+from thruster_env.numerics.checks import positive
 
 SUPPORT = (10.0 / 3.0) ** 0.5  # of a taper over its radius: half of what it reaches over
-LEAST = 1e-3  # tapers below are zero where each state has an analysis of its own
 
 
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
@@ -51,9 +48,11 @@ class LocalisedFilter(EnsembleFilter):
 
     @property
     def tapers(self) -> Mapping[str, Any]:
-        """Tapers between states and channels, (n, m), and between channels, (m, m)."""
-        states, measured, _ = self.model.positions
-        distances = self.model.positions.distances
+        """Tapers between states and channels, (n, m), and between channels, (m, m); none without a radius."""
+        positions = self.model.positions
+        if not self.radius or positions is None:
+            return {}
+        (states, measured, _), distances = positions, positions.distances
         return {
             "taper": gaspari_cohn(distances(states, measured), self.radius),
             "between": gaspari_cohn(distances(measured, measured), self.radius),
@@ -61,45 +60,5 @@ class LocalisedFilter(EnsembleFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Those of all ensembles, and tapers if there is a radius."""
-        return {**super().parameters, **(self.tapers if self.radius else {})}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LocalisedByParts(LocalisedFilter):
-    """Base of those whose update goes through states or channels, if there is a radius.
-
-    Such an update needs a diagonal R that is the same in all steps, and is neither in C nor on tensors.
-    """
-
-    serial: ClassVar[bool]  # whether it goes through channels
-
-    def __post_init__(self):
-        """Check the parameters and R; raise ValueError that states the rule and the value."""
-        super().__post_init__()
-        r = self.model.measurement_noise_cov
-        if self.radius and (r != np.diag(np.diag(r))).any():
-            raise ValueError(f"R must be diagonal where radius is not 0, but got {shown(r.tolist())}")
-
-    @property
-    def by_parts(self) -> bool:
-        """Whether the update is by parts."""
-        return bool(self.radius)
-
-    @property
-    def varying_noise(self) -> bool:  # type: ignore[override]
-        """Whether Q and R may differ from step to step."""
-        return not self.radius
-
-    @property
-    def tapers(self) -> Mapping[str, Any]:
-        """Tapers between states and channels, (n, m)."""
-        taper = super().tapers["taper"]
-        return {"taper": np.where(taper > LEAST, taper, 0.0)}
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        if not self.radius:
-            return super().kernels()
-        page, model = self.page_with(self.inflation != 1.0, relaxation=False), self.kernel_model
-        return kernels_by_parts(page, model.functions, model.shape, self.serial)
+        """Those of all ensembles, and tapers."""
+        return {**super().parameters, **self.tapers}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.ensembles.deterministic import DeterministicUpdateFilter
+from filters.ensembles.by_parts import LocalisedByParts, gaussian_moves
 from filters.ensembles.ensemble import advance, compare, settle
-from filters.ensembles.localised import LocalisedByParts
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.blocks import triangle_quotient
 from thruster_env.numerics.algebra.operations import divide
@@ -22,7 +22,7 @@ def update(model, x, z, e):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SerialSquareRootFilter(LocalisedByParts, DeterministicUpdateFilter):
+class SerialSquareRootFilter(LocalisedByParts):
     """Serial ensemble square root filter (EnSRF), without perturbed measurements.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -48,8 +48,7 @@ class SerialSquareRootFilter(LocalisedByParts, DeterministicUpdateFilter):
             others are those of `DeterministicUpdateFilter`.
 
     Raises:
-        ValueError: if a parameter is out of its range; for a radius also if the model has no positions, or R is
-            not diagonal.
+        ValueError: if a parameter is out of its range; for a radius also if the model has no positions.
 
     Source: Whitaker, Hamill (2002), "Ensemble data assimilation without perturbed observations", equations (10) to
     (13); Andrews (1968), "A square root formulation of the Kalman covariance equations"; with tapers: Karspeck,
@@ -58,4 +57,4 @@ class SerialSquareRootFilter(LocalisedByParts, DeterministicUpdateFilter):
 
     name: ClassVar[str] = "ensrf"
     page: ClassVar[Page] = Page(advance, settle, update)
-    serial: ClassVar[bool] = True
+    moves_of: ClassVar[Callable | None] = staticmethod(gaussian_moves)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.ensembles.by_parts import LocalisedByParts
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import advance, compare, settle
-from filters.ensembles.localised import LocalisedByParts
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.geometric import geometric_mean
 from thruster_env.numerics.algebra.operations import divide
@@ -63,12 +63,10 @@ class LocalEnsembleTransformFilter(LocalisedByParts, EnsembleTransformFilter):
             others are those of `DeterministicUpdateFilter`.
 
     Raises:
-        ValueError: if a parameter is out of its range; for a radius also if the model has no positions, or R is
-            not diagonal.
+        ValueError: if a parameter is out of its range; for a radius also if the model has no positions.
 
     Source: Hunt, Kostelich, Szunyogh (2007), "Efficient data assimilation for spatiotemporal chaos: a local
     ensemble transform Kalman filter".
     """
 
     name: ClassVar[str] = "letkf"
-    serial: ClassVar[bool] = False

@@ -38,8 +38,9 @@ def smooth_ensembles(
     if rotations:
         raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
     radius = getattr(filter_, "radius", 0.0)
-    if radius:
-        raise ValueError(f"a smoothed filter must have a radius of 0, but got {radius:g}")
+    if radius or filter_.by_parts:
+        rule = "a smoothed ensemble must have one gain for all states"
+        raise ValueError(f"{rule}, but got {filter_.name!r} with a radius of {radius:g}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = filter_.analysis(paired.model.functions, paired.model.shape)

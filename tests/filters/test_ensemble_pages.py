@@ -90,7 +90,8 @@ def assert_page_is_the_filter(filter_):
 
 
 def test_all_ensemble_filters_are_tried():
-    assert set(CHOICES) == {name for name, kind in FILTERS.items() if issubclass(kind, EnsembleFilter)}
+    ensembles = {name for name, kind in FILTERS.items() if issubclass(kind, EnsembleFilter)}
+    assert set(CHOICES) == ensembles - {"rhf"}  # whose page moves no member in an update
 
 
 @pytest.mark.usefixtures("as_python")

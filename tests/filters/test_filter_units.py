@@ -8,7 +8,21 @@ from tests.models import KEY, rescaled, simulated, small, wide_model
 from thruster_env.numerics.compiled import interpreted
 
 KEYS = np.array([KEY])
-UNIT_FREE = ["kf", "kf-steady", "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "ensrf", "denkf", "ienkf", "enkf-n"]
+UNIT_FREE = [
+    "kf",
+    "kf-steady",
+    "ekf",
+    "iekf",
+    "ukf",
+    "ckf",
+    "enkf",
+    "etkf",
+    "ensrf",
+    "denkf",
+    "ienkf",
+    "enkf-n",
+    "rhf",
+]
 UNIT_FREE += ["pf", "apf", "sage-husa", "vb", "ekf-robust", "open-loop"]
 
 

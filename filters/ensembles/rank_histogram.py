@@ -1,0 +1,126 @@
+"""The rank histogram filter: each channel has the density of its sorted members, and no Gaussian is assumed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from filters.ensembles.by_parts import LocalisedByParts, look
+from filters.ensembles.ensemble import advance, settle
+from filters.pages.page_filter import Page
+from thruster_env.numerics.compiled import inlined
+
+HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
+
+
+@inlined
+def below(z):
+    """The normal distribution at z."""
+    return 0.5 * math.erfc(-z / 2.0**0.5)
+
+
+@inlined
+def quantile(share):
+    """The z below which there is a share in (0, 1) of the normal distribution."""
+    low, high = -40.0, 40.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if below(middle) < share:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@inlined
+def tail_mass(edge, spread, tail, z):
+    """The posterior tail below an edge: its log mass but for the prior's scale, and its mean and deviation.
+
+    The prior is normal with the members' deviation, of which a part normal(tail) lies below the edge.
+    """
+    centre, total = edge - tail * spread, spread * spread + 1.0
+    mean, deviation = (centre + z * spread * spread) / total, spread / total**0.5
+    part = below((edge - mean) / deviation)
+    level = -0.5 * ((z - centre) ** 2 / total + math.log(total))
+    return (level + math.log(part) if part > 0.0 else -np.inf), mean, deviation
+
+
+@inlined
+def ranked_moves(y, v, tail, moves, size):
+    """How a channel's y (N,), of variance 1 in R, moves to a measurement v: to the quantiles of its posterior."""
+    order, squares = np.argsort(y), 0.0
+    for j in range(size):
+        squares += y[j] ** 2
+        moves[j] = 0.0
+    spread = (squares / (size - 1)) ** 0.5
+    if not 0.0 < spread < np.inf:
+        return
+    share = math.log(size + 1.0)  # of the prior's bins between members
+    masses = np.empty(size + 1)
+    masses[0], left, left_deviation = tail_mass(y[order[0]], spread, tail, v)
+    masses[size], right, right_deviation = tail_mass(-y[order[size - 1]], spread, tail, -v)
+    for i in range(1, size):
+        a, b = -0.5 * (y[order[i - 1]] - v) ** 2, -0.5 * (y[order[i]] - v) ** 2
+        most = max(a, b)
+        masses[i] = most + math.log(0.5 * (math.exp(a - most) + math.exp(b - most))) - share
+    most, total = masses.max(), 0.0
+    for i in range(size + 1):
+        masses[i] = math.exp(masses[i] - most)
+        total += masses[i]
+    bin_, before = 0, 0.0  # the bin in which a quantile lies, and the mass before it
+    for rank in range(size):
+        wanted = total * (rank + 1.0) / (size + 1.0)
+        while bin_ < size and before + masses[bin_] <= wanted:
+            before += masses[bin_]
+            bin_ += 1
+        part = wanted - before
+        if bin_ == 0:
+            z = quantile(part / masses[0] * below((y[order[0]] - left) / left_deviation))
+            new = left + left_deviation * z
+        elif bin_ == size:
+            rest = max(masses[size] - part, 0.0) / masses[size]
+            z = quantile(rest * below((-y[order[size - 1]] - right) / right_deviation))
+            new = -(right + right_deviation * z)
+        else:
+            low, high = y[order[bin_ - 1]], y[order[bin_]]
+            new = low + (high - low) * part / masses[bin_]
+        moves[order[rank]] = new - y[order[rank]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RankHistogramFilter(LocalisedByParts):
+    """Rank histogram filter (RHF): what a channel sees has any density, that of its members.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  channel by channel, with y_j = h(x_j): of the prior 1/(N + 1) lies between two neighbours, evenly,
+                 and below the least and above the largest y, as a part of a normal density with their deviation;
+                 times the likelihood, of which a bin has the mean of its ends, this is the posterior;
+                 the y of rank k moves to its quantile k/(N + 1), by d_j;  x_j += cov(x, y) d_j/var(y)
+
+    Two clouds of members stay two, where a Kalman gain moves all alike. The states follow what is measured by
+    linear regression. Channels with correlated noise are first made independent, by the lower triangular root of
+    R. The innovation, its covariance and the log-likelihood are Gaussian, as those of other ensembles. The update
+    is neither in C nor on tensors.
+
+    Attributes:
+        radius: of Gaspari and Cohn's taper on the regression, in the unit of the model's `Positions`; 0 for no
+            localisation. The others are those of `DeterministicUpdateFilter`.
+
+    Raises:
+        ValueError: if a parameter is out of its range; for a radius also if the model has no positions.
+
+    Source: Anderson (2010), "A non-Gaussian ensemble filter update for data assimilation".
+    """
+
+    name: ClassVar[str] = "rhf"
+    page: ClassVar[Page] = Page(advance, settle, look)
+    moves_of: ClassVar[Callable | None] = staticmethod(ranked_moves)
+
+    @property
+    def by_parts(self) -> bool:
+        """Always."""
+        return True
