@@ -67,7 +67,8 @@ def command(
         bool, typer.Option("--smoother", help="Also use later measurements.", rich_help_panel=FILTER)
     ] = False,
     lag: Annotated[
-        int | None, typer.Option(help="The number of later measurements; all by default.", rich_help_panel=FILTER)
+        int | None,
+        typer.Option(help="Smoother with that many later measurements; all by default.", rich_help_panel=FILTER),
     ] = None,
     skip: Annotated[
         int | None,

@@ -91,7 +91,7 @@ def estimate(
             or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.
-        lag: how many later measurements; all if None.
+        lag: how many later measurements, also without `smoother`; all if None.
         columns: headers by quantity, as `thruster_env.plants.logs.read.read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
@@ -128,8 +128,7 @@ def estimate_with(
         seed: likewise.
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
-    if lag is not None and not smoother:
-        raise ValueError(f"a lag must be that of a smoother, but got lag {lag} without one")
+    smoother = smoother or lag is not None
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
     if log.stamps is not None:
         if smoother:

@@ -11,7 +11,7 @@ its page of a smoother, a `Relation`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -95,18 +95,30 @@ def smooth_backwards(
         inputs: (B, K, p).
         lag: number of later measurements, 0 ... K.
     """
-    model, count = filter_.kernel_model, len(estimates.means)
-    angles, numbers = model.shape.state_angles, filter_.numbers
-    page = filter_.written_page
-    run_part = _smoother(relation, page, model.functions, model.shape, is_interpreting())
+    model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
     # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
     apart = np.abs(difference(estimates.means, model.prior_mean, angles))
     means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
     given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
-    means, covs = np.empty_like(estimates.means), np.empty_like(estimates.covs)
-    spread(lambda first, last: run_part(given, inputs, numbers, lag, means, covs, first, last), count)
-    return means, covs
+    return passes(filter_, relation)(given, inputs, lag)
+
+
+Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
+
+
+def passes(filter_: PageFilter, relation: Relation) -> Callable[[Given, np.ndarray, int], tuple]:
+    """Return the function of what a filter estimated, inputs and a lag that makes the smoother's passes."""
+    functions, shape, numbers = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers
+    run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
+
+    def smoothed(given: Given, inputs: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+        means, covs = np.empty_like(given[0]), np.empty_like(given[1])
+        work = partial(run_part, given, inputs, numbers, lag, means, covs)
+        work(0, 1) if len(means) == 1 else spread(work, len(means))
+        return means, covs
+
+    return smoothed
 
 
 @lru_cache(maxsize=64)

@@ -85,12 +85,12 @@ def smooth(
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
     if isinstance(filter_, EnsembleFilter):
         return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag))
-    relation = relation_of(filter_)
+    relation = relation_of(filter_, "a smoother", " or an ensemble Kalman filter")
     assert isinstance(filter_, PageFilter)
     return Smoothed(*smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag))
 
 
-def relation_of(filter_: Filter) -> Relation:
+def relation_of(filter_: Filter, what: str, others: str = "") -> Relation:
     """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
     kind = type(filter_)
     if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:
@@ -98,6 +98,4 @@ def relation_of(filter_: Filter) -> Relation:
     if kind in RELATIONS:
         return RELATIONS[kind]
     known = ", ".join(known.name for known in RELATIONS)
-    raise ValueError(
-        f"a smoother needs a filter of {known} or an ensemble Kalman filter, but got {filter_.name!r}"
-    )
+    raise ValueError(f"{what} needs a filter of {known}{others}, but got {filter_.name!r}")

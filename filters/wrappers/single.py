@@ -13,6 +13,7 @@ from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import (
     APPENDED,
     OBSERVATIONS,
@@ -51,7 +52,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
     replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed through a
     separate stream; the env's generator is never used. With a monitor it also gains `health`, whether all is `ok`
-    and the `alarms` of the step (`filters.monitoring.Health`).
+    and the `alarms` of the step (`filters.monitoring.Health`). With a smoothing lag it gains `smoothed` (n,) and
+    `smoothed_cov` (n, n): the state so many steps ago, given all measurements up to now; in the first steps the
+    state at the reset.
 
     Args:
         env: any env with Box actions and observations.
@@ -68,6 +71,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             returns, whose `filter` is then taken with its model.
         monitor: tests on the innovations, as a `filters.monitoring.Monitor`, a mapping of its attributes, its
             number of steps between false alarms, or True for its defaults; None for none.
+        smoothing_lag: number of steps of a fixed-lag smoother, of the filters kf, ekf, iekf, ukf and ckf; None for
+            none.
         model_arguments: mapping of arguments of the env's own model or of the factory: for a bow thruster
             `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
@@ -86,6 +91,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         tuned: Any = None,
         model_arguments: Mapping | None = None,
         monitor: Monitor | Mapping | float | None = None,
+        smoothing_lag: int | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
@@ -95,7 +101,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         filter, tuned = given_filter(filter, tuned)
         kept = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
         recorded = {"filter": kept, "observation": observation, "model": held, "tuned": tuned, **numbers}
-        recorded["model_arguments"] = model_arguments
+        recorded |= {"model_arguments": model_arguments, "smoothing_lag": smoothing_lag}
         watches = monitor_of(monitor)
         recorded["monitor"] = watches and watches.as_mapping()
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
@@ -109,7 +115,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
         length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-        session = self.filter.session()
+        session: Any = self.filter.session()
+        if smoothing_lag is not None:
+            session = WithSmoother(session, self.filter, smoothing_lag)
+        self._lagged = smoothing_lag is not None
         self._session = WithMeasuredInputs(session, split) if split.inputs else session
         self._channels, self._measurements = split.channels, list(split.measurements)
         self._watch = watch_of(watches, self.filter)
@@ -173,6 +182,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
+        if self._lagged:
+            info["smoothed"], info["smoothed_cov"] = session.smoothed()
         if self._watch is not None:
             seen = as_floats(z)[self._measurements]
             info["health"] = self._watch.step(info["innovation"], info["innovation_cov"], seen)

@@ -17,6 +17,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from thruster_env.numerics.checks import as_floats, one_of, shown
@@ -35,11 +36,12 @@ class EstimateStates(gym.vector.VectorWrapper):
 
     The info dictionary gains, with one row for each copy, `estimate` (N, n), `estimate_cov` (N, n, n),
     `innovation` (N, m), `innovation_cov` (N, m, m) and `estimate_divergences` (N,); with a monitor `health`, an
-    array of N objects.
+    array of N objects; with a smoothing lag `smoothed` (N, n) and `smoothed_cov` (N, n, n).
 
     Args:
         env: any vector env with Box actions and observations.
-        filter, observation, model, tuned, model_arguments, monitor, **numbers: those of `EstimateState`.
+        filter, observation, model, tuned, model_arguments, monitor, smoothing_lag, **numbers: those of
+            `EstimateState`.
 
     Raises:
         ValueError: if an argument is unknown or wrong, or spaces and model do not fit.
@@ -54,6 +56,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         tuned: Any = None,
         model_arguments: Mapping | None = None,
         monitor: Monitor | Mapping | float | None = None,
+        smoothing_lag: int | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
@@ -74,7 +77,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         kind = EstimatorBeliefs if isinstance(self.filter, ForeignFilter) else Beliefs
-        beliefs = kind(self.filter, self.num_envs)
+        beliefs: Any = kind(self.filter, self.num_envs)
+        if smoothing_lag is not None:
+            beliefs = WithSmoother(beliefs, self.filter, smoothing_lag, self.num_envs)
+        self._lagged = smoothing_lag is not None
         self._beliefs = WithMeasuredInputs(beliefs, split) if inputs else beliefs
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
@@ -169,6 +175,8 @@ class EstimateStates(gym.vector.VectorWrapper):
             "innovation_cov": beliefs.part("innovation_cov", m, m),
             "estimate_divergences": beliefs.part("divergences").astype(np.int64),
         }
+        if self._lagged:
+            added["smoothed"], added["smoothed_cov"] = beliefs.smoothed()
         if self._watches:
             added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there)
         info |= added

@@ -62,7 +62,7 @@ def estimate(
         dt: sample time [s], of a log without times, or to put it on.
         grid: whether the log is put on a grid; else it is filtered on its own stamps, by the clock.
         smoother: correct estimates by later measurements.
-        lag: how many later ones; all by default.
+        lag: how many later ones, also without `smoother`; all by default.
         skip: first rows that do not count in the findings; 50, or a quarter of a short log, by default.
         seed: of the filter's random numbers.
         **numbers: the filter's own, such as `ensemble_size`.
