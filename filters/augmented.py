@@ -101,6 +101,8 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         constants=(*map(float, model.constants), *map(float, spread)),
         substeps=model.substeps,
         operating_input=model.operating_input,
+        bounds=model.bounds,
+        bounded_by=model.bounded_by,
         states=(*model.states, *further_states),
         input_quantities=model.input_quantities,
         measurements=model.measurements,

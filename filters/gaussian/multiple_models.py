@@ -75,7 +75,8 @@ class MultipleModelFilter(Filter):
         if not isinstance(names, Sequence) or len(names) != len(models):
             rule = f"mode_filter must be one name, or one for each of {len(models)} modes"
             raise ValueError(f"{rule}, but got {shown(names)}")
-        found = tuple(make_filter(name, model) for name, model in zip(names, models, strict=True))
+        free = (model.replace(bounds=()) if model.bounds else model for model in models)
+        found = tuple(make_filter(name, model) for name, model in zip(names, free, strict=True))
         for one in found:
             if not one.gaussian_likelihood or one.size or not one.has_covariance:
                 rule = "mode_filter must be a filter of one mean and covariance"

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.engine.belief import Kernels
+from filters.engine.bounded import bounded_kernels
 from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
@@ -58,11 +59,15 @@ class PageFilter(FilterWithPage):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        return page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        plain = page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        bounds, bounded_by = self.model.bounds, self.model.bounded_by
+        return bounded_kernels(plain, bounds, bounded_by) if bounds else plain
 
 
 def with_page(filter_: Filter, what: str) -> FilterWithPage:
-    """A filter that has a page; of another one raise ValueError, which says what it was to be."""
+    """A filter that has a page; of another one, and of a model with bounds, raise ValueError."""
     if not isinstance(filter_, FilterWithPage):
         raise ValueError(f"{what} must have a page, as 'ekf' and 'enkf' have, but got {filter_.name!r}")
+    if filter_.model.bounds:
+        raise ValueError(f"{what} must have a model without bounds, but got {filter_.model.bounds}")
     return filter_

@@ -93,6 +93,8 @@ def smooth(
 def relation_of(filter_: Filter, what: str, others: str = "") -> Relation:
     """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
     kind = type(filter_)
+    if filter_.model.bounds:
+        raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")
     if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:
         return SCHEDULED
     if kind in RELATIONS:

@@ -1,4 +1,4 @@
-"""Smoothing some steps behind a filter in closed loop: an augmented state, RTS, theory, FilterPy, single and vector."""
+"""Smoothing some steps behind a filter in closed loop, against theory, an augmented state, RTS and FilterPy."""
 
 import pickle
 

@@ -174,4 +174,6 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         prior_mean=model.prior_mean,
         prior_cov=model.prior_cov,
         **model.quantities._asdict(),
-    ).replace(state_low=model.state_low, state_high=model.state_high)
+    ).replace(
+        state_low=model.state_low, state_high=model.state_high, bounds=model.bounds, bounded_by=model.bounded_by
+    )

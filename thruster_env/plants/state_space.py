@@ -21,6 +21,7 @@ from thruster_env.plants.model_digest import digest_of
 from thruster_env.plants.positions import Positions
 from thruster_env.plants.quantities import Quantities, count_of, outputs, quantities
 from thruster_env.plants.shape import Functions, Shape, constants_are_array, constants_form
+from thruster_env.plants.state_bounds import checked_bounds
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
 
@@ -66,6 +67,10 @@ class StateSpaceModel:
             input, in increasing order of u*, for gain scheduling of a Kalman filter; None if unknown.
         state_low: smallest value of each state in normal operation, (n,); None if unknown.
         state_high: largest value of each state, (n,); None if unknown.
+        bounds: (low, high) of states by symbol or index, None for no bound: {"c": (0.0, None)}. Estimates of the
+            Kalman filters of one mean and covariance keep them; the belief beneath knows of none.
+        bounded_by: how: "truncation", the moments of the Gaussian within the bounds, or "projection", the most
+            probable state within (`filters.engine.bounded`).
         states: a `Quantity` or a name for each state; x_1, x_2, ... if None.
         input_quantities: the same for the inputs; u_1, ... if None.
         measurements: the same for the measurements; z_1, ... if None.
@@ -94,6 +99,8 @@ class StateSpaceModel:
     operating_points: Callable | None = None
     state_low: Any = None
     state_high: Any = None
+    bounds: Any = ()
+    bounded_by: str = "truncation"
     states: Any = None
     input_quantities: Any = None
     measurements: Any = None
@@ -130,6 +137,8 @@ class StateSpaceModel:
         checked["outputs"] = outputs(self.outputs)
         if self.positions is not None:
             checked["positions"] = Positions(*self.positions).checked(n, m)
+        checked["bounds"] = checked_bounds(self.bounds, checked["states"])
+        one_of("bounded_by", self.bounded_by, ("truncation", "projection"))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         check_functions(self)

@@ -1,0 +1,138 @@
+"""Estimates that keep bounds on the states, by truncated moments or by projection, of any filter of one Gaussian.
+
+The filter itself goes on with the belief x, P that knows of no bounds; what it tells is constrained:
+
+- truncation: the moments of the normal distribution within the bounds. Where state i, with s^2 = P_ii, has the
+  mean mu and the variance v in units of s: x += P_i mu/s, P += P_i P_i' (v - 1)/s^2. Of several bounded states
+  this is repeated until it settles, each seen without its own bound and with all others (expectation propagation).
+- projection: the x within the bounds whose (x - x_f)' P^-1 (x - x_f) is smallest, x_f the filter's; P stays.
+
+To go on with a constrained belief would count a bound anew in each step: a constant would drift away from it.
+
+Source: Simon, Simon (2010), "Constrained Kalman filtering via density function truncation for turbofan engine
+health estimation"; Simon (2010), "Kalman filtering with state constraints: a survey"; for several states
+Cunningham, Hennig, Lacoste-Julien (2011), "Gaussian probabilities and expectation propagation"; for the quadratic
+programme Hildreth (1957), "A quadratic programming procedure".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.truncated import truncated_normal
+from thruster_env.plants.state_bounds import Bound
+
+TRUNCATION, PROJECTION = "truncation", "projection"
+ROUNDS = 10_000  # at most, over all bounds
+ENOUGH, SETTLED = 1e-14, 1e-10  # last moves of projection and of truncation, in standard deviations
+LEAST = 1e-12  # of a variance that a bound leaves
+
+
+@lru_cache(maxsize=64)
+def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str) -> Kernels:
+    """Kernels of the same filter whose mean and covariance keep bounds; its own lie behind its other memory."""
+    n, places = kernels.n, memory_places(kernels.n, kernels.m)
+    mean, free = places.mean, places.extras + kernels.extras + kernels.scratch
+    size = n + n * n  # mean and covariance are neighbours
+    plain_start, plain_predict, plain_update = kernels.start, kernels.predict, kernels.update
+    constrain = (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, places.cov, bounds)
+
+    @inlined
+    def tell(row):
+        for i in range(size):
+            row[free + i] = row[mean + i]
+        constrain(row)
+
+    @inlined
+    def recall(row):
+        for i in range(size):
+            row[mean + i] = row[free + i]
+
+    @inlined
+    def start(memory, numbers, size):
+        plain_start(memory, numbers, size)
+        tell(memory[0])
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        recall(memory[0])
+        plain_predict(memory, u, numbers, size)
+        tell(memory[0])
+
+    @inlined
+    def update(memory, z, numbers, size):
+        recall(memory[0])
+        plain_update(memory, z, numbers, size)
+        tell(memory[0])
+
+    kept = kernels.extras + kernels.scratch + size
+    return kernels._replace(start=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
+
+
+def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
+    states = tuple(one.place for one in bounds)
+    low, high = tuple(one.low for one in bounds), tuple(one.high for one in bounds)
+
+    @inlined
+    def constrain(row):
+        # A state's bounds are a Gaussian factor: a precision and an information. Without it there is the cavity.
+        column, precisions, informations = np.zeros(n), np.zeros(len(states)), np.zeros(len(states))
+        for _ in range(ROUNDS if len(states) > 1 else 1):
+            largest = 0.0
+            for b in range(len(states)):
+                i = states[b]
+                x, p = row[mean + i], row[cov + i * n + i]
+                precision = 1.0 / p - precisions[b] if p > 0.0 else 0.0
+                if precision > 0.0:
+                    s, cavity = precision**-0.5, (x / p - informations[b]) / precision
+                    moved, variance = truncated_normal((low[b] - cavity) / s, (high[b] - cavity) / s)
+                    new_x, new_p = cavity + s * moved, max(s * s * variance, LEAST * p)
+                    for j in range(n):
+                        column[j] = row[cov + j * n + i] / p
+                    for j in range(n):
+                        row[mean + j] += column[j] * (new_x - x)
+                        for k in range(n):
+                            row[cov + j * n + k] += column[j] * column[k] * (new_p - p)
+                    row[mean + i], row[cov + i * n + i] = min(max(new_x, low[b]), high[b]), new_p
+                    precisions[b], informations[b] = 1.0 / new_p - precision, new_x / new_p - cavity * precision
+                    largest = max(largest, abs(new_x - x) / p**0.5, abs(new_p / p - 1.0))
+            if not largest > SETTLED:
+                break
+        for b in range(len(states)):
+            row[mean + states[b]] = min(max(row[mean + states[b]], low[b]), high[b])
+
+    return constrain
+
+
+def _projection(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
+    states = tuple(one.place for one in bounds)
+    low, high = tuple(one.low for one in bounds), tuple(one.high for one in bounds)
+
+    @inlined
+    def constrain(row):
+        forces = np.zeros(len(states))  # x = x_f + P (the forces at the bounds), each zero or at its bound
+        for _ in range(ROUNDS):
+            largest = 0.0
+            for b in range(len(states)):
+                i = states[b]
+                p = row[cov + i * n + i]
+                if p > 0.0:
+                    without = row[mean + i] - p * forces[b]
+                    force = (min(max(without, low[b]), high[b]) - without) / p
+                    change = force - forces[b]
+                    for j in range(n):
+                        row[mean + j] += row[cov + j * n + i] * change
+                    forces[b] = force
+                    largest = max(largest, abs(change) * np.sqrt(p))
+            if not largest > ENOUGH:
+                break
+        for b in range(len(states)):
+            row[mean + states[b]] = min(max(row[mean + states[b]], low[b]), high[b])
+
+    return constrain
