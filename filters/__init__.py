@@ -31,6 +31,7 @@ from filters.particles.particle import ParticleFilter
 from filters.registry import FILTERS, make_filter
 from filters.smoothers.smooth import Smoothed, smooth
 from filters.tensors import torch
+from filters.transformed import transformed_model
 from filters.wrappers.ids import register_filtered_envs
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
@@ -84,6 +85,7 @@ __all__ = [
     "run",
     "smooth",
     "torch",
+    "transformed_model",
 ]
 
 may_be_inlined(__name__, "thruster_env.plants")

@@ -14,7 +14,20 @@ from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.truncated import truncated_normal
 
 INF = np.inf
-PAGES = ("kf", "kf-steady", "ekf", "iekf", "ukf", "ckf", "fading", "h-infinity", "schmidt", "sage-husa", "vb")
+PAGES = (
+    "kf",
+    "kf-steady",
+    "ekf",
+    "iekf",
+    "ukf",
+    "ckf",
+    "fading",
+    "h-infinity",
+    "schmidt",
+    "ekf-robust",
+    "sage-husa",
+    "vb",
+)
 BY_NAME = {"x_1": (0.0, None), "x_3": (-0.2, 0.4)}
 
 
