@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.gaussian.square_root import SQUARE_ROOT
-from filters.pages.page import Page
 from thruster_env.numerics.checks import as_floats
 from thruster_env.plants.affine import AffineModel
 from thruster_env.plants.simulate import simulate
@@ -68,12 +63,5 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
     expected = np.einsum("bkii->bki", found.innovation_covs) / np.diag(model.measurement_noise_cov)
     if (expected < STIFF).all() and not found.divergences.any():
         return found.covs
-    found = run(_SquareRootFilter(model=model), keys, inputs, measured)
+    found = run(ExtendedKalmanFilter(model=model, form="square-root"), keys, inputs, measured)
     return np.where((found.divergences > 0)[:, None, None, None], np.nan, found.covs)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SquareRootFilter(ExtendedKalmanFilter):
-    """The extended Kalman filter with roots of covariances."""
-
-    page: ClassVar[Page] = SQUARE_ROOT

@@ -63,6 +63,6 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
         raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
     if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:
         raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
-    form = {"form": "covariance"} if isinstance(filter_, KalmanFilter) else {}  # of the same estimates
+    form = {"form": "covariance"} if filter_.forms else {}  # of the same estimates
     used = replace(filter_, model=model, **form)
     return Differentiable(used.kernel_model, used.written_page, used.own_numbers)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.gaussian.square_root import SQUARE_ROOT
+from filters.gaussian.ud import UD
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.checks import one_of
 
 
 def advance(model, x, P, u):
@@ -39,8 +43,21 @@ class ExtendedKalmanFilter(PageFilter):
         update:  v = z - h(x),  S = H P H' + R,  K = P H' S^-1,  H = dh/dx at the mean,
                  x += K v,  P = (I - K H) P (I - K H)' + K R K'  (Joseph)
 
+    Attributes:
+        form: form of the recursion: "covariance" as above, "square-root" (`gaussian.square_root`) or "ud"
+            (`gaussian.ud`), which keep twice the digits of P. The estimates are equal to rounding.
+
+    Raises:
+        ValueError: if the form is unknown.
+
     Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, section 8.3.
     """
 
     name: ClassVar[str] = "ekf"
     page: ClassVar[Page] = Page(advance, settle, update)
+    forms: ClassVar[Mapping[str, Page]] = {"square-root": SQUARE_ROOT, "ud": UD}
+    form: str = "covariance"
+
+    def __post_init__(self):
+        """Check the form; raise ValueError that states the rule and the value."""
+        one_of("form", self.form, self.known_forms)

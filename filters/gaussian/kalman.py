@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -11,13 +12,11 @@ import numpy as np
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.information import INFORMATION
 from filters.gaussian.schedule import SCHEDULED
-from filters.gaussian.square_root import SQUARE_ROOT
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.checks import at_least, covariance, one_of
 from thruster_env.plants.affine import AffineModel, linearize
 
 MOST_POINTS = 200  # of a schedule; programs are written out for them
-FORMS = {"covariance": ExtendedKalmanFilter.page, "information": INFORMATION, "square-root": SQUARE_ROOT}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,8 +54,8 @@ class KalmanFilter(AffineFilter):
     `operating_points` and constant beyond them; at the first measurement they are those of u = 0.
 
     Attributes:
-        form: form of the recursion: "covariance" as above, "information" (`gaussian.information`) or "square-root"
-            (`gaussian.square_root`). The estimates are equal to rounding.
+        form: form of the recursion: "covariance" as above, "information" (`gaussian.information`), "square-root"
+            (`gaussian.square_root`) or "ud" (`gaussian.ud`). The estimates are equal to rounding.
         schedule: number of operating points, spread over the range of the input; 1 for the model's own point.
 
     Raises:
@@ -69,13 +68,14 @@ class KalmanFilter(AffineFilter):
 
     name: ClassVar[str] = "kf"
     page: ClassVar[Page] = ExtendedKalmanFilter.page
+    forms: ClassVar[Mapping[str, Page]] = {**ExtendedKalmanFilter.forms, "information": INFORMATION}
     form: str = "covariance"
     schedule: int = 1
 
     def __post_init__(self):
         """Check the model, the form and the schedule."""
         super().__post_init__()
-        one_of("form", self.form, tuple(FORMS))
+        one_of("form", self.form, self.known_forms)
         object.__setattr__(self, "schedule", at_least("schedule", self.schedule, 1, MOST_POINTS))
         if self.form == "information":
             covariance("prior_cov", self.model.prior_cov, self.model.n, positive_definite=True)
@@ -103,5 +103,5 @@ class KalmanFilter(AffineFilter):
     @property
     def written_page(self) -> Page:
         """The page of the form, or of a schedule."""
-        form = SCHEDULED if self.schedule > 1 else FORMS[self.form]
-        return form._replace(own=super().written_page.own)
+        page = super().written_page
+        return SCHEDULED._replace(own=page.own) if self.schedule > 1 else page

@@ -49,6 +49,12 @@ def update(model, x, P, z):
     H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - model.h(x), model.measurement_angles))
     both = triangle(above(beside(root(R), H @ L), beside(zeros(L, n, m), L)))
+    return updated(model, x, both, v, seen)
+
+
+def updated(model, x, both, v, seen):
+    """What an update returns, of the triangle [[S^(1/2), 0], [K S^(1/2), L]]."""
+    n, m = len(x), len(v)
     of_s, of_gain, L = part(both, 0, 0, m, m), part(both, m, 0, n, m), part(both, m, m, n, n)
     x = wrap(x + of_gain @ forward_quotient(of_s, v), model.state_angles)
     return x, square(L), v, square(of_s), density(v, factor_of(of_s), seen), {"L": L}

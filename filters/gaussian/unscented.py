@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.gaussian.square_root import start, updated
 from filters.pages.page_filter import Page, PageFilter
+from thruster_env.numerics.algebra.blocks import above, beside, part, triangle, zeros
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import first, ones, others, outer, root, square, units
-from thruster_env.numerics.checks import finite, positive
+from thruster_env.numerics.checks import finite, one_of, positive
 
 
 def begin(model, x, P):
@@ -47,7 +50,8 @@ def settle(model, X):
 
 def update(model, x, P, z):
     """The measurement z; channels that are NaN are missing."""
-    (g, w, _), L, U, seen = model.own, root(P), others(units(x)), present(z)
+    g, w = model.own.spread, model.own.weight
+    L, U, seen = root(P), others(units(x)), present(z)
     y, s, D = moments(model, model.h(points(model, x, L)), model.measurement_angles)
     s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - y, model.measurement_angles))
@@ -56,6 +60,37 @@ def update(model, x, P, z):
     K = divide(C, S)
     rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
     return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+
+
+# The square-root form: P, S and the gain follow from one triangle, as `square_root` has it
+
+
+def begin_by_root(model, x, P):
+    """The points of a belief, by the root that is kept."""
+    return points(model, x, model.kept["L"])
+
+
+def deviations(model, D, s):
+    """A matrix A with A A' = scatter(D, s)."""
+    return beside(D * model.own.weight_root, outer(s * model.own.shift_root, ones(part(D, 0, 0, len(s), 1))))
+
+
+def settle_root(model, X):
+    """The end of a step."""
+    x, s, D = moments(model, X, model.state_angles)
+    L = triangle(beside(deviations(model, D, s), model.Q_root))
+    return wrap(x, model.state_angles), square(L), {"L": L}
+
+
+def update_root(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    n, m, seen, L = len(x), len(z), present(z), model.kept["L"]
+    y, s, D = moments(model, model.h(points(model, x, L)), model.measurement_angles)
+    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - y, model.measurement_angles))
+    of_x = (L * model.own.spread) @ others(units(x)) * model.own.weight_root
+    both = above(beside(deviations(model, D, s), root(R)), beside(of_x, zeros(L, n, m + 1)))
+    return updated(model, x, triangle(both), v, seen)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,19 +116,27 @@ class UnscentedKalmanFilter(PageFilter):
             nonlinearity of f and h shows. With the common 0.001 the filter is hardly more than an extended one.
         beta: prior knowledge of the distribution beyond its moments; 2 is best for Gaussian ones.
         kappa: moves the points further out and gives the centre a larger weight; above -n.
+        form: "covariance" as above, or "square-root", which carries L and keeps twice the digits of P; beta must
+            then be at least alpha^2. The estimates are equal to rounding.
 
     Raises:
-        ValueError: if alpha or n + kappa is not positive, or alpha^2 kappa + beta n is negative.
+        ValueError: if alpha or n + kappa is not positive, alpha^2 kappa + beta n is negative, or the
+            form is unknown or does not go with beta.
 
     Source: Julier (2002), "The scaled unscented transformation"; Wan, van der Merwe (2000), "The unscented Kalman
-    filter for nonlinear estimation".
+    filter for nonlinear estimation"; for the square-root form van der Merwe, Wan (2001), "The square-root
+    unscented Kalman filter for state and parameter-estimation".
     """
 
     name: ClassVar[str] = "ukf"
     page: ClassVar[Page] = Page(advance, settle, update, begin)
+    forms: ClassVar[Mapping[str, Page]] = {
+        "square-root": Page(advance, settle_root, update_root, begin_by_root, start)
+    }
     alpha: float = 1.0
     beta: float = 2.0
     kappa: float = 0.0
+    form: str = "covariance"
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
@@ -106,6 +149,10 @@ class UnscentedKalmanFilter(PageFilter):
                 "alpha^2 kappa + beta n must not be negative, or covariances could be, "
                 f"but got alpha={alpha}, beta={beta}, kappa={kappa} for n = {n} states"
             )
+        if one_of("form", self.form, self.known_forms) == "square-root" and beta < alpha**2:
+            raise ValueError(
+                f"beta of the square-root form must be at least alpha^2, {alpha**2:g}, but got {beta}"
+            )
         for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
             object.__setattr__(self, name, value)
 
@@ -113,4 +160,8 @@ class UnscentedKalmanFilter(PageFilter):
     def parameters(self) -> dict[str, float]:
         """Where the points lie, and their weights."""
         square = self.alpha**2 * (self.model.n + self.kappa)
-        return {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": self.beta - self.alpha**2}
+        found = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": self.beta - self.alpha**2}
+        roots = {
+            f"{name}_root": found[f"{name}{rest}"] ** 0.5 for name, rest in (("weight", ""), ("shift", "_weight"))
+        }
+        return found if self.form == "covariance" else found | roots

@@ -39,7 +39,7 @@ class FilterWithPage(Filter):
         return {name: getattr(self, name) for name in self._fields() if name not in self.unrolled}
 
     def _fields(self) -> Iterator[str]:
-        return (field.name for field in dataclasses.fields(self) if field.name != "model")
+        return (field.name for field in dataclasses.fields(self) if field.name not in ("model", "form"))
 
     @cached_property
     def own_numbers(self) -> tuple[float, ...]:
@@ -55,7 +55,25 @@ class FilterWithPage(Filter):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PageFilter(FilterWithPage):
-    """Base of filters that have a page of mean and covariance; see `FilterWithPage`."""
+    """Base of filters that have a page of mean and covariance; see `FilterWithPage`.
+
+    Attributes:
+        forms: pages of the same estimates in other arithmetic, by what the field `form` is for them.
+    """
+
+    forms: ClassVar[Mapping[str, Page]] = {}
+
+    @property
+    def written_page(self) -> Page:
+        """The page of the form, with the shapes of the parameters."""
+        page = super().written_page
+        form = self.forms.get(getattr(self, "form", ""))
+        return page if form is None else form._replace(own=page.own, fixed=page.fixed)
+
+    @property
+    def known_forms(self) -> tuple[str, ...]:
+        """What the field `form` may be."""
+        return "covariance", *self.forms
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""

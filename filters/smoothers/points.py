@@ -20,7 +20,7 @@ from thruster_env.numerics.algebra.points import others, root, square, units
 
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
-    (g, w, _), L, U = model.own, root(P), others(units(x))
+    g, w, L, U = model.own.spread, model.own.weight, root(P), others(units(x))
     mean, s, D = unscented.moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(unscented.scatter(model, D, s) + model.Q))

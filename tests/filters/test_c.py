@@ -34,10 +34,14 @@ OWN = {
     "kf": {},
     "kf information": {"form": "information"},
     "kf square-root": {"form": "square-root"},
+    "kf ud": {"form": "ud"},
     "kf-steady": {},
     "ekf": {},
+    "ekf square-root": {"form": "square-root"},
+    "ekf ud": {"form": "ud"},
     "iekf": {"iterations": 3},
     "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0},
+    "ukf square-root": {"form": "square-root"},
     "ckf": {},
     "fading": {"fading": 1.1},
     "h-infinity": {"theta": 0.002},
@@ -56,7 +60,13 @@ ENSEMBLES = {
     "ienkf": {"iterations": 2},
     "enkf-n": {"certainty": 1.5, "inflation": 1.02},
 }
-KEPT = {"kf square-root": ["L"], "ekf-robust": ["weight"], "sage-husa": ["R", "Q", "predicted"], "vb": ["V", "nu"]}
+KEPT = {
+    "kf square-root": ["L"],
+    "ekf ud": ["UD"],
+    "ekf-robust": ["weight"],
+    "sage-husa": ["R", "Q", "predicted"],
+    "vb": ["V", "nu"],
+}
 MODELS = {
     "thruster": lambda: thruster_model(operating_voltage=3.0),
     "pendulum": lambda: wide_pendulum().replace(operating_state=[0.3, 0.0], operating_input=[0.5]),

@@ -41,6 +41,8 @@ MODELS = {
 FORMS = {
     "kf, information": ("kf", {"form": "information"}),
     "kf, square-root": ("kf", {"form": "square-root"}),
+    "ekf, square-root": ("ekf", {"form": "square-root"}),
+    "ukf, square-root": ("ukf", {"form": "square-root"}),
     "kf, scheduled": ("kf", {"schedule": 5}),
     "fuzzy, by moments": ("fuzzy", {"blending": "moments"}),
     "enkf, inflated": ("enkf", {"inflation": 1.1, "relaxation": 0.3}),

@@ -8,7 +8,6 @@ import pytest
 
 from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
 from filters.differentiated.differentiable import KINDS, differentiable
-from filters.gaussian.kalman import FORMS
 from filters.likelihood import information, likelihood
 from filters.pages.page_filter import PageFilter
 from filters.sensitivity import ModelSlopes, sensitivity
@@ -148,7 +147,7 @@ class Formed(ExtendedKalmanFilter):
 
     @property
     def written_page(self):
-        return FORMS[self.form]
+        return self.forms.get(self.form, self.page)
 
 
 def test_all_filters_with_pages_are_tried():

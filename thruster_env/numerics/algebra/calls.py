@@ -147,6 +147,8 @@ def _function(operation: Operation, result: tuple, by_transpose: bool, others: t
     """The same for all operations alike: compiled code then has it once."""
     if operation is matrices.multiply:
         return _product(by_transpose, *shapes)
+    if operation not in _FUNCTIONS:
+        raise ValueError(f"{operation.name} is for models that are small and can be traced, but this one is not")
     return _FUNCTIONS[operation](result, *others, *shapes)
 
 
