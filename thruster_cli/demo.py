@@ -171,8 +171,9 @@ def files(tuned: Path, best: Tuning | None, pictures: dict[Path, str], report: R
         **pictures,
         report.page: "the report: open it in a browser",
         tuned: "the tuned filter: EstimateState(env, tuned=FILE)",
-        **({} if best is None else {best.file: "the one of the best type"}),
     }
+    if best is not None and best.file is not None:
+        about[best.file] = "the one of the best type"
     width = max(len(str(path)) for path in about)
     return [f"{path!s:{width}}  {what}" for path, what in about.items()]
 

@@ -235,7 +235,7 @@ class AugmentedProblem(Problem):
     leads_in = property(lambda self: self.problem.leads_in)
     dt = property(lambda self: self.problem.dt)
     plant_data = property(lambda self: self.problem.plant_data)
-    seed_word = property(lambda self: self.problem.seed_word)  # type: ignore[assignment]
+    seed_word = property(lambda self: self.problem.seed_word)
 
 
 def _suffix(one: tuple[str, Unknown | None]) -> str:
