@@ -34,7 +34,8 @@ STEPS = (
     Step("Could the state be in two places at once?", ("pf", "gsf"), "a mean and P cannot say that"),
     Step("Is it strongly curved within its uncertainty?", ("iekf", "ukf", "gsf"), "one tangent is not enough"),
     Step("Does the noise of the sensor change?", ("vb", "sage-husa"), "they estimate R as they run"),
-    Step("Are there dozens of states, or no Jacobian?", ("etkf", "enkf"), "cost grows with members"),
+    Step("More states than you can afford members?", ("letkf",), "localised by distance"),
+    Step("Are there dozens of states, or no Jacobian?", ("etkf", "enkf-n"), "enkf-n needs no inflation"),
     Step("Is the model wrong in an unknown way?", ("fading", "h-infinity"), "they trust it less; or tune Q"),
 )
 OTHERWISE = Step("Otherwise", ("ekf",), "the least cost, gradients, C code")
