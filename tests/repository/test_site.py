@@ -101,7 +101,7 @@ def test_examples_of_the_command_line_page_can_be_copied():
     )
     assert "* `--json FILE`: " in text and "* `--seed INTEGER`: " in text
     assert re.search(
-        r"^\* `verify`: Compute the held-out metrics .*, and say whether they hold\.$", text, re.MULTILINE
+        r"^\* `verify`: Recompute the held-out metrics .*, and say whether they hold\.$", text, re.MULTILINE
     )
     assert not re.search(r"^\* `\w+`: .*\.\.\.$", text, re.MULTILINE)  # no summary is cut
     assert not re.search(r"^\* `[^`]*<", text, re.MULTILINE) and "[default: (" not in text
