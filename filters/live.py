@@ -177,7 +177,7 @@ class Live:
         session = self._session
         if len(u) != self._inputs:
             raise ValueError(
-                f"predict_to(time, u) must tell the input before a sample of {time:.9g} s, a later time"
+                f"predict_to(time, u) must give the input before a sample at {time:.9g} s, a later time"
             )
         self._remember(time, u)
         count = max(1, math.ceil((time - self.time) / self._step - 1e-6))
@@ -208,7 +208,7 @@ class Live:
         near = ROUNDING * self._step
         place = next((i for i, one in enumerate(self._events) if one.end > time + near), None)
         if place is None or self._events[place].begin > time + near:
-            raise ValueError(f"a sample must not be from before the start, but got one of {time:.9g} s")
+            raise ValueError(f"a sample must not be earlier than the start, but got one at {time:.9g} s")
         again, self._events = self._events[place:], self._events[:place]
         first = again[0]
         self._session.load(first.before)

@@ -80,7 +80,7 @@ def sensitivity(
     check_shapes(given, model, (p, len(model.constants)), (p, n, n), (p, m, m), (p, n), (p, n, n))
     seen = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
     if seen.shape != (m,):
-        raise ValueError(f"predicted must say of each of {m} channels whether it is, but got {predicted!r}")
+        raise ValueError(f"predicted must be true or false for each of {m} channels, but got {predicted!r}")
     wanted = Wanted(information=True, constants=True, tails=True)
     density = Density(float(degrees), seen)
     out, information = derivatives(

@@ -90,8 +90,8 @@ def cov_of_measured_starts(model: StateSpaceModel, first: np.ndarray) -> np.ndar
     a = h * scales / deviations[:, None]
     if not (np.isfinite(a).all() and a.any()):
         raise ValueError(
-            "a start from the first measurement must be of a model whose measurement sees a state at the prior "
-            f"mean, but there dh/dx is {h.tolist()}"
+            "a start from the first measurement needs a measurement that depends on a state at the prior mean, "
+            f"but dh/dx there is {h.tolist()}"
         )
     inverse = np.linalg.pinv(a, rcond=FAINT)
     off = difference(first, np.array(model.functions.observe(x, c)), shape.measurement_angles) / deviations

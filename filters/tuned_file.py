@@ -61,8 +61,8 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
     _check_version(path, content.get("version"))
     if content.get("hash") != sealed(content)["hash"]:
         raise ValueError(
-            "a tuned file must be as it was written, with the hash of its content, "
-            f"but {path} was edited: its hash is {shown(content.get('hash'))}"
+            f"a tuned file must be unchanged, with the hash of its content, but {path} was edited: its hash is "
+            f"{shown(content.get('hash'))}"
         )
     try:
         content = _of_this_version(content)

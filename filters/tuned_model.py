@@ -39,7 +39,7 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         differing.append(f"dt {then:g} (here {dt:g})")
     if differing:
         raise ValueError(
-            f"a tuned file must be for the model it is put on, but {file} was tuned for {', '.join(differing)}"
+            f"a tuned file must be for the model it is used with, but {file} was tuned for {', '.join(differing)}"
         )
 
 
@@ -51,7 +51,7 @@ def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | Non
     check_same_quantities(tuned_for, model, dt, file)
     if model.digest != tuned_for["digest"]:
         raise ValueError(
-            f"a tuned file must be for the model it is put on, but {file} was tuned for a model of digest "
+            f"a tuned file must be for the model it is used with, but {file} was tuned for a model of digest "
             f"{tuned_for['digest']} (here {model.digest})"
         )
 

@@ -120,7 +120,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     stages = [one.of_rows for one in stages_of(page, memory, equations)]
     kept = {name: one.shape for name, one in memory.kept.items()}
     if wrong := [name for name in kept if name in TOLD or not is_name(name)]:
-        raise ValueError(f"what a filter in C keeps must have a name that is free there, but got {wrong[0]!r}")
+        raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
     flying = memory.end - places.extras - sum(prod(size) for size in kept.values())
     points = _points_of(stages[2], equations, memory, flying)
     if points:
@@ -176,7 +176,7 @@ def _check_traced(name: str, function: Callable, jacobian: Callable | None, othe
         raise
     except Exception as error:  # whatever a user's function raises
         raise ValueError(
-            f"{name} must consist of arithmetic and functions of math or numpy, and decide nothing, but "
+            f"{name} must consist of arithmetic and functions of math or numpy, without branches, but "
             f"{getattr(function, '__name__', 'it')} raised {type(error).__name__}: {str(error).splitlines()[0]}"
         ) from error
 

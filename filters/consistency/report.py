@@ -208,7 +208,7 @@ def report_of(
     errors, whitened_errors, deviations = found.errors
     innovations, whitened_innovations, expected_deviations = found.innovations
     if len(errors) < 2:
-        raise ValueError(f"a consistency report must be of at least two runs, but got {len(errors)}")
+        raise ValueError(f"a consistency report must have at least two runs, but got {len(errors)}")
     n, m, present = errors.shape[-1], innovations.shape[-1], found.present
     names = _named("names", names, n, "state")
     channels = _named("channels", channels, m, "channel")

@@ -28,7 +28,7 @@ class GatedSession(Session):
         super().__init__(filter_)
         self.gate = positive("gate", gate)
         if not filter_.has_covariance:
-            raise ValueError(f"a gate must be that of a filter with a covariance, but {filter_.name!r} has none")
+            raise ValueError(f"a gate needs a filter with a covariance, but {filter_.name!r} has none")
         self.rejected = np.zeros(len(self.innovation), dtype=int)
         self._kept = tuple(part.copy() for part in self._memory)
 

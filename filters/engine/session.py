@@ -156,9 +156,7 @@ class Session:
         for name, parts in (("dt", 1), ("substep", model.substeps)):
             if name in names:
                 return self._noise_places.constants + names.index(name), parts
-        raise ValueError(
-            f"set_dt must be called on a model with a constant dt, but got {', '.join(names) or 'none'}"
-        )
+        raise ValueError(f"set_dt needs a model with a constant dt, but got {', '.join(names) or 'none'}")
 
     def set_parameter(self, name: str, value: float) -> None:
         """Use another value of one of the filter's numbers from here on; ValueError for one that it lacks."""
@@ -184,7 +182,7 @@ class Session:
 
     def _check_one_model(self, name: str) -> None:
         if not self._filter.one_model:
-            raise ValueError(f"{name} must be called on a filter of one model, but got {self._name!r}")
+            raise ValueError(f"{name} needs a filter with one model, but got {self._name!r}")
 
     def _remember_noise(self) -> None:
         """Keep the first numbers, with which `clear` begins again."""

@@ -50,7 +50,8 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
         found = _made(found, label, model, numbers)
     elif numbers:
         raise ValueError(
-            f"numbers are for what makes an estimator, but {label!r} is one already, and got {', '.join(numbers)}"
+            f"numbers must come with a function that makes an estimator, but {label!r} is one already, and got "
+            f"{', '.join(numbers)}"
         )
     return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
 

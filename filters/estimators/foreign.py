@@ -80,7 +80,7 @@ class ForeignFilter(Filter):
     def session(self, gate: float | None = None) -> EstimatorSession:
         """The estimator at work on one trajectory; ValueError for a gate, which it would have to have itself."""
         if gate is not None:
-            raise ValueError(f"a gate must be that of a filter of filters.FILTERS, but got one of {self.name!r}")
+            raise ValueError(f"a gate needs a filter of filters.FILTERS, but got {self.name!r}")
         return EstimatorSession(self)
 
     def fill(self, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, out: tuple) -> None:

@@ -32,7 +32,7 @@ class EstimatorSession:
         if not steps_alone(filter_.estimator):
             raise ValueError(
                 f"the estimator {filter_.name!r} must have reset(key, z) and step(u, z) to run beside an env, "
-                "but it has not"
+                "but it lacks them"
             )
         model = filter_.model
         n, m = model.n, model.m

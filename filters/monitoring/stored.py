@@ -62,7 +62,7 @@ def tuned_monitor(path: str | Path) -> Monitor:
     """
     given = read_tuned_file(path).get("monitor")
     if given is None:
-        raise ValueError(f"a tuned file must have a monitor (tune again, or say the steps), but {path} has none")
+        raise ValueError(f"a tuned file must have a monitor (tune again, or give the steps), but {path} has none")
     if not isinstance(given, Mapping):
         raise ValueError(f"the monitor of a tuned file must be a mapping, but {path} has {shown(given)}")
     try:

@@ -96,7 +96,7 @@ class Called:
             return stacked(function(states, *inputs, self._constants(c)), parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise ValueError(
-                f"{self._name} must be a function of tensors, or of arithmetic that decides nothing, but raised "
+                f"{self._name} must accept tensors, or consist of arithmetic without branches, but raised "
                 f"{type(error).__name__}: {str(error).splitlines()[0]}"
             ) from error
 

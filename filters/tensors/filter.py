@@ -90,8 +90,8 @@ class TensorFilter:
         self._make()
         if self._model is not filter_.model and any(self._given):
             raise ValueError(
-                f"functions of tensors must be given to a filter of the model itself, but got {filter_.name!r}, "
-                "which has an affine approximation"
+                f"functions of tensors need a filter on the model itself, but got {filter_.name!r}, "
+                "which uses an affine approximation"
             )
         for name in DIMENSIONS:
             setattr(self, name, torch.as_tensor(getattr(self._model, name), dtype=dtype, device=device))
@@ -249,8 +249,8 @@ class TensorFilter:
             or not all(_is(one, getattr(self._model, name)) for name, one in others.items())
         ):
             raise ValueError(
-                "the compiled log-likelihood must be that of a filter whose functions, prior and constants are "
-                "its model's, but got others: use run"
+                "the compiled log-likelihood needs the model's own functions, prior and constants, but got "
+                "others: use run"
             )
         noise = self.process_noise_cov, self.measurement_noise_cov
         return compiled_likelihood(self.filter, inputs, measurements, *noise)

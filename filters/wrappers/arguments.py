@@ -31,7 +31,7 @@ def given_filter(filter, tuned) -> tuple:
         offered = getattr(tuned, "filter", None)
         if not isinstance(offered, Filter):
             rule = "tuned must be the path of a tuned file, or what tuning.tune returns"
-            raise ValueError(f"{rule} (a filter that is made is filter=...), but got {shown(tuned)}")
+            raise ValueError(f"{rule} (pass a filter object as filter=...), but got {shown(tuned)}")
         if filter is not None:
             raise ValueError(f"tuned must come without filter: it has its own, but got {shown(filter)}")
         filter, tuned = offered, None
@@ -62,7 +62,7 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
     for name in numbers:
         if name not in known and not is_foreign(filter):
             rule = f"a number of filter {filter!r} must be one of {', '.join(known) or 'none'}"
-            raise ValueError(f"{rule} (what the model takes goes into model_arguments), but got {name!r}")
+            raise ValueError(f"{rule} (arguments of the model go into model_arguments), but got {name!r}")
     arguments = {} if model_arguments is None else model_arguments
     if not isinstance(arguments, Mapping):
         raise ValueError(f"model_arguments must be a mapping, but got {shown(arguments)}")

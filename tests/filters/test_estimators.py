@@ -235,7 +235,9 @@ def test_what_needs_a_filter_of_ours_says_so():
         run(
             filter_, np.zeros((1, 2)), np.zeros((1, 1, 1)), np.zeros((1, 2, 1)), process_noise_covs=np.eye(2)[None]
         )
-    with pytest.raises(ValueError, match="numbers are for what makes an estimator, .* and got gain"):
+    with pytest.raises(
+        ValueError, match="numbers must come with a function that makes an estimator, .* and got gain"
+    ):
         make_filter(AtOnce(), NOMINAL.model(), gain=2.0)
 
 

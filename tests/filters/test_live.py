@@ -190,7 +190,7 @@ def test_what_cannot_be_is_said_in_a_line(call, rule):
 
 
 def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused():
-    with pytest.raises(ValueError, match="must not be from before the start, but got one of 0.9 s"):
+    with pytest.raises(ValueError, match="must not be earlier than the start, but got one at 0.9 s"):
         started(late=5.0).update(0.9, "thrust", 0.1)
     with pytest.raises(ValueError, match="z must not be NaN with skip_missing=False"):
         started(skip_missing=False).update(1.02, "thrust", math.nan)
@@ -200,7 +200,7 @@ def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused()
     np.testing.assert_array_equal(skipped.mean, before)
     with pytest.raises(ValueError, match=r"start\(time\) must come before"):
         make_filter("ekf", thruster_model()).live().predict_to(1.0, [0.0])
-    with pytest.raises(ValueError, match="must tell the input before a sample of 2 s"):
+    with pytest.raises(ValueError, match="must give the input before a sample at 2 s"):
         live = make_filter("ekf", thruster_model()).live()
         live.start(1.0)
         live.update(2.0, "thrust", 0.1)

@@ -228,5 +228,5 @@ def test_the_sample_times_of_several_models_do_not_change(name):
         lambda: filter_.session().set_dt(0.02),
         lambda: filter_.session().scale_process_noise(2.0),
     ):
-        with pytest.raises(ValueError, match=f"must be called on a filter of one model, but got '{name}'"):
+        with pytest.raises(ValueError, match=f"needs a filter with one model, but got '{name}'"):
             use()

@@ -244,5 +244,5 @@ def test_shapes_and_degrees_that_do_not_fit_are_refused():
         sensitivity(make(**values), inputs, measurements, slopes._replace(constants=slopes.constants[:, 1:]))
     with pytest.raises(ValueError, match="degrees of freedom must be above 2, but got 1.0"):
         sensitivity(make(**values), inputs, measurements, slopes, degrees=1.0)
-    with pytest.raises(ValueError, match="predicted must say of each of 2 channels whether it is"):
+    with pytest.raises(ValueError, match="predicted must be true or false for each of 2 channels"):
         sensitivity(make(**values), inputs, measurements, slopes, predicted=[True])

@@ -208,7 +208,7 @@ def test_a_gate_leaves_out_channels_that_are_too_far(name):
     assert other.rejected.tolist() == [1, 1]
     with pytest.raises(ValueError, match="gate must be positive, but got 0"):
         filter_.session(gate=0.0)
-    with pytest.raises(ValueError, match="a gate must be that of a filter with a covariance, but 'open-loop'"):
+    with pytest.raises(ValueError, match="a gate needs a filter with a covariance, but 'open-loop'"):
         make_filter("open-loop", cart()).session(gate=3.0)
 
 
@@ -224,5 +224,5 @@ def test_a_session_takes_another_sample_time_where_the_model_has_it():
     np.testing.assert_array_equal(session.mean, expected.mean)
     with pytest.raises(ValueError, match="dt must be .*positive"):
         session.set_dt(-1.0)
-    with pytest.raises(ValueError, match="must be called on a model with a constant dt, but got none"):
+    with pytest.raises(ValueError, match="needs a model with a constant dt, but got none"):
         made("ekf", of_three_states).session().set_dt(0.1)

@@ -46,5 +46,5 @@ def test_the_file_has_it_and_older_ones_do_not(tmp_path):
     with pytest.raises(ValueError, match="the monitor of a tuned file must be a mapping"):
         tuned_monitor(path)
     rewrite(path, lambda content: content.pop("monitor"))
-    with pytest.raises(ValueError, match="must have a monitor .tune again, or say the steps., but"):
+    with pytest.raises(ValueError, match="must have a monitor .tune again, or give the steps., but"):
         tuned_monitor(path)

@@ -192,7 +192,7 @@ BAD = [
     (("tune", "--scenario", "none"), "problem must be one of"),
     (
         ("tune", "--filter", "ekf", "--method", "gradient", "--worst"),
-        "method='gradient' (--method) must count the mean of problems, but got worst (--worst)",
+        "method='gradient' (--method) must minimise the mean over problems, but got worst (--worst)",
     ),
     (
         ("tune", "--filter", "enkf", "--method", "gradient"),

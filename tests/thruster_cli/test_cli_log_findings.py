@@ -180,7 +180,7 @@ def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811
         (("--monitor", "3"), "steps_between must be from 100 to 1e12, but got 3"),
         (("--monitor", "often"), "--monitor must be steps, or 'tuned', but got often"),
         (("--monitor", "tuned"), "--monitor tuned must come with a tuned file, but got none"),
-        (("--no-grid",), "set_dt must be called on a model with a constant dt"),
+        (("--no-grid",), "set_dt needs a model with a constant dt"),
     ):
         done = thruster("estimate", "whole.csv", *MODEL, *wrong)
         assert done.returncode == 2 and rule in done.stderr

@@ -188,13 +188,13 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             "clock_offset (--clock-offset) of thrust must be seconds",
         ),
         (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),
-        (("estimate", "run.csv", "--out", "./run.csv"), "what is written must not replace what is read"),
-        (("estimate", "run.csv", "--out", "est.csv", "--json", "run.csv"), "must not replace what is read"),
+        (("estimate", "run.csv", "--out", "./run.csv"), "an output file must not replace an input file"),
+        (("estimate", "run.csv", "--out", "est.csv", "--json", "run.csv"), "must not replace an input file"),
         (
             ("estimate", "run.csv", "--out", "est.csv", "--json", "."),
             "must be where it can be written, but . is",
         ),
-        (("identify", "run.csv", "--json", "run.csv"), "must not replace what is read"),
+        (("identify", "run.csv", "--json", "run.csv"), "must not replace an input file"),
         (
             ("simulate", "--out", "new.csv", "--sensor", "torque"),
             "a channel of sensors must be one of thrust, speed",

@@ -59,7 +59,7 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     before = (tmp_path / "mine.toml").read_text()
     for command in (("identify", *logs), ("identify", "--bollard", "t.csv"), ("tune", "--scenario", "nominal")):
         done = thruster(*command, "--preset", "mine.toml", "--out", "mine.toml")
-        assert done.returncode == 2 and "must not replace what is read, but got mine.toml for both" in done.stderr
+        assert done.returncode == 2 and "must not replace an input file, but got mine.toml for both" in done.stderr
     assert (tmp_path / "mine.toml").read_text() == before
     assert thruster("simulate", "--preset", "mine.toml", "--steps", 20, "--out", "sim.csv").returncode == 0
     env = gym.make("BowThruster-v0", preset="mine.toml").unwrapped

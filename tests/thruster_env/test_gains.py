@@ -151,7 +151,7 @@ def test_a_gain_needs_something_to_act_on():
     plant = make_plant("tunnel")
     with pytest.raises(ValueError, match="tracking_weight must be positive, but got 0.0"):
         quadratic_gain(plant, TASK._replace(weights=(0.0, 0.0, 0.01)), 12.0)
-    with pytest.raises(ValueError, match="voltage must be one where feedback has an effect, but got 0 V"):
+    with pytest.raises(ValueError, match="voltage must be such that feedback has an effect, but got 0 V"):
         quadratic_gain(plant, TASK._replace(weights=(1.0, 0.0, 0.0)), 0.0)
 
 

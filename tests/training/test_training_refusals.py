@@ -35,7 +35,7 @@ def test_a_damaged_file_is_one_clear_line_and_nothing_is_overwritten(name, how, 
     damage(copied / FINAL / name, how)
     before = contents(copied)
     with pytest.raises(
-        ValueError, match=r"but .*(cannot be read|is not there|is not readable|got|holds none)"
+        ValueError, match=r"but .*(cannot be read|is missing|is not readable|got|holds none)"
     ) as error:
         folder = find_saved(copied / FINAL)
         load(folder, make_environments(setup_of(), [0]))

@@ -96,13 +96,13 @@ def test_filters_with_what_a_model_came_with_are_those_of_the_baseline():
     choice = given_choice("kf", problem)
     data = problem.data(problem.held_out_seeds(0, 4))
     assert rows[0].evaluation.score == evaluate(choice.filter(problem), data, problem.scale).score
-    with pytest.raises(ValueError, match="come with a Q and R of its own, but short's has none"):
+    with pytest.raises(ValueError, match="have its own Q and R, but short's has none"):
         tuning.compare("ekf", SHORT, seeds=2, knows="given")
 
 
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
-    (lambda: tuning.compare([]), "a comparison must be of filters, but got none"),
+    (lambda: tuning.compare([]), "a comparison must have at least one filter, but got none"),
     (
         lambda: tuning.compare(["ekf", 3]),
         "a tuned file, a Study or an estimator, but got 3",
@@ -117,7 +117,7 @@ WRONG = [
         "must be a whole number of at least 2, but got 1",
     ),
     (lambda: tuning.compare("ekf", knows="all"), "one of true, scaled, untuned, given, but got 'all'"),
-    (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out where filters are tuned"),
+    (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out if filters are tuned"),
     (lambda: tuning.compare("ekf", seeds=1), "held-out seeds must be a whole number of at least 2, but got 1"),
 ]
 

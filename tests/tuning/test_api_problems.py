@@ -115,7 +115,7 @@ def test_problems_by_name_and_themselves():
 
 WRONG = [
     (lambda: problem_of(3), "a problem must be a name, .* of a model and recorded runs, but got 3"),
-    (lambda: problems_of([]), "or a list of some, but got an empty list"),
+    (lambda: problems_of([]), "or a list of them, but got an empty list"),
     (lambda: problem_of("nominal", dt=0.1), r"dt must come with a pair \(model, data\), but got 'nominal'"),
     (lambda: problem_of(("tunnel", "x.csv"), preset="t200"), "must come without another, but got 't200'"),
     (lambda: problem_of((cart(), 5)), "a log must be the path of a file, a pandas.DataFrame, .* but got 5"),

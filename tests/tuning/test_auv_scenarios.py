@@ -146,7 +146,9 @@ def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_pa
     assert env.reset(seed=1)[1]["estimate"].shape == (8,)
     others = {"sensors": {"sensors": "default"}, "dt": {"dt": 0.1}, "preset": {"preset": "remus100"}}
     for rule, other in others.items():
-        with pytest.raises(ValueError, match=f"must be for the plant it is put on, but .* was tuned for {rule}"):
+        with pytest.raises(
+            ValueError, match=f"must be for the plant it is used with, but .* was tuned for {rule}"
+        ):
             EstimateState(gym.make("SegorogeniAUV-v0", **{"sensors": "motion", **other}), tuned="tuned.json")
     with pytest.raises(ValueError, match="a plant's data must have"):
         EstimateState(gym.make("BowThruster-v0"), tuned="tuned.json")

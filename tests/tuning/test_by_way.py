@@ -53,7 +53,7 @@ def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
         ("nominal", {"way": "als"}, "way 'als' needs a linear model"),
         ("nominal", {"way": "magic"}, "way must be one of"),
         ("nominal", {"way": "em", "method": "gradient"}, "must come without method='gradient'"),
-        ("nominal", {"way": "em", "worst": True}, "must count the mean of problems"),
+        ("nominal", {"way": "em", "worst": True}, "must minimise the mean over problems"),
         ("nominal", {"way": "squarem", "full_q": True}, "must come without full_q"),
     ],
 )

@@ -131,7 +131,7 @@ def test_problems_of_other_states_share_parameters_of_their_own():
         Plan("kf", (LinearProblem(n=2), LinearProblem(n=3))).checked()
     with pytest.raises(ValueError, match="must have different names, but got linear-3, linear-3"):
         Plan("kf", (LinearProblem(), LinearProblem())).checked()
-    with pytest.raises(ValueError, match="'gradient' .* must count the mean of problems, but got worst"):
+    with pytest.raises(ValueError, match="'gradient' .* must minimise the mean over problems, but got worst"):
         tuning.tune(both, "kf", method="gradient", worst=True, progress=False)
 
 

@@ -88,7 +88,7 @@ def test_the_start_is_part_of_the_digest_said_and_refused_where_nothing_is_seen(
         measurement_noise_cov=[0.1], prior_mean=[0.0], prior_cov=[1.0], inputs=1,
         observe_jacobian=lambda x, c: ((2.0 * x[0],),),
     )  # fmt: skip
-    with pytest.raises(ValueError, match=r"sees a state at the prior mean, but there dh/dx is \[\[0.0\]\]"):
+    with pytest.raises(ValueError, match=r"depends on a state at the prior mean, but dh/dx there is \[\[0.0\]\]"):
         RunsProblem([one[:2] for one in runs_far_off()], blind, start="measurement")
 
 

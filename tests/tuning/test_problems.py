@@ -105,7 +105,7 @@ def test_one_number_may_stand_for_the_whole_noise():
     assert choice.model == {"sigma": 0.5} and parameters_of(choice) == {"sigma": 0.5}
     np.testing.assert_allclose(choice.filter(problem).model.process_noise_cov, np.diag([0.025**2, 0.25]))
     assert problem.untuned == problem.given == {"sigma": 0.1}, "the default of the user's function"
-    with pytest.raises(ValueError, match="must be asked of a problem that tunes Q and R, but .* tunes sigma"):
+    with pytest.raises(ValueError, match="needs a problem that tunes Q and R, but .* tunes sigma"):
         Plan("ekf", (problem,), full_q=True).checked()
 
 

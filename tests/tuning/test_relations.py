@@ -119,13 +119,13 @@ def test_the_command_takes_them(tmp_path):
     [
         (("Q22 : 4",), r"a relation must be NAME = \[FACTOR\] NAME, .* but got 'Q22 : 4'"),
         (("Q22 = 4 Q99",), "relations must be among Q11, Q22, R11, R22,.* but got 'Q22 = 4 Q99'"),
-        (("Q22 = Q11", "Q22 = 1"), "one relation at most, but Q22 has more"),
+        (("Q22 = Q11", "Q22 = 1"), "at most one relation, but Q22 has more"),
         (("Q22 = Q11", "R11 = Q22"), "in proportion to one that is free, but got 'R11 = Q22'"),
         (("Q22 = Q22",), "in proportion to one that is free, but got 'Q22 = Q22'"),
         (("Q22 = -1",), "Q22 must be positive, but got 'Q22 = -1'"),
         (("Q22 = -2 Q11",), "a variance must be a positive multiple, but got 'Q22 = -2 Q11'"),
         (("Q22 = 2..1",), "a range must be LOW..HIGH with LOW below HIGH, but got 'Q22 = 2..1'"),
-        (("Q11 = 1", "Q22 = 1", "R11 = 1", "R22 = 1"), "must leave a number to tune, but got Q11 = 1, Q22 = 1"),
+        (("Q11 = 1", "Q22 = 1", "R11 = 1", "R22 = 1"), "must leave a parameter to tune, but got Q11 = 1, Q22 = 1"),
     ],
 )
 def test_relations_that_cannot_be(where, rule):

@@ -51,5 +51,5 @@ def test_baselines_are_not_searched_over_q_and_r():
     assert choice.numbers == {"time_constant": 4.0} and parameters_of(choice) == {"time_constant": 4.0}
     storage = optuna.storages.InMemoryStorage()
     for name in ("open-loop", "inversion"):
-        with pytest.raises(ValueError, match=f"filter must be one that has something to tune, but got '{name}'"):
+        with pytest.raises(ValueError, match=f"filter must have something to tune, but got '{name}'"):
             open_study("s", Plan(name, (NOMINAL,)), storage)

@@ -59,7 +59,7 @@ OTHERS = {
 @pytest.mark.parametrize(("arguments", "said"), OTHERS.values(), ids=list(OTHERS))
 @pytest.mark.parametrize("count", [None, 2])
 def test_a_file_on_another_plant_is_refused_and_each_difference_named(arguments, said, count, nominal):
-    rule = "a tuned file must be for the plant it is put on, but .*ekf.json was tuned for " + said
+    rule = "a tuned file must be for the plant it is used with, but .*ekf.json was tuned for " + said
     with pytest.raises(ValueError, match=rule):
         wrapped(nominal, count, **arguments)
 

@@ -163,7 +163,8 @@ def test_a_tuned_file_on_another_model_is_refused_and_the_difference_named(env, 
     if offered:
         wrapped.unwrapped.state_space_model = lambda **changes: found.replace(**changes)
     with pytest.raises(
-        ValueError, match="a tuned file must be for the model it is put on, but .*ekf.json was tuned for " + said
+        ValueError,
+        match="a tuned file must be for the model it is used with, but .*ekf.json was tuned for " + said,
     ):
         EstimateState(wrapped, tuned=path, model=None if offered else found)
 

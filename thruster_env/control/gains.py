@@ -98,5 +98,5 @@ def quadratic_gain(plant: Plant, task: Task, voltage: float) -> np.ndarray:
         return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a + s.T)[0]
     except np.linalg.LinAlgError as error:
         raise ValueError(
-            f"voltage must be one where feedback has an effect, but got {voltage:g} V: {error}"
+            f"voltage must be such that feedback has an effect, but got {voltage:g} V: {error}"
         ) from None

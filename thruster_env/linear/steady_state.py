@@ -48,9 +48,7 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
 
     # U_a = -U_p turns the attack angle past zero lift for every preset, so the root lies between.
     if not imbalance(0.0) * imbalance(20.0 * c.blade_speed) < 0:
-        raise ValueError(
-            f"blade_angle must be one with which the thruster has a steady state, but got {p.blade_angle}"
-        )
+        raise ValueError(f"blade_angle must allow a steady state, but got {p.blade_angle}")
     ratio = brentq(imbalance, 0.0, 20.0 * c.blade_speed, xtol=1e-16)
     load = c.load_gain * forces(ratio)[1]
     drive = c.voltage_gain * abs(voltage)

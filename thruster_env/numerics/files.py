@@ -38,7 +38,7 @@ def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
         except OSError:  # one of them is not there
             continue
         if same:
-            raise ValueError(f"what is written must not replace what is read, but got {path} for both")
+            raise ValueError(f"an output file must not replace an input file, but got {path} for both")
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:

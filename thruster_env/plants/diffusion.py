@@ -72,6 +72,6 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
         return covariance("densities", s, n)
     except ValueError:
         raise ValueError(
-            "process_noise_cov must be that of white noise in continuous time (a state that others move has some "
-            f"of theirs within a step), but got {shown(q.tolist())} for a step of {dt:g} s"
+            "process_noise_cov must be that of white noise in continuous time (a state driven by others has part "
+            f"of their noise within a step), but got {shown(q.tolist())} for a step of {dt:g} s"
         ) from None

@@ -34,7 +34,7 @@ def check_same(entries: Entries, tuned_for: Mapping, data: Mapping, file: str | 
         raise ValueError(f"{error} (in the tuned file {file})") from None
     if essential:
         raise ValueError(
-            f"a tuned file must be for the plant it is put on, but {file} was tuned for {', '.join(essential)}"
+            f"a tuned file must be for the plant it is used with, but {file} was tuned for {', '.join(essential)}"
         )
     return others
 

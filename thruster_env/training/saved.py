@@ -84,7 +84,7 @@ def remove(folder: Path) -> None:
 def mend(folder: Path) -> None:
     """Remove the incomplete files of a killed process from a training's folder; anything else stays as it is.
 
-    A policy that was about to be replaced is restored if its successor is not there.
+    A policy that was about to be replaced is restored if its successor is missing.
     """
     if not folder.is_dir():
         return
@@ -185,7 +185,7 @@ def whole(path: Path, read: Callable[[Path], Any]) -> Any:
     try:
         return read(path)
     except FileNotFoundError:
-        raise ValueError(f"a saved policy must have a {path.name}, but {path} is not there") from None
+        raise ValueError(f"a saved policy must have a {path.name}, but {path} is missing") from None
     except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None

@@ -39,9 +39,9 @@ def check_way(plan: Plan, name: str, workers: int) -> None:
     """Raise ValueError for a way that there is not, or a plan that none can serve."""
     find_way(name)
     if plan.worst:
-        raise ValueError("a way (--way) must count the mean of problems, but got worst (--worst)")
+        raise ValueError("a way (--way) must minimise the mean over problems, but got worst (--worst)")
     if plan.budget is not None or plan.filter == AUTO:
-        raise ValueError("a way (--way) must be of one filter and without a budget of microseconds a step")
+        raise ValueError("a way (--way) must have one filter, and no budget of microseconds per step")
     if len(plan.objectives) > 1:
         raise ValueError(f"a way (--way) must have one objective, but got {list(plan.objectives)}")
     if workers > 1:

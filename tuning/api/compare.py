@@ -90,7 +90,7 @@ def compare(
     some, left_out = without_unfit(some, problems)
     if trials is not None:
         if knows is not None:
-            raise ValueError(f"knows must be left out where filters are tuned, but got {shown(knows)} and trials")
+            raise ValueError(f"knows must be left out if filters are tuned, but got {shown(knows)} and trials")
         some = [
             tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
             for one in some
@@ -105,7 +105,7 @@ def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[
     named = [one for one in filters if _is_named(one)]
     kept, left_out = fitting(named, problems)
     if not kept and len(named) == len(filters):  # not even a tuned one
-        raise ValueError(next(iter(left_out.values()), "a comparison must be of filters, but got none"))
+        raise ValueError(next(iter(left_out.values()), "a comparison must have at least one filter, but got none"))
     return [one for one in filters if not _is_named(one) or one in kept], left_out
 
 

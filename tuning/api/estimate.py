@@ -90,6 +90,6 @@ def _as_file(tuned: Any) -> Iterator[str | Path | None]:
         yield tuned
         return
     if not hasattr(tuned, "save"):
-        raise ValueError(f"what is tuned must be a tuned file or a Study, but got {shown(tuned)}")
+        raise ValueError(f"tuned must be a tuned file or a Study, but got {shown(tuned)}")
     with tempfile.TemporaryDirectory() as folder:
         yield copy(tuned).save(Path(folder) / "tuned.json")  # the study itself does not remember this one

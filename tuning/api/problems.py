@@ -53,7 +53,7 @@ def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) ->
     """One problem, or several of a list; the arguments are those of `problem_of`. The second "a" is "a (2)"."""
     some = given if isinstance(given, list) else [given]
     if not some:
-        raise ValueError(f"{RULE}, or a list of some, but got an empty list")
+        raise ValueError(f"{RULE}, or a list of them, but got an empty list")
     found = [problem_of(one, preset, **of_logs) for one in some]
     names = [one.name for one in found]
     for place, name in enumerate(names):

@@ -183,7 +183,9 @@ def _check_method(plan: Plan, by_gradient: str | None) -> None:
         return
     check_gradient(plan.filter, "a filter whose likelihood has a gradient")
     if plan.worst:
-        raise ValueError("method='gradient' (--method) must count the mean of problems, but got worst (--worst)")
+        raise ValueError(
+            "method='gradient' (--method) must minimise the mean over problems, but got worst (--worst)"
+        )
     if plan.budget is not None:
         raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
 

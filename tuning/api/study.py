@@ -173,7 +173,9 @@ class Study:
 
         rows = self.tuning.result.sizes
         if not rows:
-            raise ValueError(f"a figure of ensemble sizes needs an ensemble and truth, but {self!r} has not both")
+            raise ValueError(
+                f"a figure of ensemble sizes needs an ensemble and true states, but {self!r} lacks one of them"
+            )
         return drawn(draw_sizes(rows, self.choice.numbers["ensemble_size"]))
 
     def report(self, out: str | Path | None = None) -> Path:

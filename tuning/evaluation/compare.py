@@ -174,7 +174,7 @@ def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
     if knows == "given":
         own = given(name, scenario)
         if own is None:
-            raise ValueError(f"the model must come with a Q and R of its own, but {scenario.name}'s has none")
+            raise ValueError(f"the model must have its own Q and R, but {scenario.name}'s has none")
         return own
     if knows == "true":
         known = oracle(name, scenario)

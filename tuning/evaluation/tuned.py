@@ -109,7 +109,7 @@ def check_keepable(name) -> None:
     if is_foreign(name):
         raise ValueError(
             f"a tuned file must be of a filter of filters.FILTERS, but got {label_of(name)!r}: "
-            "tune an estimator by tuning.tune, and keep its choice yourself"
+            "tune an estimator by tuning.tune, and store its parameters yourself"
         )
 
 

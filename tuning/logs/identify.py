@@ -63,7 +63,7 @@ def split_runs(
     if not found[0]:
         raise ValueError(
             f"logs must have {SHORTEST_PIECE} rows without a gap (or give hold_gaps, --hold-gaps), but "
-            f"{', '.join(log.name for log in parts[0])} have not"
+            f"{', '.join(log.name for log in parts[0])} do not"
         )
     return found[0], found[1]
 

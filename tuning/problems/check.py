@@ -110,7 +110,7 @@ def _check_counted(data: Data, shape: tuple[int, int], name: str) -> None:
     counted = np.asarray(data.counted)
     if counted.shape != shape or counted.dtype != bool:
         raise ValueError(
-            f"counted of problem {name} must be bool and of shape {shape}, one a measurement, but got "
+            f"counted of problem {name} must be bool and of shape {shape}, one per measurement, but got "
             f"{counted.dtype} of shape {counted.shape}"
         )
 
@@ -161,9 +161,7 @@ def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
 def _check_scale(problem: Problem, data: Data, name: str) -> None:
     if data.states is None or problem.scale is None:
         if data.states is not None or problem.scale is not None:
-            raise ValueError(
-                f"problem {name} must have a scale where its data have a truth, and none where they have none"
-            )
+            raise ValueError(f"problem {name} must have a scale if, and only if, its data have a truth")
         return
     scale = np.asarray(problem.scale, dtype=np.float64)
     if scale.shape != data.states.shape[-1:] or not (scale > 0).all() or not np.isfinite(scale).any():

@@ -186,7 +186,7 @@ class EnvProblem(AssumedProblem):
         scale = rows_of(data.scored_rows(data.known_states), self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
-                f"the scale of problem {self.name} must be given where a state does not move, "
+                f"the scale of problem {self.name} must be given if a state does not move, "
                 f"but its true states have the standard deviations {scale.tolist()}"
             )
         return scale

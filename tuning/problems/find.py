@@ -97,7 +97,7 @@ def _from_module(name: str) -> Problem:
             found = found()
         except Exception as error:
             raise ValueError(
-                f"a problem's function must give it without arguments, but {name!r} raised {said(error)}"
+                f"a function must return a problem without arguments, but {name!r} raised {said(error)}"
             ) from error
     return named(checked_problem(found, name), name)
 

@@ -121,7 +121,7 @@ class LogProblem(AssumedProblem):
         known = [states for states in found if states is not None]
         self._states = known if len(known) == len(found) else None
         if self._states is None and self._scale is not None:
-            raise ValueError(f"a scale must come with logs of all true states, but {self.name} has not got them")
+            raise ValueError(f"a scale must come with logs of all true states, but {self.name} lacks them")
         if self._states is not None:
             rows = [~np.isnan(states).any(axis=1) for states in self._states]
             self.parts = cut(known=rows)

@@ -152,7 +152,7 @@ class ModelProblem(AssumedProblem):
                 scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
-                f"the scale of problem {self.name} must be given where neither a bound nor the error of the open "
+                f"the scale of problem {self.name} must be given if neither a bound nor the error of the open "
                 f"loop is finite and positive in every state, but the latter is {scale.tolist()}"
             )
         return scale

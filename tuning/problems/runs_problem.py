@@ -128,7 +128,7 @@ def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, nam
             references[f"{STATE}:{one.symbol}"], referred[f"{STATE}:{one.symbol}"] = states[:, i], one
     if inputs.shape != (len(measurements) - 1, model.inputs):
         raise ValueError(
-            f"inputs of {name} must be one row fewer than its measurements and one column per input, "
+            f"inputs of {name} must have one row fewer than its measurements and one column per input, "
             f"{(len(measurements) - 1, model.inputs)}, but got {inputs.shape}"
         )
     return Log(name, dt, inputs, measurements, model.input_quantities, model.measurements, references, referred)
@@ -139,7 +139,5 @@ def _columns(what: str, given: Any, count: int, name: str) -> np.ndarray:
     found = as_floats(given)
     found = found[:, None] if found.ndim == 1 and count == 1 else found
     if found.ndim != 2 or found.shape[1] != count:
-        raise ValueError(
-            f"{what} of {name} must have {count} columns, one each of the model, but got {found.shape}"
-        )
+        raise ValueError(f"{what} of {name} must have {count} columns, as the model has, but got {found.shape}")
     return found

@@ -102,7 +102,7 @@ class Plan(NamedTuple):
     def checked(self) -> Plan:
         """The same plan; ValueError for one that cannot work."""
         if not all(map(has_search_space, self.filter_types)):
-            raise ValueError(f"filter must be one that has something to tune, but got {self.filter!r}")
+            raise ValueError(f"filter must have something to tune, but got {self.filter!r}")
         if not self.scenarios:
             raise ValueError("a study must have at least one scenario, but got none")
         self._check_problems()
@@ -119,7 +119,7 @@ class Plan(NamedTuple):
         if parameters is not None and (self.full_q or self.full_r or self.hold_r):
             names = ", ".join(one.name for one in parameters)
             raise ValueError(
-                f"a full Q, a full R or an R that is held must be asked of a problem that tunes Q and R, but "
+                f"a full Q, a full R or a held R needs a problem that tunes Q and R, but "
                 f"{self.scenarios[0].name} tunes {names}"
             )
         if self.full_q and not self._has_covariance:

@@ -71,7 +71,7 @@ def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[P
         if unknown is not None:
             raise ValueError(f"relations must be among {', '.join(known)}, but got {shown(text)}")
         if names.count(relation.name) > 1:
-            raise ValueError(f"each number must have one relation at most, but {relation.name} has more")
+            raise ValueError(f"each parameter must have at most one relation, but {relation.name} has more")
         _check(known[relation.name], relation, text)
     bound = {one.name for one in found if one.ends is None}
     for relation, text in zip(found, relations, strict=True):
@@ -79,7 +79,7 @@ def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[P
             raise ValueError(f"numbers must be in proportion to one that is free, but got {shown(text)}")
     free = {one.name: one for one in parameters if one.name not in bound}
     if not free:
-        raise ValueError(f"relations must leave a number to tune, but got {', '.join(relations)}")
+        raise ValueError(f"relations must leave a parameter to tune, but got {', '.join(relations)}")
     for relation in found:
         if relation.of:
             root = free[relation.of]

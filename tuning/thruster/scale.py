@@ -41,7 +41,7 @@ def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int =
         what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
     else:
         raise ValueError(
-            "a scenario must have a bound or a stable open loop to measure errors in, but Q is singular, "
+            "a scenario needs a bound or a stable open loop as the scale of errors, but Q is singular, "
             f"{list(scenario.process_noise_cov)}, and the open loop is unstable"
         )
     rounding = ROUNDING * np.sqrt(scenario.untuned["process_noise_cov"])

@@ -72,7 +72,7 @@ def _start(task: Task, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
         elif isinstance(one.place, MeasurementVariance):
             counts.append(measured[one.place.index])
         else:
-            raise ValueError(f"EM must be of variances in Q and R, but {one.name} is tuned, too")
+            raise ValueError(f"EM tunes only variances in Q and R, but {one.name} is tuned, too")
     first = np.clip(goal.coordinates.of(goal.untuned), goal.coordinates.low, goal.coordinates.high)
     return first, np.array(counts, dtype=np.float64)
 

@@ -41,7 +41,7 @@ def mehra_equations(
     """
     a, c, n = linear.a, linear.c, len(linear.a)
     if len(seen) <= n or np.linalg.matrix_rank(a) < n:
-        raise ValueError(f"way 'mehra' needs an A with an inverse and {n} lags, but one of them is not there")
+        raise ValueError(f"way 'mehra' needs an A with an inverse and {n} lags, but one of them is missing")
     closed, power, rows = a - a @ gain @ c, np.eye(n), []
     for _ in range(n):
         rows.append(c @ power @ a)

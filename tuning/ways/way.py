@@ -53,7 +53,9 @@ class Way(NamedTuple):
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
         if MODEL in self.needs and not task.free:
-            raise ValueError(f"way {name!r} tunes the model, but {task.problems[0].name} has none of it free")
+            raise ValueError(
+                f"way {name!r} tunes the model, but {task.problems[0].name} has no free parameter of it"
+            )
         if LINEAR in self.needs:
             stationary(task.model(task.start), task.problems[0].name, name)
         if NUTPIE in self.needs and importlib.util.find_spec(NUTPIE) is None:

@@ -298,7 +298,7 @@ def test_what_ways_need_is_said_in_a_line():
     with pytest.raises(ValueError, match="way must be one of .*, but got 'magic'"):
         find_way("magic")
     certain = Task("enkf", ring(steps=4), ring(steps=4).data(range(2)), options={"hold_r": True})
-    with pytest.raises(ValueError, match="way 'posterior' tunes the model, but .* has none of it free"):
+    with pytest.raises(ValueError, match="way 'posterior' tunes the model, but .* has no free parameter of it"):
         find_way("posterior").run("posterior", certain)
     ensemble = task_of(linear(), filter_name="enkf")
     with pytest.raises(ValueError, match="a filter for way 'em' must be one of kf"):

@@ -120,5 +120,5 @@ def test_em_ends_where_the_gradient_of_the_likelihood_ends(name, options):
 
 def test_em_refuses_numbers_that_are_no_variances():
     task = task_of(linear(), options={"prior": True})
-    with pytest.raises(ValueError, match="EM must be of variances in Q and R, but P0 is tuned, too"):
+    with pytest.raises(ValueError, match="EM tunes only variances in Q and R, but P0 is tuned, too"):
         find_way("em").run("em", task)

@@ -114,7 +114,7 @@ class Number:
         return f"<number {self.place}: {self.operation}>"
 
     def __bool__(self) -> bool:
-        raise TypeError("a number that is not known yet has no truth value: use where(condition, a, b)")
+        raise TypeError("a traced value has no truth value: use where(condition, a, b)")
 
     def _with(self, other) -> Number | None:
         """The other one as a Number of this graph; None where it is no number."""

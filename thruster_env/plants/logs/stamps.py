@@ -34,7 +34,7 @@ def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
     if not known:
         return None
     if len({one.tzinfo is None for one in known}) > 1:
-        raise ValueError("times must all have a time zone, or none, but there are some of each")
+        raise ValueError("times must all have a time zone, or none, but got both")
     known = [one if one.tzinfo is None else one.astimezone(UTC) for one in known]
     seconds = iter([(one - known[0]) / timedelta(seconds=1) for one in known])
     return np.array([np.nan if one is None else next(seconds) for one in found])

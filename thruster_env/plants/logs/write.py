@@ -128,7 +128,7 @@ def header_of(quantity: Quantity, taken=()) -> str:
         header = f"{plain(text)}_{unit}" if unit else plain(text)
         if header not in taken:
             return header
-    raise ValueError(f"columns must have different headers, but {header} stands for two")
+    raise ValueError(f"columns must have different headers, but {header} is that of two")
 
 
 def _pyarrow():

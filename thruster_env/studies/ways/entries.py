@@ -166,9 +166,9 @@ def _check(case: Case, way: str, task: Task) -> None:
     if way in WAYS:
         find_way(way).check(way, task)
     elif way == ORACLE and oracle_choice(case.filter, task.problems[0]) is None:
-        raise ValueError("nobody knows the plant's own Q and R")
+        raise ValueError("the plant's own Q and R are unknown")
     elif way in (STUDY, STUDY_LOG_SCORE) and (case.runs != 32 or case.group in "EG" or case.make is lidar):
-        raise ValueError("a study draws its own runs, which are others than these")
+        raise ValueError("a study draws its own runs, not these")
 
 
 def _follow(case: Case, way: str, place: int, task: Task) -> None:

@@ -83,7 +83,7 @@ def run_comparison(
             on_run(run, done, len(runs))
     except BrokenProcessPool:
         raise ValueError(
-            "processes must live until their runs are done, but one was killed: go on by the same call"
+            "processes must live until their runs are done, but one was killed: the same call continues"
         ) from None
     except BaseException:
         for process in list((pool._processes or {}).values()):

@@ -139,8 +139,8 @@ def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.nda
     clock = max(within, key=len, default=np.empty(0))
     if len(clock) < 2:
         raise ValueError(
-            f"measurements must go on after all inputs have begun, at {begin:.10g} s, but {path} has {len(clock)} "
-            "from there on"
+            f"measurements must continue after all inputs have begun, at {begin:.10g} s, but {path} has "
+            f"{len(clock)} from there on"
         )
     return clock
 
