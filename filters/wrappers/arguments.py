@@ -21,7 +21,7 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 
 
 def given_filter(filter, tuned) -> tuple:
-    """The arguments `filter` and `tuned` as a wrapper keeps them: what has a filter, as a study, is that filter.
+    """The arguments `filter` and `tuned` as a wrapper keeps them; a study becomes its filter.
 
     Raises ValueError if either does not have the type that the wrapper documents, or both are given.
     """
@@ -42,11 +42,11 @@ def given_filter(filter, tuned) -> tuple:
 
 
 def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
-    """The filter that a wrapper of env runs; the wrapper's class documents the arguments.
+    """The filter for a wrapper around env; the wrapper's class documents the arguments.
 
     A tuned file is data: nothing in it becomes a model or another argument of the wrapper.
 
-    Raises ValueError if an argument is unknown or off.
+    Raises ValueError if an argument is unknown or wrong.
     """
     if tuned is not None:
         if filter is not None or numbers or model_arguments is not None:
@@ -70,7 +70,7 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
 
 
 def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> StateSpaceModel:
-    """The model that is given, that the "module:factory" named makes, or the env's own; see `EstimateState`."""
+    """The given model, one made by "module:factory", or the env's own; see `EstimateState`."""
     what, make = maker_of(env, model)
     if not isinstance(make, StateSpaceModel):
         return made(what, make, arguments)
@@ -80,14 +80,14 @@ def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> S
 
 
 class ModelInSpec:
-    """A model as an env's spec keeps it. JSON refuses it with its class's name, which says what to do."""
+    """A model as an env's spec stores it. JSON refuses it with its class's name, which says what to do."""
 
     def __init__(self, content):
         self.content = content
 
 
 class EstimatorInSpec(ModelInSpec):
-    """A filter that is made, or an estimator, as an env's spec keeps it, likewise."""
+    """A filter object, or an estimator, as an env's spec stores it, likewise."""
 
 
 EstimatorInSpec.__name__ = "Filter or Estimator (give its name or 'module:object' instead)"
@@ -99,7 +99,7 @@ def check_spaces(
 ) -> gym.spaces.Box:
     """Return the action space; raise ValueError unless both spaces are Box, and actions fit the model.
 
-    They are the model's inputs, of which the last `measured_inputs` are left out.
+    Actions are the model's inputs without the last `measured_inputs`.
     """
     actions, size = _box("action", action_space), model.inputs - measured_inputs
     if int(np.prod(actions.shape)) != size:

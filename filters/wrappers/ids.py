@@ -1,7 +1,7 @@
 """Registered envs with a filter around them: `gym.make("filters:BowThruster-EnKF-v0")`, also as vector envs.
 
-Packages whose envs offer a model are found by the entry point group PLANTS. For each of their ids there is one
-here, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each filter of ALIASES.
+The entry point group PLANTS lists packages whose envs offer a model. Each of their ids gets a filtered one,
+    "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each filter of ALIASES.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def modelled_ids() -> list[str]:
 
 
 def register_filtered_envs() -> None:
-    """Register every env that offers a model with a filter around it; nothing happens the second time."""
+    """Register every env that offers a model with a filter around it; a second call has no effect."""
     for env_id in modelled_ids():
         for word, filter in [("Filtered", None), *((word, name) for name, word in ALIASES.items())]:
             if filtered_id(env_id, word) not in registry:

@@ -1,4 +1,4 @@
-"""Measured inputs of a model, such as an attitude from an AHRS: they are appended to the action.
+"""Measured inputs of a model, such as an attitude from an AHRS, appended to the action.
 
     x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
 
@@ -50,7 +50,7 @@ class WithMeasuredInputs:
         self._runs.start(*which, keys, z[..., self._measurements])
 
     def step(self, u, z: np.ndarray, **idle) -> None:
-        """Predict with the action and what was measured at the step's beginning, and update."""
+        """Predict with the action and the inputs measured at the step's beginning, and update."""
         last = self._last
         assert last is not None  # `start` comes first
         self._runs.step(np.concatenate([u, last], axis=-1), z[..., self._measurements], **idle)

@@ -1,4 +1,4 @@
-"""Where a wrapper's model comes from: the env, a factory that the caller names, or the caller's own hands."""
+"""Where a wrapper's model comes from: the env, a factory that the caller names, or the caller."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
 
 
 def offered(env, name: str) -> Any:
-    """What an env, or a wrapper around it, offers by an attribute; None if nothing does."""
+    """The attribute of an env, or of a wrapper around it; None if none has it."""
     if isinstance(env, gym.Env) and env.has_wrapper_attr(name):
         return env.get_wrapper_attr(name)
     return getattr(env.unwrapped, name, None)
 
 
 def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
-    """The model that is made of some arguments; ValueError if there is none."""
+    """The model made with some arguments; ValueError if there is none."""
     try:
         found = make(**arguments)
     except TypeError as error:

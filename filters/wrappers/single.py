@@ -41,17 +41,17 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "measurement+estimate": the measurement, then the mean, (m + n,);
     - "belief": the mean, then the standard deviations, (2 n,).
 
-    What the env appends to its measurement (validity flags, a reference signal) stays at the end of the
-    observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m counts
+    Entries that the env appends to its measurement (validity flags, a reference signal) stay at the end of
+    the observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m includes
     them in the observation, but not in the innovation.
 
     The info dictionary gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m)
     and `estimate_divergences`, the number of restarts from the prior after an estimate that was not finite. All
     are in the units of the model. The measurement is `info["measurement"]` if the env reports it (missing where
-    `measurement_valid` is false), else the observation. Where a measurement is missing, the observation repeats
+    `measurement_valid` is false), otherwise the observation. For a missing measurement, the observation repeats
     the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
     replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed through a
-    separate stream; the env's generator is never used. With a monitor it also gains `health`, whether all is `ok`
+    separate stream; the env's generator is never used. With a monitor info also gains `health`, with `ok`
     and the `alarms` of the step (`filters.monitoring.Health`). With a smoothing lag it gains `smoothed` (n,) and
     `smoothed_cov` (n, n): the state so many steps ago, given all measurements up to now; in the first steps the
     state at the reset.
@@ -59,16 +59,16 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     Args:
         env: any env with Box actions and observations.
         filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or a filter
-            that is made already, such as `tuning.tune(...).filter`, which brings its model; or an estimator of
+            object with its model, such as `tuning.tune(...).filter`; or an estimator of
             another package, as `filters.estimators.estimator.Estimator`, a function that makes one
-            from a model, or "module:object" for either; a covariance that it does not give is zero,
+            from a model, or "module:object" for either; a covariance that it does not return is zero,
             an innovation NaN.
         observation: one of the three forms above.
         model: None for the model that the env, or a wrapper around it, offers by `state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
             `StateSpaceModel` (which the env's spec cannot hold as JSON).
-        tuned: path of a tuned file, which gives filter, parameters and model arguments; or what `tuning.tune`
-            returns, whose `filter` is then taken with its model.
+        tuned: path of a tuned file, which gives filter, parameters and model arguments; or the result of
+            `tuning.tune`, whose `filter` is used with its model.
         monitor: tests on the innovations, as a `filters.monitoring.Monitor`, a mapping of its attributes, its
             number of steps between false alarms, or True for its defaults; None for none.
         smoothing_lag: number of steps of a fixed-lag smoother, of the filters kf, ekf, iekf, ukf and ckf; None for
@@ -149,7 +149,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def step(self, action):
         """Step the env, then predict with the clipped action and update with the measurement.
 
-        Raises ValueError, before the env is stepped, for an action that is not numbers, or too few or many.
+        Raises ValueError, before the env is stepped, for an action that is not numeric or has the wrong size.
         """
         u = self._clipped(action)
         observation, reward, terminated, truncated, info = self.env.step(action)

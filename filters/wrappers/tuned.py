@@ -18,18 +18,18 @@ from thruster_env.plants.state_space import StateSpaceModel
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
     """Make the filter of a tuned file, for a model that takes the tuned Q, R and parameters.
 
-    Nothing that the file names is imported: the model is the env's own, or given by the caller. It has to be the
-    one that the file is for. A file that holds its plant as data is compared with the env's plant, if no model is
-    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files of before version 4
-    are compared by the plant alone.
+    Names in the file are never imported: the model is the env's own, or given by the caller, and must be
+    the file's. A file that contains its plant as data is compared with the env's plant, if no model is
+    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files older than version 4
+    are compared only by the plant.
 
     Args:
-        env: that is wrapped.
+        env: the wrapped env.
         model: as `EstimateState` takes it.
         file: the path.
 
     Raises:
-        ValueError: with what differs, if the model is another one; or if the file is a bad one.
+        ValueError: with the differences, if the model is another one; or if the file is invalid.
     """
     content = read_tuned_file(file)
     plant, check = content.get("plant"), getattr(env.unwrapped, "check_tuned_for", None)
@@ -54,7 +54,7 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
 
 
 def sample_time(env) -> float | None:
-    """An env's `dt` [s], None where it says none."""
+    """An env's `dt` [s], None if it has none."""
     dt = getattr(env.unwrapped, "dt", None)
     return float(dt) if isinstance(dt, float | int) and not isinstance(dt, bool) and dt > 0 else None
 

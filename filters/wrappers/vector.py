@@ -107,7 +107,7 @@ class EstimateStates(gym.vector.VectorWrapper):
     def step(self, actions):
         """Step the env, then predict with the clipped actions and update with the measurements.
 
-        Raises ValueError, before the envs are stepped, for actions that are not numbers, or too few or many.
+        Raises ValueError, before the envs are stepped, for actions that are not numeric or have the wrong size.
         """
         ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
         u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)

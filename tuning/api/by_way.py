@@ -1,4 +1,4 @@
-"""A way of tuning as a study: what it kept on its path are the trials, and its answer is the choice."""
+"""A way of tuning as a study: the values on its path are the trials, and its result is the choice."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ANSWER = "answer of the way"  # attribute of a study
 
 
 class Followed(NamedTuple):
-    """What a way found, and what it took."""
+    """The result of a way, and its cost."""
 
     name: str
     choice: Choice
@@ -36,7 +36,7 @@ class Followed(NamedTuple):
 
 
 def check_way(plan: Plan, name: str, workers: int) -> None:
-    """Raise ValueError for a way that there is not, or a plan that none can serve."""
+    """Raise ValueError for an unknown way, or a plan that ways do not support."""
     find_way(name)
     if plan.worst:
         raise ValueError("a way (--way) must minimise the mean over problems, but got worst (--worst)")
@@ -51,10 +51,10 @@ def check_way(plan: Plan, name: str, workers: int) -> None:
 def follow(
     study: optuna.Study, plan: Plan, data: Sequence[Data], trials: int, on_trial: OnTrial, *, name: str
 ) -> bool:
-    """Follow a way to its end, or one by trials for as many as a study has: `run` of `run_study`.
+    """Run a way to its end, or one that samples trials for as many as a study has: `run` of `run_study`.
 
     Returns:
-        Whether Ctrl-C ended it; what it had found until then is kept.
+        Whether Ctrl-C ended it; its results so far are kept.
 
     Raises:
         ValueError: if the plan lacks what the way needs.
@@ -100,7 +100,7 @@ def _start(plan: Plan, name: str) -> Choice | None:
 
 
 def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
-    """The result of a study of a way with its answer in place of the best trial, and what the way took."""
+    """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
     answer = study.user_attrs[ANSWER]
     found = answer["choice"]
     choice = Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"]))
@@ -113,7 +113,7 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
 
 
 def way_sentence(found: Followed, word: str) -> str:
-    """What found the numbers, and what it took."""
+    """How the parameters were found, and the cost."""
     way = WAYS[found.name]
     took = f"It took {found.seconds:.2g} s and as much as {found.runs:.0f} passes of the filter over one of the"
     return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}."

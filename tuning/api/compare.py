@@ -49,10 +49,10 @@ def compare(
 ) -> FilterComparison:
     """Rank filters on problems: errors, consistency, cost, and which beat the first one on the same seeds.
 
-    All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if the
-    paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
-    difference of their log-likelihoods leaves out 0. A filter that is named, and refuses a problem's model, is
-    left out, and `left_out` says why. Ctrl-C keeps the rows that are done.
+    All filters see the same truth, inputs and measurements. A filter is better or worse than the first one if the
+    paired 95 % interval of the ratio of their scores excludes 1; without truth, if that of the
+    difference of their log-likelihoods excludes 0. Named filters that do not accept a problem's model are
+    left out, and `left_out` says why. Ctrl-C keeps finished rows.
 
         comparison = tuning.compare(["kf", "ekf", "enkf"], "mismatch", seeds=50)
         comparison.to_frame()
@@ -62,19 +62,19 @@ def compare(
         filters: names of filters, tuned files, `Study`s, other packages' estimators, or your own: a filter such as
             `make_filter("ekf", model)` or a model with its Q and R, in a list; the others are compared with the
             first.
-        problem: on what, as `tuning.tune` takes it; several in a list. By default that of the first tuned file or
+        problem: a problem as for `tuning.tune`, or a list of several; by default that of the first tuned file or
             study, or "nominal".
         seeds: number of held-out seeds.
         seed: of the study to which they belong.
-        trials: tune each filter that is named with so many trials first; all filters on the same training seeds.
-        knows: the Q and R of a filter given by name: "true" (oracle), "scaled" (scaled default), "untuned" (rule
+        trials: tune each named filter first with this number of trials, all on the same training seeds.
+        knows: the Q and R of named filters: "true" (oracle), "scaled" (scaled default), "untuned" (rule
             of thumb) or "given" (those of the model that filters assume); by default the oracle's, or the scaled
-            default's where the plant's Q and R are unknown.
+            default's if the plant's Q and R are unknown.
         augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
             row; by name with an `Unknown`, or (std, walk).
         ensemble_size: of all filters, or by name.
         preset: the problems of another thruster, by name or file.
-        progress: whether to show it; None in terminals and notebooks only.
+        progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
         `FilterComparison`: `to_frame()`, `plot_scores()`, `sentences()`.
@@ -101,7 +101,7 @@ def compare(
 
 
 def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
-    """The filters without those named ones that refuse a problem's model, and by label why these do."""
+    """The filters without named ones that do not accept a problem's model, and the reasons by label."""
     named = [one for one in filters if _is_named(one)]
     kept, left_out = fitting(named, problems)
     if not kept and len(named) == len(filters):  # not even a tuned one
@@ -112,7 +112,7 @@ def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[
 def compared(
     contenders: Sequence[Contender], problems: Sequence[Problem], seed: int, seeds: int, console: Any
 ) -> FilterComparison:
-    """Run contenders over problems with a progress bar; what `tuning.compare` and `thruster compare` both do."""
+    """Run contenders over problems with a progress bar, for `tuning.compare` and `thruster compare`."""
 
     def held_out(problem: Problem) -> range:
         return problem.held_out_seeds(seed, seeds)
@@ -127,11 +127,11 @@ def compared(
 def contenders_of(
     filters: Sequence[Any], knows: str, unknown: Unknowns, sizes: Mapping[Any, int], seed: int
 ) -> list[Contender]:
-    """The filters that take part: tuned files and studies first as they are, then those that are named.
+    """The filters to compare: first tuned files and studies, then named filters.
 
     Args:
         filters: names, paths of tuned files, `Study`s or estimators.
-        knows: what a filter that is named knows of the plant's noise.
+        knows: the Q and R of named filters.
         unknown: constants that each of these also estimates in a second row.
         sizes: ensemble size by name; under None that of all others.
         seed: of the study whose training runs scale the scaled default.
@@ -180,7 +180,7 @@ def _default(filters: Sequence[Any]) -> Any:
 
 
 def knowledge_on(problems: Sequence[Problem]) -> str:
-    """What filters know of the noise by default: all of it, or the scaled default if it is unknown."""
+    """The default Q and R of filters: the plant's, or the scaled default if these are unknown."""
     return "scaled" if any(one.true is None for one in problems) else "true"
 
 

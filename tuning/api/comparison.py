@@ -33,9 +33,9 @@ class FilterComparison:
     """Filters on one problem or several, in the order in which they were given.
 
     Attributes:
-        boards: a `Leaderboard` a problem: seeds, bound and rows.
+        boards: a `Leaderboard` for each problem: seeds, bound and rows.
         seed: of the study to which the held-out seeds belong.
-        interrupted: whether Ctrl-C ended it; the rows are those that were done.
+        interrupted: whether Ctrl-C ended it; the rows are the finished ones.
         left_out: by label, why a filter could not run.
     """
 
@@ -63,7 +63,7 @@ class FilterComparison:
         return [winners(board) for board in self.boards]
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a filter and problem: errors, score and its ratio to the first filter's, consistency, cost.
+        """A row for each filter and problem: errors, score and its ratio to the first filter's, consistency, cost.
 
         Raises:
             ValueError: if pandas is not installed.
@@ -88,7 +88,7 @@ class FilterComparison:
     def plot_scores(self) -> Figure:
         """Score of each filter with 95 % interval, a panel per problem; without truth the log-likelihood gained.
 
-        Hollow are filters that do not differ significantly from the first.
+        Hollow points do not differ significantly from the first.
         """
         count = max(len(board.rows) for board in self.boards)
         figure, axes = panels(len(self.boards), 3, (5.2, 0.9 + 0.38 * count), extra=0.3)

@@ -41,8 +41,8 @@ def estimate(
 ) -> LogEstimates:
     """Estimate the state of a recorded run, and report what the innovations say about filter and model.
 
-    If the log also has states or outputs of the model, such as the thrust of a load cell where the filter sees the
-    tachometer, they are compared with the estimate.
+    States or outputs of the model in the log, such as the thrust of a load cell that the filter does not see, are
+    compared with the estimate.
 
         estimates = tuning.estimate("run.csv", tuned="tuned.json")
         estimates.to_frame()
@@ -51,19 +51,19 @@ def estimate(
     Args:
         log: the path of a .csv, .parquet or .npz file, or of a recorder's; a table, as a pandas.DataFrame or a
             mapping from headers to arrays; or a `Log`; or a pair (model, log).
-        tuned: a tuned file or a `Study`: filter, Q, R and the like.
+        tuned: a tuned file or a `Study`, with filter, Q, R and other parameters.
         filter: without these, the name of a filter, or another package's estimator; "ekf" if None.
-        model: whose log it is, in place of a thruster: a `StateSpaceModel`, what makes or offers one,
+        model: the log's model, if it is not a thruster's: a `StateSpaceModel`, an object that makes or offers one,
             "module:object", or a thruster's preset.
-        preset: the thruster that it is of, by name or file.
-        sensors: what the filter sees of a thruster.
+        preset: the log's thruster, by name or file.
+        sensors: a thruster's channels that the filter sees.
         columns: headers by quantity: {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
         clock_offset: seconds by quantity that a channel's clock is ahead.
-        dt: sample time [s], of a log without times, or to put it on.
-        grid: whether the log is put on a grid; else it is filtered on its own stamps, by the clock.
+        dt: sample time [s] of a log without times, or of the grid.
+        grid: whether to put the log on a grid; otherwise the filter uses its own time stamps.
         smoother: correct estimates by later measurements.
-        lag: how many later ones, also without `smoother`; all by default.
-        skip: first rows that do not count in the findings; 50, or a quarter of a short log, by default.
+        lag: number of later measurements, also without `smoother`; all by default.
+        skip: initial rows that are not scored; 50, or a quarter of a short log, by default.
         seed: of the filter's random numbers.
         **numbers: the filter's own, such as `ensemble_size`.
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogEstimates:
-    """Estimates and innovations of every row of a log, and what they say about filter and model.
+    """Estimates and innovations of every row of a log, and the findings on filter and model.
 
     Attributes:
         found: the estimate itself.
@@ -50,7 +50,7 @@ class LogEstimates:
 
     @property
     def means(self) -> np.ndarray:
-        """Estimates of the states, (K + 1, n); a smoother's where it was asked for."""
+        """Estimates of the states, (K + 1, n); the smoother's if requested."""
         return self.found.means
 
     @property
@@ -60,12 +60,12 @@ class LogEstimates:
 
     @property
     def innovations(self) -> np.ndarray:
-        """Measurement less prediction, (K + 1, m), NaN where nothing was measured."""
+        """Measurement minus prediction, (K + 1, m), NaN if missing."""
         return self.found.innovations
 
     @property
     def log_likelihood(self) -> float:
-        """Of the rows that count; NaN for a filter without a covariance."""
+        """Of the scored rows; NaN for a filter without a covariance."""
         return self.findings.log_likelihood
 
     def sentences(self) -> list[str]:
@@ -73,14 +73,14 @@ class LogEstimates:
         return verdict(self.found, self.findings)
 
     def alarms(self, monitor: Monitor | Mapping | float = 100_000.0, *, isolate: bool = False) -> LogAlarms:
-        """What tests on the innovations say of the sensors (docs/monitoring.md).
+        """Tests of the sensors by the innovations (docs/monitoring.md).
 
         Args:
             monitor: a `filters.monitoring.Monitor`, a mapping of its attributes, or steps between false alarms.
-            isolate: whether to run the filter without each channel, too, and name the faulty one.
+            isolate: whether to run the filter also without each channel, and name the faulty one.
 
         Raises:
-            ValueError: for a wrong monitor, a filter without a covariance, and to isolate the only channel.
+            ValueError: for a wrong monitor, a filter without a covariance, or isolation of the only channel.
         """
         return alarms_of(self.found, monitor_of(monitor) or Monitor(), self.findings.first, isolate=isolate)
 
@@ -89,7 +89,7 @@ class LogEstimates:
         return self.found.output(symbol)
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a time: inputs, measurements, references, estimates, standard deviations and innovations.
+        """A row for each time: inputs, measurements, references, estimates, standard deviations and innovations.
 
         Raises:
             ValueError: if pandas is not installed.

@@ -33,7 +33,7 @@ def evaluate(
     model: str | StateSpaceModel | None = None,
     progress: bool | None = None,
 ) -> HeldOut:
-    """Run a filter on held-out seeds of a problem, beside its baselines, what was given first.
+    """Run a filter and its baselines on held-out seeds of a problem.
 
     The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
     is the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
@@ -42,15 +42,15 @@ def evaluate(
         evaluation.to_frame()
 
     Args:
-        tuned: a tuned file, a `Study`, or the name of a filter: then it is the rule of thumb of that filter. Or
-            own numbers: a filter, as `make_filter("ekf", model)`, or a `StateSpaceModel` with its own Q and R.
-        problem: on what: a name, a `Problem`, "module:object" or a pair (model, data); by default that of the
+        tuned: a tuned file, a `Study`, or the name of a filter, which gets the rule of thumb. Or your
+            own parameters: a filter, as `make_filter("ekf", model)`, or a `StateSpaceModel` with its own Q and R.
+        problem: a name, a `Problem`, "module:object" or a pair (model, data); by default that of the
             tuned file, or "nominal" for the name of a filter.
-        seeds: number of held-out seeds, of problems that can make as many as are asked for.
+        seeds: number of held-out seeds, for problems that can generate any number.
         seed: of the study to which they belong.
         preset: the problem of another thruster, by name or file.
-        model: "module:object" of the logs that a tuned file names, where their model is code.
-        progress: whether to show it; None in terminals and notebooks only.
+        model: "module:object" for the logs of a tuned file, if their model is code.
+        progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
         `HeldOut`: `evaluations` by name, `ratios`, `bound`, `to_frame()`, `plot_errors()`.

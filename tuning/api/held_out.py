@@ -1,4 +1,4 @@
-"""`HeldOut`: what a filter and its baselines achieve on seeds that no study saw, as a value."""
+"""`HeldOut`: the performance of a filter and its baselines on held-out seeds, as a value."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class HeldOut:
     """A filter and its baselines on the same held-out seeds of a problem.
 
     Attributes:
-        choice: the filter's numbers.
-        problem: on what.
+        choice: the filter's parameters.
+        problem: the problem.
         proof: evaluations, bound and seeds.
-        is_tuned: whether the choice is that of a study; else it is the rule of thumb.
+        is_tuned: whether the choice is that of a study; otherwise it is the rule of thumb.
         seed: of the study to which the seeds belong.
-        name: what the filter is called, "tuned" or, of numbers that the user brought, "own numbers".
-        chosen: of a study what was chosen and what gave way, in sentences.
+        name: the filter's label, "tuned" or, for the user's parameters, "own numbers".
+        chosen: a study's choice and what it replaced, in sentences.
     """
 
     choice: Choice
@@ -62,7 +62,7 @@ class HeldOut:
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
-        """What each filter achieved: "rule of thumb", "scaled default", "tuned", "oracle", where there is one."""
+        """The evaluation of each filter: "rule of thumb", "scaled default", "tuned", "oracle", if there is one."""
         found = self.proof.evaluations
         return {self._called(name): one for name, one in found.items() if self.is_tuned or name != TUNED}
 
@@ -71,12 +71,12 @@ class HeldOut:
 
     @property
     def evaluation(self) -> Evaluation:
-        """What the filter itself achieved."""
+        """The filter's own evaluation."""
         return self.proof.tuned
 
     @property
     def choices(self) -> dict[str, Choice]:
-        """The numbers of each filter."""
+        """The parameters of each filter."""
         found = {
             self.name: self.choice,
             **baselines(self.choice.name, self.problem, self.seed, self.proof.default),
@@ -90,12 +90,12 @@ class HeldOut:
 
     @property
     def bound(self) -> np.ndarray:
-        """Bound on the standard error of each state, (n,); NaN where there is none."""
+        """Bound on the standard error of each state, (n,); NaN if there is none."""
         return self.proof.bound
 
     @property
     def seeds(self) -> range:
-        """The held-out seeds; of logs the numbers of the held-out blocks."""
+        """The held-out seeds; for logs the indices of the held-out blocks."""
         return self.proof.seeds
 
     @property
@@ -110,18 +110,18 @@ class HeldOut:
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
-        """Log-likelihood of a run less that of each baseline, paired; it needs no truth."""
+        """Log-likelihood of a run minus that of each baseline, paired; it needs no truth."""
         return self.proof.likelihood_gains
 
     def to_dict(self) -> dict[str, Any]:
-        """All figures as plain numbers: what `thruster evaluate --json` has of them."""
+        """All results as plain numbers, as in `thruster evaluate --json`."""
         said = metrics(self.proof)
         if not self.is_tuned:
             del said["tuned"]
         return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said}
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
+        """A row per filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
 
         Raises:
             ValueError: if pandas is not installed.
@@ -140,7 +140,7 @@ class HeldOut:
         """RMSE of each state, of all filters, with 95 % intervals and the bound.
 
         Raises:
-            ValueError: if there is no truth, and so no RMSE.
+            ValueError: without truth, since there is no RMSE.
         """
         from tuning.reporting.figures import draw_comparison
 
@@ -227,13 +227,13 @@ def on_held_out(
     console: Console,
     name: str = TUNED,
 ) -> HeldOut:
-    """Run a choice and its baselines on held-out seeds; arguments as of `HeldOut` and `evaluate_held_out`."""
+    """Run a choice and its baselines on held-out seeds; arguments as in `HeldOut` and `evaluate_held_out`."""
     with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
         return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed, name)
 
 
 def cells_of(one: Evaluation) -> dict[str, float]:
-    """The figures of an evaluation by the names that columns of a table have."""
+    """The results of an evaluation by column names."""
     cells: dict[str, float] = {}
     errors = [(state.short_label, rmse) for state, rmse in zip(one.states, one.rmse, strict=True)]
     errors += [(one.outputs[symbol].short_label, rmse) for symbol, rmse in one.output_rmse.items()]

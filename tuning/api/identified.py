@@ -1,4 +1,4 @@
-"""`Identified`: parameters that were found in recorded runs, as a value."""
+"""`Identified`: parameters identified from recorded runs, as a value."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified:
-    """The most likely values of free parameters, how sure they are, and how the model does on other runs.
+    """Maximum-likelihood values of free parameters, their uncertainty, and the model's errors on other runs.
 
     Attributes:
         found: the identification itself.
-        validation: of the model at the "start" and "identified", on the held-out runs, or on those it has seen.
+        validation: of the model at the "start" and "identified", on the held-out runs, or else on the same runs.
         family: the thruster or the model whose parameters are free.
-        runs: that it learned from.
-        held_out: that only validated.
+        runs: runs used for identification.
+        held_out: runs used only for validation.
     """
 
     found: Identification
@@ -68,7 +68,7 @@ class Identified:
 
     @property
     def model(self) -> StateSpaceModel:
-        """The model with the values that were found, as the filter ran on it."""
+        """The model with the identified values, as the filter used it."""
         return self.found.objective.model_at(self.found.at)
 
     def sentences(self) -> list[str]:
@@ -76,10 +76,10 @@ class Identified:
         return [*self.found.sentences(), *remarks(self.runs, self.held_out, self.found)]
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a parameter: unit, start, value, standard error, whether the data determine it, and a test.
+        """A row per parameter: unit, start, value, standard error, whether the data determine it, and a test.
 
-        "p" is the probability of so large a fall of the likelihood where the parameter is held "left out at", if
-        that were the truth: zero where its range holds zero, else the start.
+        "p" is the probability of so large a fall of the likelihood if "left out at" were the parameter's true
+        value: zero if its range contains zero, otherwise the start.
 
         Raises:
             ValueError: if pandas is not installed.
@@ -109,7 +109,7 @@ class Identified:
         return Path(path)
 
     def plot_profiles(self, names: Sequence[str] | None = None) -> Figure:
-        """Profile likelihoods: how far the log-likelihood falls where one parameter is held elsewhere.
+        """Profile likelihoods: the fall of the log-likelihood if one parameter is held at another value.
 
         Args:
             names: of the parameters; all if None. Each takes some searches.

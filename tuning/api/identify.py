@@ -49,11 +49,12 @@ def identify(
     seed: int = 0,
     progress: bool | None = None,
 ) -> Identified:
-    """Find the parameters under which recorded runs are most likely, and say which of them the runs determine.
+    """Find the maximum-likelihood parameters for recorded runs, and say which of them the runs determine.
 
-    Of a thruster may be free: its parameters (motor_damping, voltage_gain, ...), dead_band, thrust_asymmetry,
-    ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the variances of Q and R. Of another
-    model, the arguments that have numbers for defaults, and its named constants. Ctrl-C keeps the best so far.
+    A thruster's free parameters may be its constants (motor_damping, voltage_gain, ...), dead_band,
+    thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the variances of Q and
+    R; another model's may be its arguments with numeric defaults and its named constants. Ctrl-C keeps the best so
+    far.
 
         found = tuning.identify(["run1.csv", "run2.csv"], ["motor_damping", "voltage_gain"], preset="tunnel")
         found.to_frame()
@@ -63,26 +64,26 @@ def identify(
         logs: one recorded run or several: paths of .csv, .parquet or .npz files, or of recorders', tables, or
             `Log`s; or a pair (model, logs).
         free: names of the free parameters; for a thruster its damping, gain and lift by default.
-        model: in place of a thruster: a function that returns a `StateSpaceModel` (called with dt, if it takes
-            it), a model, "module:object" for either, or a thruster's preset.
+        model: instead of a thruster: a function that returns a `StateSpaceModel` (called with dt if it has that
+            argument), a model, "module:object" for either, or a thruster's preset.
         preset: the thruster where the search starts, by name or file.
-        sensors: what the filter sees of a thruster.
+        sensors: a thruster's channels that the filter sees.
         columns: headers by quantity.
         clock_offset: seconds by quantity that a channel's clock is ahead.
-        dt: sample time [s], of logs without times, or to put them on.
-        ranges: (low, high) by name, within which a parameter is looked for.
+        dt: sample time [s] of logs without times, or of the grid.
+        ranges: search ranges (low, high) by name.
         start: values by name where the search begins.
-        noise: whether the variances of Q and R are found, too.
-        held_out: runs that only validate, themselves or by path; by default every third of three or more.
+        noise: whether the variances of Q and R are also free.
+        held_out: runs used only for validation, as objects or paths; by default every third of three or more.
         use_all: hold no run out.
-        hold_gaps: hold the last input over gaps of a log; by default runs are cut there.
+        hold_gaps: hold the last input over gaps of a log; by default runs are split there.
         filter: "ekf", or "kf" for affine models.
         predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
         degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
         gate: leave out samples beyond so many standard deviations, such as 5, as outliers.
-        starts: searches from so many starts.
-        seed: of the draws of the starts.
-        progress: whether to show it; None in terminals and notebooks only.
+        starts: number of starts of the search.
+        seed: of the random starts.
+        progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
         `Identified`: `values`, `standard_errors`, `validation`, `to_frame()`, `save()`, `plot_profiles()`.
@@ -131,8 +132,8 @@ def identified(
 
     Args:
         family: from `tuning.logs.identify.family_of`.
-        runs: to learn from.
-        proving: that only validate; if there are none, the runs themselves do.
+        runs: for identification.
+        proving: for validation; if there are none, `runs` are used.
         ranges: of some free parameters.
         start: of some.
         console: where progress is shown.

@@ -1,4 +1,4 @@
-"""Numbers that a user brings, as a choice: those of a filter, or of a model with its own Q and R."""
+"""A user's own parameters as a choice: those of a filter, or of a model with its own Q and R."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def is_own(given: Any) -> bool:
 
 
 def own_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
-    """The Q, R and other numbers of a filter or model, for a problem of the same equations; the prior is its own.
+    """The Q, R and other parameters of a filter or model, with its prior, for a problem of the same equations.
 
-    A model stands for an extended Kalman filter on it.
+    A model means an extended Kalman filter on it.
 
     Raises:
         ValueError: if the model's functions, states or constants are not those of the problem's.

@@ -23,12 +23,12 @@ RULE = (
 
 
 def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> Problem:
-    """The problem that a user gives.
+    """The problem for a user's argument.
 
     Args:
-        given: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, or "module:object"; a
-            `Problem`; or a pair (model, data) for `log_problem`, where the model is a `StateSpaceModel`, what
-            makes or offers one, "module:object", or a preset of a thruster, and data are recorded runs.
+        given: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a
+            `Problem`; or a pair (model, data) for `log_problem`, where the model is a `StateSpaceModel`, an object
+            that makes or offers one, "module:object", or a thruster's preset, and data are recorded runs.
         preset: the problem of another thruster, by name or file.
         **of_logs: options of `log_problem`, for a pair; None for those not given.
 
@@ -50,7 +50,7 @@ def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> 
 
 
 def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
-    """One problem, or several of a list; the arguments are those of `problem_of`. The second "a" is "a (2)"."""
+    """One problem, or several in a list; arguments as in `problem_of`. A second "a" is named "a (2)"."""
     some = given if isinstance(given, list) else [given]
     if not some:
         raise ValueError(f"{RULE}, or a list of them, but got an empty list")
@@ -63,9 +63,9 @@ def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) ->
 
 
 def given_for(file: str | Path, problem: Any = None, model: str | None = None, **of_logs: Any) -> list[Problem]:
-    """The problems by which a tuned file's are found again: those the user gives, and logs that the file names.
+    """The problems of a tuned file: those given by the user, and logs that the file names.
 
-    Nothing is imported that a file names: a problem or a model that is code has to be given.
+    Names in a file are never imported: a problem or a model that is code has to be given.
     """
     given = [] if problem is None else list(problems_of(problem, **of_logs))
     kept = read_tuned_file(file)["problems"]
@@ -75,7 +75,7 @@ def given_for(file: str | Path, problem: Any = None, model: str | None = None, *
 
 
 def is_filter(given: Any) -> bool:
-    """Whether something is a filter or an estimator, and no tuned file: a `Path`, or what ends in .json.
+    """Whether something is a filter or an estimator, not a tuned file (a `Path`, or a text that ends in .json).
 
     Raises:
         ValueError: for an unknown name, or any other object.

@@ -72,8 +72,8 @@ def trial_bar(
     Args:
         plan: of the study.
         names: of its scenarios.
-        total: trials that it shall have.
-        before: finished trials that it has.
+        total: total number of trials.
+        before: number of trials already finished.
         console: where it is shown.
     """
     from tuning.search.filter_types import filter_types_running

@@ -38,20 +38,19 @@ def report(
 ) -> Path:
     """Write a page on a tuned filter, its study and its evaluation on held-out seeds; return the page's path.
 
-    Beside the page its tables are written as Markdown. The page is self-contained and needs no network. Of a list
-    of two it has both side by side and, where they are of the same problem, the paired ratio of their scores.
+    The page's tables are also written as Markdown beside it. The page is self-contained and needs no network. For
+    a list of two it shows both side by side and, for the same problem, the paired ratio of their scores.
 
         tuning.report("tuned.json", out="report.html")
         tuning.report(["ekf.json", "ukf.json"], out="both.html")
 
     Args:
         source: a `Study`, a tuned file, or the name of a study in the storage; or a list of two of them.
-        out: the page, a file that ends in .html, or a folder for it; by default it is beside the tuned file, or in
-            the folder out.
-        storage: where the study is, of a file or a name; without it the page on a file leaves the search out.
-        problem: what it was tuned on, where that is code or was changed: a file only names it.
-        model: "module:object" of the logs that a tuned file names, where their model is code.
-        progress: whether to show it; None in terminals and notebooks only.
+        out: the page, a .html file, or a folder for it; by default beside the tuned file, or in the folder out.
+        storage: storage of the study; without it the page on a file omits the search.
+        problem: the problem it was tuned on, if that is code or has changed: a file only names it.
+        model: "module:object" for the logs of a tuned file, if their model is code.
+        progress: whether to show progress; by default only in terminals and notebooks.
 
     Raises:
         ValueError: if the source is refused, or the page cannot be written.

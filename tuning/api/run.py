@@ -62,7 +62,7 @@ class Tuning(NamedTuple):
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """Which trial was chosen and what gave way, in sentences; none where gradients led to the choice."""
+        """Which trial was chosen and what it replaced, in sentences; none for a choice by gradients."""
         if self.way is not None:
             return (way_sentence(self.way, self.scenario.seed_word),)
         if self.gradient is not None:
@@ -91,13 +91,13 @@ def run_tuning(
 
     Args:
         plan: of the study.
-        trials: finished trials that it shall have in total.
+        trials: total number of finished trials.
         console: where progress is shown.
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        by_gradient: the objective whose gradient leads to the choice, beside a study; None where the study does.
-        way: the way of tuning whose answer is the choice, one of `tuning.ways.registry.WAYS`; None for a study.
+        by_gradient: the objective whose gradient determines the choice, beside a study; None if the study does.
+        way: the way of tuning that determines the choice, one of `tuning.ways.registry.WAYS`; None for a study.
         workers: processes that share the study.
 
     Raises:
@@ -171,7 +171,7 @@ def _draw_first(plan: Plan, console: Console) -> None:
 
 
 def aim_of(method: str, asked: Sequence[str] | None) -> str | None:
-    """The objective whose gradient a method follows: what was asked for, if it has one, or the likelihood."""
+    """The objective whose gradient a method follows: the requested one if it has a gradient, or the likelihood."""
     if one_of("method", method, METHODS) == METHODS[0]:
         return None
     return asked[0] if asked and asked[0] in OF_STATES else LIKELIHOOD
@@ -209,7 +209,7 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
 
 
 def names_of(plan: Plan) -> str:
-    """Names of a plan's scenarios as those of a study and of a file have them."""
+    """Names of a plan's scenarios as used in names of studies and files."""
     return ", ".join(map(short_name, plan.scenarios))
 
 
@@ -219,7 +219,7 @@ def short_name(problem: Problem) -> str:
 
 
 def file_name(name: str) -> str:
-    """A problem's name without folders and what shells read: "nominal-mine" of "nominal (presets/mine.toml)"."""
+    """A problem's name without folders and special characters: "nominal-mine" of "nominal (presets/mine.toml)"."""
     paths = [Path(part.removesuffix(")")) for part in name.split(" (")]
     text = "-".join(path.stem if path.suffix == ".toml" else path.name for path in paths)
     return re.sub(r"[^\w.+-]+", "-", text).strip("-")

@@ -1,4 +1,4 @@
-"""How results show themselves: tables of pandas and of HTML, and figures of matplotlib."""
+"""Display of results: pandas and HTML tables, and matplotlib figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFrame:
-    """Columns as a table of pandas.
+    """Columns as a pandas table.
 
     Args:
         columns: of equal length, by name.

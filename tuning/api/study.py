@@ -45,7 +45,7 @@ class Study:
 
     @property
     def choice(self) -> Choice:
-        """The tuned numbers: those of the model, such as Q and R, and the filter's own."""
+        """The tuned parameters: those of the model, such as Q and R, and the filter's own."""
         return self.tuning.result.choice
 
     @property
@@ -65,7 +65,7 @@ class Study:
 
     @property
     def held_out(self) -> HeldOut:
-        """Tuned filter and baselines on seeds that the study never saw; of several problems on the first."""
+        """Tuned filter and baselines on held-out seeds; for several problems on the first."""
         return self.evaluations[0]
 
     @property
@@ -77,7 +77,7 @@ class Study:
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """The trials as Optuna has them."""
+        """The trials as Optuna objects."""
         return self.tuning.result.trials
 
     @property
@@ -87,13 +87,13 @@ class Study:
 
     @property
     def consistent(self) -> bool | None:
-        """Whether any trial's mean NIS was in its band; None where all count."""
+        """Whether any trial's mean NIS was in its band; None without a band."""
         return self.tuning.result.consistent
 
     def save(self, path: str | Path) -> Path:
-        """Write the tuned file, which `EstimateState(env, tuned=path)` and all commands take; return the path.
+        """Write the tuned file for `EstimateState(env, tuned=path)` and all commands; return the path.
 
-        A report of the study names this file afterwards.
+        Later reports of the study name this file.
 
         Raises:
             ValueError: if the file cannot be written, or the filter is an estimator that is code.
@@ -122,7 +122,7 @@ class Study:
         return Path(folder)
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a trial: its number, state, objectives, whether it is consistent, seconds, and what it tried.
+        """A row per trial: its number, state, objectives, whether it is consistent, seconds, and parameters.
 
         Raises:
             ValueError: if pandas is not installed.
@@ -151,7 +151,7 @@ class Study:
         """RMSE before and after on held-out seeds, with 95 % intervals and the bound.
 
         Raises:
-            ValueError: if there is no truth, and so no RMSE.
+            ValueError: without truth, since there is no RMSE.
         """
         return self.held_out.plot_errors()
 
@@ -164,7 +164,7 @@ class Study:
         return self.held_out.plot_consistency()
 
     def plot_sizes(self) -> Figure:
-        """RMSE against ensemble size on seeds that chose neither Q nor R.
+        """RMSE against ensemble size on separate seeds.
 
         Raises:
             ValueError: for a filter without an ensemble, or a problem without truth.

@@ -51,11 +51,10 @@ def tune(
 ) -> Study:
     """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
-    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares; of
+    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares; for
     recorded runs without true states it is the negative log-likelihood of the innovations. The first trial is the
-    rule of thumb. The mean NIS is kept in a band, because RMSE hardly determines Q and R: only their ratio matters
-    to the estimate. Ctrl-C keeps all finished trials: the study is that of these, and says that it was
-    `interrupted`.
+    rule of thumb. The mean NIS is kept in a band, because RMSE barely determines Q and R: only their ratio affects
+    the estimate. Ctrl-C keeps all finished trials: the study then consists of these and is marked `interrupted`.
 
         study = tuning.tune("mismatch", filter="enkf", trials=50)
         study.save("tuned.json")
@@ -64,14 +63,14 @@ def tune(
         study = tuning.tune((model, ["run1.csv", "run2.csv"]), trials=100)
 
     Args:
-        problem: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, or "module:object"; a
+        problem: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a
             `Problem`; a pair (model, data) of a model, or a thruster's preset, and recorded runs; or a list of
-            several problems, of whose objectives the mean is minimised, or the `worst`. Recorded runs are paths,
-            tables of pandas, mappings from headers to arrays, or `Log`s.
+            problems, for the mean of their objectives or the `worst`. Recorded runs are paths,
+            pandas tables, mappings from headers to arrays, or `Log`s.
         filter: name of a filter; "auto" for the best of all within the budget; or "module:object" for an estimator
             of your own, which can be used and evaluated, but not saved.
-        trials: finished trials that the study shall have in total.
-        seed: of all randomness; the same seed repeats all.
+        trials: total number of finished trials of the study.
+        seed: of all randomness; the same seed gives the same results.
         objective: the quantity to minimise, or two for a Pareto front, as `thruster tune --objective` lists them;
             by default the score, or without truth the negative log-likelihood.
         consistent: whether the mean NIS is kept between 0.8 and 1.25 times its expected value; the objective
@@ -80,32 +79,32 @@ def tune(
         hold_r: keep R at the data sheet's value, tune only Q.
         full_q: tune the correlations of Q, too.
         full_r: tune the correlations of R, too.
-        where: relations among the numbers of the model that hold, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
+        where: relations that parameters must obey, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
             (not tuned), "Q11 = 1e-6..1e-2" (its range).
         augment: constants of the model, such as "voltage_gain", that the filter also estimates, as further states
             whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
         budget: time limit of a step of the filter [microseconds of one core].
-        sampler: of Optuna: "tpe", "random", "cma-es", ...
+        sampler: Optuna's sampler: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for Kalman filters but kf-steady, gsf, imm, mmae, fuzzy: maximum
-            likelihood, or the best "score", "mse" or "log-score" where that is the objective.
-        way: another way of tuning in place of the study, such as "em", as `thruster ways` lists them: it ends of
-            itself, or if it is a sampler after so many trials.
+        method: "optuna"; or "gradient", for Kalman filters except kf-steady, gsf, imm, mmae, fuzzy: maximum
+            likelihood, or the best "score", "mse" or "log-score" if that is the objective.
+        way: another way of tuning instead of a study, such as "em", as `thruster ways` lists them: a sampler ends
+            after `trials` trials, the others by their own criterion.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.
-        name: of the study; by default from the above.
-        progress: whether to show it; None in terminals and notebooks only.
+        name: of the study; by default from the arguments above.
+        progress: whether to show progress; by default only in terminals and notebooks.
         preset: the problem of another thruster, by name or file.
-        sensors: of recorded runs of a thruster, what the filter sees.
-        columns: of recorded runs, headers by quantity.
-        clock_offset: of recorded runs, seconds by quantity that a channel's clock is ahead.
-        dt: of recorded runs, the sample time [s].
+        sensors: for recorded runs of a thruster, the channels that the filter sees.
+        columns: for recorded runs, headers by quantity.
+        clock_offset: for recorded runs, seconds by quantity that a channel's clock is ahead.
+        dt: for recorded runs, the sample time [s].
         held_out: recorded runs used only for the held-out evaluation; by default every third.
-        blocks: how many blocks a recorded run is cut into.
-        lead: rows at the beginning of a block that do not count.
-        hold_gaps: of logs, whether runs are not cut at gaps, and their inputs are held there.
-        start: of logs, where blocks begin: "prior", or "measurement", where their first measurement says.
+        blocks: number of blocks per recorded run.
+        lead: rows at the beginning of a block that are not scored.
+        hold_gaps: hold the last input over gaps of a log; by default runs are split there.
+        start: initial state of blocks of logs: "prior", or "measurement", from their first measurement.
 
     Returns:
         `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
