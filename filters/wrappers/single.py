@@ -42,8 +42,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "belief": the mean, then the standard deviations, (2 n,).
 
     Entries that the env appends to its measurement (validity flags, a reference signal) stay at the end of
-    the observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m includes
-    them in the observation, but not in the innovation.
+    the observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m
+    includes them in the observation, but not in the innovation.
 
     The info dictionary gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m)
     and `estimate_divergences`, the number of restarts from the prior after an estimate that was not finite. All

@@ -20,8 +20,8 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
 
     Names in the file are never imported: the model is the env's own, or given by the caller, and must be
     the file's. A file that contains its plant as data is compared with the env's plant, if no model is
-    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files older than version 4
-    are compared only by the plant.
+    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files older than version
+    4 are compared only by the plant.
 
     Args:
         env: the wrapped env.

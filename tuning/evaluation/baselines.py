@@ -54,7 +54,7 @@ def rule_of_thumb(name: str, scenario: Problem) -> Choice:
 def given(name: str, scenario: Problem) -> Choice | None:
     """The filter with the given Q and R of the problem's model; None if there are none.
 
-    Those of a model that has the plant's own Q and R are the oracle's, and not given.
+    A model with the plant's own Q and R is the oracle, not a given one.
     """
     return given_choice(name, scenario) if filter_class(name).has_covariance else None
 
@@ -65,7 +65,7 @@ def rule_label(scenario: Problem) -> str:
 
 
 def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | None:
-    """The filter with the sample covariances of what its model leaves of the truth; None where there are none."""
+    """The filter with the sample covariances of its model's residuals on the truth; None if there are none."""
     if not filter_class(name).has_covariance:
         return None
     found = noise_estimation(scenario, seed)
@@ -75,14 +75,14 @@ def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | Non
 
 
 def with_covariances(choice: Choice, q: np.ndarray | None, r: np.ndarray | None) -> Choice:
-    """The same choice with another Q (n, n) and R (m, m), each as it was if None."""
+    """The same choice with another Q (n, n) and R (m, m), unchanged if None."""
     noise = {} if q is None else {"process_noise_cov": rows_argument(q)}
     noise |= {} if r is None else {"measurement_noise_cov": as_argument(r)}
     return choice._replace(model={**choice.model, **noise})
 
 
 def oracle(name: str, scenario: Problem) -> Choice | None:
-    """The filter that knows the plant's own Q and R, with the rule of thumb's N; None if they are unknown."""
+    """The filter with the plant's own Q and R and the rule of thumb's N; None if they are unknown."""
     return oracle_choice(name, scenario)
 
 
@@ -92,18 +92,17 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
 
-    An engineer would do the same after one look at the innovations. R stays. The runs are the training runs of a
-    study with this seed, and the random numbers are the same for each c, so the same arguments give the same
-    factor.
+    An engineer would do the same after one look at the innovations. R is unchanged. The runs are the training runs
+    of a study with this seed, with the same random numbers for each c, so the same arguments give the same factor.
 
     Args:
         name: name of the filter.
-        scenario: makes the training runs, and says what the filter assumes of the plant.
+        scenario: generates the training runs, and defines the model that the filter assumes.
         seed: seed of the study.
 
     Returns:
-        The choice with its factor and mean NIS; or the reason why there is none, for a filter that has no NIS or
-        whose mean NIS no factor between 1e-8 and 1e8 brings to 1.
+        The choice with its factor and mean NIS; or the reason why there is none: the filter has no NIS, or no
+        factor between 1e-8 and 1e8 brings its mean NIS to 1.
     """
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
@@ -141,7 +140,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
 
 def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
-    """A rule of thumb with a factor on its Q, even where Q follows from other parameters."""
+    """A rule of thumb with a factor on its Q, even if Q follows from other parameters."""
     return scaled(_with_noise(rule, scenario), factor)
 
 
@@ -165,7 +164,7 @@ def _with_noise(choice: Choice, scenario: Problem) -> Choice:
 
 
 def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
-    """All baselines of a filter that exist, by name, the most important one first.
+    """All existing baselines of a filter by name, the most important one first.
 
     The scaled default is computed for the study's seed, unless it is given. If the model's given values are the
     rule of thumb, there is one baseline for both, called "given".

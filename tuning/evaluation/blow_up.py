@@ -1,4 +1,4 @@
-"""Does the model of a filter blow up between samples? Asked of its innovations on a problem's data."""
+"""Whether a filter's model blows up between samples, by its innovations on a problem's data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None)
     """A sentence on a filter whose model blows up between samples, from its scored innovations; empty otherwise.
 
     Args:
-        filter_: that made the estimates.
+        filter_: the filter of the estimates.
         estimates: on the same data.
         data: inputs and measurements.
         dt: sample time [s], if there is one.

@@ -43,7 +43,7 @@ SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
 class Contender(NamedTuple):
-    """A filter in a comparison, which may be made for any scenario."""
+    """A filter in a comparison, which can be made for any scenario."""
 
     label: str
     choose: Callable[[Problem], Choice]
@@ -52,7 +52,7 @@ class Contender(NamedTuple):
     suit: Callable[[Problem], Problem] = lambda problem: problem  # as the filter assumes it
 
     def filter(self, scenario: Problem) -> Filter:
-        """The filter, with what the scenario lets it assume of the plant."""
+        """The filter, with the model that the scenario lets it assume."""
         choice = self.choose(scenario)
         filter_ = choice.filter(self.suit(scenario))
         if not self.unknown:
@@ -140,9 +140,9 @@ def contender(
     Args:
         name: name of a filter; or an estimator, a function that makes one from a model, or "module:object".
         knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q follows
-            from the mean NIS on the training runs, "untuned" for the rule of thumb, "given" for what the model
-            that filters assume came with.
-        unknown: constants of the model to estimate with the states; a belief of None stands for `default_belief`.
+            from the mean NIS on the training runs, "untuned" for the rule of thumb, "given" for the values of the
+            model that filters assume.
+        unknown: constants of the model to estimate with the states; a belief of None means `default_belief`.
         seed: seed of the study whose training runs scale the scaled default.
         **numbers: parameters of the filter, such as `ensemble_size`; by default those of the rule of thumb.
 
@@ -204,7 +204,7 @@ def compare(
 
     Args:
         contenders: the filters; the others are compared with the first one.
-        scenarios: the problems that they are compared on.
+        scenarios: the problems of the comparison.
         seeds: at least 2, held-out ones for a comparison of tuned filters; or a function that returns the seeds of
             a problem.
         on_row: called before each filter's run with the scenario and the filter's label.
@@ -264,9 +264,9 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
 
 
 def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
-    """Metrics of a filter on some data, by run, and the seconds that its runs took without compilation.
+    """Metrics of a filter on some data, by run, and the seconds of its runs without compilation.
 
-    The scale says of which states log scores are; None for none.
+    The scale selects the states of log scores; None for none.
     """
     seen = data.seen
     few = seen.filter_keys[:2], seen.inputs[:2, :2], seen.measurements[:2, :3]

@@ -1,6 +1,6 @@
 """A filter on a problem's data: errors with intervals, consistency, and paired comparisons.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared. Of a consistent filter
+NEES is the normalised estimation error squared, NIS the normalised innovation squared. For a consistent filter
 their expected values are the number of states and the number of measured channels.
 """
 
@@ -67,7 +67,7 @@ class Evaluation(NamedTuple):
 
     @property
     def scored(self) -> list[int]:
-        """Indices of the states that count in the score."""
+        """Indices of the scored states."""
         return np.flatnonzero(np.isfinite(self.scale)).tolist()
 
 
@@ -75,10 +75,10 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     """Run a filter over all seeds of some data in compiled, parallel calls, and compute its metrics.
 
     Args:
-        filter_: the filter; where it estimates more than the plant's n states, these come first.
-        data: inputs and measurements, and the truth where it is known.
-        scale: (n,) by which the score divides errors, the problem's `scale`: infinite for states that do not
-            count; None where there is no truth.
+        filter_: the filter; if it estimates more than the plant's n states, these come first.
+        data: inputs and measurements, and the truth if known.
+        scale: (n,) by which the score divides errors, the problem's `scale`: infinite for states that are not
+            scored; None without truth.
 
     Raises:
         ValueError: if the scale is not positive, or not one number for each state.
@@ -88,7 +88,7 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
 
 
 def values_of(filter_: Filter, data: Data, scale) -> Evaluation:
-    """What `evaluate` gives, faster: values without intervals, without NEES and derived outputs."""
+    """A faster `evaluate`: values without intervals, NEES and derived outputs."""
     return compute_metrics(filter_, metrics_of_all(filter_, data, False, False), data, scale, False, False)
 
 
@@ -97,8 +97,8 @@ def compute_metrics(
 ) -> Evaluation:
     """Metrics of a filter from those of its runs; other arguments and errors are those of `evaluate`.
 
-    Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values;
-    so do variances of NEES and NIS.
+    Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values,
+    as do variances of NEES and NIS.
     """
     some = runs.present[runs.present > 0]
     nees_variance, nis_variance = variance_ratios(runs) if variances else (np.nan, np.nan)
@@ -178,7 +178,7 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
     Args:
         filter_: the filter.
         data: of at least two runs.
-        dt: sample time [s], which is named where the model blows up between samples.
+        dt: sample time [s], named in the report if the model blows up between samples.
     """
     model, members, first = filter_.model, None, data.first_scored
     seen, states = data.seen, None if data.states is None else data.known_states
@@ -210,7 +210,7 @@ def score(mean_squares: np.ndarray, scale: np.ndarray, weights: np.ndarray | Non
 
 
 def mse(mean_squares: np.ndarray, scale: np.ndarray, weights: np.ndarray | None = None) -> float:
-    """Sum over the states that count of mean square error over scale^2; arguments as of `score`."""
+    """Sum over the scored states of mean square error over scale^2; arguments as in `score`."""
     counted = np.isfinite(scale)
     return float((pooled_mean(mean_squares, weights)[counted] / scale[counted] ** 2).sum())
 
@@ -249,13 +249,13 @@ def median_score_ratio(a: Evaluation, b: Evaluation) -> float:
 
 
 def resampled_ratios(a: Evaluation, b: Evaluation) -> np.ndarray:
-    """Score of a over that of b for every bootstrap resample of the runs, which are the same for both."""
+    """Score of a over that of b for every bootstrap resample of their common runs."""
     scores = [_scores(np.sqrt(resampled_means(e.mean_squares, e.weights)), e.scale) for e in (a, b)]
     return scores[0] / scores[1]
 
 
 def likelihood_gain(a: Evaluation, b: Evaluation) -> Interval:
-    """Log-likelihood of a less that of b, mean over runs with a paired interval: above 0, a predicts better.
+    """Log-likelihood of a minus that of b, mean over runs with a paired interval: above 0, a predicts better.
 
     It needs no truth. NaN for a filter without a covariance.
 

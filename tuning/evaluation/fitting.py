@@ -11,11 +11,11 @@ from tuning.problems.problem import Problem
 
 
 def fitting(names: Iterable[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
-    """The filters that take the models of all problems, and by label why each other one does not.
+    """The filters that accept the models of all problems, and by label why the others do not.
 
     Args:
         names: of filters, or estimators.
-        problems: on which they are to run.
+        problems: the problems of the comparison.
     """
     kept: list[Any] = []
     left_out: dict[str, str] = {}

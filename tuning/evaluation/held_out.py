@@ -61,7 +61,7 @@ class Comparison(NamedTuple):
 
     @property
     def baselines(self) -> tuple[str, ...]:
-        """Names of the baselines that there are, the most important one first."""
+        """Names of the existing baselines, the most important one first."""
         return tuple(name for name in BY_IMPORTANCE if name in self.evaluations)
 
     @property
@@ -74,7 +74,7 @@ class Comparison(NamedTuple):
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
-        """Log-likelihood of a run of the tuned filter less that of each baseline; it needs no truth."""
+        """Log-likelihood of a run of the tuned filter minus that of each baseline; it needs no truth."""
         if self.kept_gains is not None:
             return dict(self.kept_gains)
         found = self.evaluations
@@ -86,7 +86,7 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
 
     Args:
         choice: of a study.
-        scenario: on what.
+        scenario: the problem.
         seed: of the study; its training seeds scale the scaled default.
         count: number of held-out seeds; a problem of logs has a fixed number, and ignores it.
     """

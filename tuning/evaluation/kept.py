@@ -1,8 +1,8 @@
 """Results of long computations that a study and a tuned file store, so that a report need not repeat them.
 
-They are stored with a digest of what they follow from, and used only where that is the same: the choice, the
-problems and the versions of all packages. The digest does not prove who wrote them: `tuning.evaluation.verify`
-recomputes held-out metrics.
+They are stored with a digest of their inputs (the choice, the problems and the versions of all packages), and
+    used only if that is the same. The digest does not prove who wrote them: `tuning.evaluation.verify` recomputes
+    held-out metrics.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
 
 
 def kept_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
-    """The stored table of ensemble sizes, if it is that of this choice; else None.
+    """The stored table of ensemble sizes if it belongs to this choice, otherwise None.
 
     Args:
         data: the result of `sizes_as_data`, or anything else.
@@ -80,7 +80,7 @@ def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
 
 
 def comparison_as_data(comparison: Comparison) -> dict:
-    """What a report shows of a comparison in addition to the metrics in a tuned file."""
+    """The data of a comparison that a report needs besides the metrics in a tuned file."""
     found = {role: getattr(comparison, role) for role in ROLES}
     return {
         "expected_nis": _plain(comparison.tuned.expected_nis),
@@ -94,12 +94,12 @@ def comparison_as_data(comparison: Comparison) -> dict:
 def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
     """The held-out comparison on a problem that a tuned file stores; None if it has to be recomputed.
 
-    That is where the file does not contain it, or was made with other versions of packages.
+    It is recomputed if the file lacks it, or was made with other versions of packages.
 
     Args:
         content: content of the tuned file.
         choice: the file's choice.
-        problem: one of those that it was tuned on, with the digest that the file has.
+        problem: one of the file's problems, with the file's digest.
     """
     if content.get("made_with") != versions():
         return None

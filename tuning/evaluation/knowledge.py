@@ -1,4 +1,4 @@
-"""What filters of a comparison know about the plant's noise and assume about its constants."""
+"""The noise and constants that filters of a comparison assume."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:
     """The source of the Q and R of the filters in a comparison; empty if not stated.
 
     Args:
-        rows: with a label, and what the filter knows.
-        option: what the user calls the choice among them.
+        rows: with a label, and the source of the filter's Q and R.
+        option: the user's name for the choice among these.
     """
     groups: dict[str, list[str]] = {}
     for row in rows:

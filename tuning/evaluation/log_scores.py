@@ -21,14 +21,14 @@ def log_scores_of(
 ) -> np.ndarray:
     """Log N(x; x^, P) of late steps, (B, T); NaN where a step is not scored, and without truth or covariance.
 
-    The density is that of the states of finite scale alone. A step at which their P is singular, or not finite,
-    has the least score there is, -1e6: a filter earns nothing by a covariance that is none.
+    The density is that of the states of finite scale alone. A step at which their P is singular or not finite
+    has the lowest score, -1e6: a filter gains nothing by an invalid covariance.
 
     Args:
-        filter_: that made the estimates.
+        filter_: the filter of the estimates.
         estimates: of all steps.
         data: of the same runs.
-        scale: (n,), infinite for states that do not count; None without truth.
+        scale: (n,), infinite for states that are not scored; None without truth.
 
     Source: Gneiting, Raftery (2007), "Strictly proper scoring rules, prediction, and estimation", JASA 102(477).
     """

@@ -1,4 +1,4 @@
-"""Noise estimation: sample covariances of what a model's two equations leave of the truth."""
+"""Noise estimation: sample covariances of the residuals of a model's two equations on the truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROUNDING = 1e-12  # of a state's largest value, below which residuals are roundi
 
 
 class Residuals(NamedTuple):
-    """What a model leaves of true states and of measurements, in a row each."""
+    """Residuals of a model on true states and on measurements, one per row."""
 
     process: np.ndarray  # (N, n), x_{k+1} - f(x_k, u_k)
     measurement: np.ndarray  # (N', m), z_k - h(x_k), of the times at which all channels were measured
@@ -45,9 +45,9 @@ class Estimated(NamedTuple):
 
 
 def residuals(model: StateSpaceModel, data: Data) -> Residuals:
-    """Residuals of a model on runs whose true states are known, scored steps only.
+    """Residuals of a model on runs with known true states, scored steps only.
 
-        w_k = x_{k+1} - f(x_k, u_k),   v_k = z_k - h(x_k);  of angles the short way round
+    w_k = x_{k+1} - f(x_k, u_k),   v_k = z_k - h(x_k);  angles wrapped
 
     Args:
         model: with as many states as are known.

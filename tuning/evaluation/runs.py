@@ -24,7 +24,7 @@ FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finit
 class RunMetrics(NamedTuple):
     """Metrics of a filter in each of B runs, over T late steps; those that need the truth may be None.
 
-    Of the late steps those count that are scored (`Data.scored`).
+    Only scored late steps count (`Data.scored`).
     """
 
     nis: np.ndarray  # (B, T), NaN where nothing was measured or S is singular, or the step is not scored
@@ -40,7 +40,7 @@ class RunMetrics(NamedTuple):
 
     @property
     def weights(self) -> np.ndarray | None:
-        """By which runs are pooled, (B,): their numbers of scored steps; None where these are all the same."""
+        """Weights by which runs are pooled, (B,): their numbers of scored steps; None if these are equal."""
         return None if (self.counts == self.counts[0]).all() else self.counts.astype(np.float64)
 
 
@@ -54,9 +54,9 @@ def metrics_by_run(
 ) -> RunMetrics:
     """Metrics of a filter's estimates on some data, run by run, for the states that the plant has.
 
-    The NEES is NaN unless it is wanted: for forty states it takes a tenth of the filter's own time. Errors of
-    derived outputs are left out unless they are wanted; log scores are those of the states with a finite scale,
-    and left out where no scale is given.
+    The NEES is NaN unless requested: for forty states it takes a tenth of the filter's own time. Errors of
+    derived outputs are omitted unless requested; log scores are those of the states with a finite scale,
+    and omitted without a scale.
     """
     late, measurements = data.late, data.measurements
     present = (~np.isnan(data.late_scored(measurements))).sum(axis=-1)
@@ -108,8 +108,8 @@ def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
 def variance_ratios(runs: RunMetrics) -> tuple[float, float]:
     """Variances of NEES and NIS over a run's steps over those of chi-squares, means over runs; NaN for none.
 
-    A chi-square of m degrees of freedom has the variance 2 m; where the number of measured channels changes, the
-    variance of that number adds to it.
+    A chi-square of m degrees of freedom has the variance 2 m; if the number of measured channels varies, its
+    variance is added.
     """
     degrees = runs.present[runs.present > 0]
     nis = _variance_over_steps(runs.nis) / (2.0 * degrees.mean() + degrees.var()) if degrees.size else np.nan
@@ -137,9 +137,9 @@ def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
 
 
 def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
-    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round; needs data with truth.
+    """Errors (B, K + 1, n) of the plant's n states, with angles wrapped; needs data with truth.
 
-    They are NaN where a step does not count.
+    They are NaN at steps that are not scored.
     """
     states = data.known_states
     n = states.shape[-1]

@@ -41,15 +41,15 @@ def ensemble_sizes(
 ) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
-    Neither Q nor R nor N was chosen on these seeds (`seeds.size_seeds`). Where the plan has a budget, no size is
-    above that of the choice, which is known to be within it. Without truth there is no score, and no row. For
+    Neither Q nor R nor N was chosen on these seeds (`seeds.size_seeds`). If the plan has a budget, no size is
+    above that of the choice, which is within it. Without truth there is no score, and no row. For
     models of more than twelve states the sizes are first compared on a few of the seeds: see `few_seeds_first`.
 
     Args:
         choice: the choice of a study.
         plan: the plan of the study.
         training: the plan's training data, on which the mean NIS has to be within its band, as in the trials.
-        consistent: whether the best size is sought among those whose mean NIS is within its band.
+        consistent: whether the best size must have its mean NIS in the band.
     """
     if any(problem.scale is None for problem in plan.scenarios):
         return []
@@ -72,14 +72,14 @@ def ensemble_sizes(
 def few_seeds_first(
     choice: Choice, plan: Plan, training: Sequence[Data], sizes: Sequence[int], consistent: bool
 ) -> list[SizeRow]:
-    """The same where a step is expensive: a size is not run on all seeds if a few seeds show that it is too small.
+    """The same for expensive steps: a size is not run on all seeds if a few seeds show that it is too small.
 
-    All sizes are run on the first eight seeds. The one with the lowest score there, of each scenario, is the best
-    one, and is run on all seeds; so are the others, smallest first, until one is sufficient. A size is left out if
-    its score is more than 1 % above that of the best on the first seeds already, by the lower end of a 99.9 %
-    interval: an interim analysis needs this level so that the final interval keeps its 95 % (Peto's rule). No size
-    is accepted early, for runs in which a small ensemble fails may be rare. The mean NIS is that of the first
-    fresh seeds, and for sizes that are run on all seeds that of the training data.
+    All sizes are run on the first eight seeds. The one with the lowest score there, in each scenario, is the best
+    one, and is run on all seeds; so are the others, smallest first, until one is sufficient. A size is dropped if
+    its score on the first seeds is more than 1 % above the best, by the lower end of a 99.9 % interval: an interim
+    analysis needs this level so that the final interval keeps its 95 % (Peto's rule). No size is accepted early,
+    because a small ensemble may fail only in rare runs. The mean NIS is that of the first fresh seeds; for sizes
+    run on all seeds it is that of the training data.
 
     Source: Peto et al. (1976), "Design and analysis of randomized clinical trials requiring prolonged observation
     of each patient", British J. Cancer 34, 585-612.
@@ -166,8 +166,8 @@ def _worst(ratios: Iterable[Interval]) -> Interval:
 def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
     """The smallest size whose 95 % interval of the score over the best one ends below 1.01.
 
-    With several scenarios there may be none that is so good on all of them; then it is the smallest whose interval
-    ends within 1 % of where that of the best compromise ends. Where it has to be consistent, sizes whose mean NIS
+    With several scenarios there may be none for all of them; then it is the smallest whose interval
+    ends within 1 % of that of the best compromise. If it has to be consistent, sizes whose mean NIS
     is outside its band are not eligible.
     """
     scores = [row.ratio.value for row in sizes]
@@ -178,12 +178,12 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
 
 
 def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
-    """The smallest ensemble whose estimates are so close to the largest one's that the error hardly grows.
+    """The smallest ensemble whose estimates are so close to the largest one's that the error barely grows.
 
         mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
 
-    Without truth this can still be computed: sampling adds this much to the mean square error, in units of the
-    variance that the largest ensemble assumes. The likelihood is insensitive to it where R is large. Where the
+    This can be computed without truth: sampling adds this much to the mean square error, in units of the
+    variance that the largest ensemble assumes. The likelihood is insensitive to it if R is large. If the
     plan has a budget, no size is above that of the choice.
 
     Args:
@@ -224,7 +224,7 @@ def _counting(outside: Sequence[float], consistent: bool, scores: Sequence[float
 
 
 def left_out(rows: Sequence[SizeRow], kept: int) -> list[int]:
-    """Sizes that were not eligible for their mean NIS, where the kept one is in its band."""
+    """Sizes that were not eligible because of their mean NIS, if that of the kept one is in its band."""
     outside = {row.size: row.outside for row in rows}
     return [] if outside.get(kept, 1.0) > 0 else [size for size, found in outside.items() if found > 0]
 

@@ -1,4 +1,4 @@
-"""Evaluations as plain numbers, as files and studies hold them, and back."""
+"""Evaluations as plain numbers, as stored in files and studies, and back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tuning.problems.problem import Problem
 
 
 def summary(evaluation: Evaluation) -> dict:
-    """The figures of an evaluation as plain numbers for JSON, None where there is no value."""
+    """The results of an evaluation as plain numbers for JSON, None if there is no value."""
     return {
         "rmse": [numbers(value) for value in evaluation.rmse],
         "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
@@ -31,9 +31,9 @@ def summary(evaluation: Evaluation) -> dict:
 def summarised(
     data: Mapping, problem: Problem, expected_nis: float | None = None, median_nees: float | None = None
 ) -> Evaluation:
-    """An evaluation with the figures of a `summary`, without single runs: it has the arrays of one run.
+    """An evaluation from a `summary`, without single runs: it has the arrays of one run.
 
-    So no interval can be computed from it, and no paired comparison.
+    It allows no intervals and no paired comparison.
 
     Raises:
         KeyError, TypeError, ValueError: if the data are not a summary.
@@ -66,7 +66,7 @@ def summarised(
 
 
 def numbers(value: Interval) -> list[float] | None:
-    """An interval as plain numbers, None where there is none."""
+    """An interval as plain numbers, None if there is none."""
     return None if math.isnan(value.value) else list(value)
 
 

@@ -124,16 +124,16 @@ def _kept(problem: Problem) -> dict:
 
 
 def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem] = ()) -> Problem:
-    """A problem that a tuned file names: built in, stored in the file, or given by the caller.
+    """A problem of a tuned file: built in, stored in the file, or given by the caller.
 
-    Nothing is imported that a file names: a problem that is code has to be given. A file of version 2 has only the
+    Names in a file are never imported: a problem that is code has to be given. A file of version 2 has only the
     path of a scenario file, which is then read.
 
     Args:
         content: content of the tuned file, from `read_tuned_file`.
         name: name of the problem.
         path: path of the tuned file, for errors.
-        given: problems of the caller, which are found by name or digest.
+        given: problems of the caller, matched by name or digest.
 
     Raises:
         ValueError: if there is no such problem, the stored content is damaged, or the given problem is another
@@ -188,7 +188,7 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
 
     Args:
         path: path of the file.
-        problems: the problems it was tuned on, if these are code, which the file only names.
+        problems: the problems it was tuned on, if these are code, since the file only names them.
     """
     content = read_tuned_file(path)
     try:

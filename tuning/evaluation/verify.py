@@ -26,7 +26,7 @@ class Difference(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """The difference over the larger magnitude; infinite where one of them is not a number."""
+        """The difference over the larger magnitude; infinite if one of them is not a number."""
         if not isinstance(self.stored, int | float) or not isinstance(self.found, int | float):
             return float("inf")
         return abs(self.stored - self.found) / max(abs(self.stored), abs(self.found))
@@ -50,10 +50,10 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
 
     Args:
         path: the tuned file.
-        problems: the problems it was tuned on, if these are code: nothing that a file names is imported.
+        problems: the problems it was tuned on, if these are code: names in a file are never imported.
 
     Raises:
-        ValueError: if the file is not a complete tuned file as it was written, or has no metrics.
+        ValueError: if the file is not a complete, unchanged tuned file, or has no metrics.
     """
     content, (choice, _, seed) = read_tuned_file(path), read_tuned(path, problems)
     held_out = content.get("held_out")

@@ -8,7 +8,7 @@ PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that a tuned file depends on, as they are installed."""
+    """Installed versions of the packages that a tuned file depends on."""
     return {name: _version(name) for name in PACKAGES}
 
 

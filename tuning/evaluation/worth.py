@@ -62,7 +62,7 @@ def _listed(parts: Sequence[tuple[str, str]]) -> str:
 
 
 def sized(gained: Interval) -> Interval:
-    """A gain with its interval, or the size of a loss: what "above" or "below" is said of."""
+    """A gain with its interval, or the size of a loss, to go before "above" or "below"."""
     return gained if gained.value >= 0 else Interval(-gained.value, -gained.high, -gained.low)
 
 

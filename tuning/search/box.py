@@ -1,6 +1,6 @@
-"""Samplers that draw Q and R within a box of their ranges, which grows where the best trial nears a side of it.
+"""Samplers that draw Q and R within a box in their ranges, which grows as the best trial nears a side of it.
 
-Ranges are wide, so that no truth lies outside; and most of them is nonsense, in which a search would lose its way.
+Ranges are so wide that no truth lies outside, and most of their values are implausible.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def box(
 ) -> dict[str, BaseDistribution]:
     """The distributions of a space, those of Q and R within their box.
 
-    A side is where the search begins or ten times beyond the best trial, whichever is farther, within the range.
+    A side is the initial one or ten times beyond the best trial, whichever is farther, within the range.
 
     Args:
         space: distributions by name.
@@ -40,7 +40,7 @@ def box(
 
 
 class InBox:
-    """A sampler that draws within the box; trials that are enqueued, and those near the best one, know none."""
+    """A sampler that draws within the box, which does not limit enqueued trials and those near the best one."""
 
     def __init__(self, first: Mapping[str, tuple[float, float]], **options):
         """Remember where the search begins."""

@@ -20,7 +20,7 @@ _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
 class CmaEsSampler(optuna.samplers.CmaEsSampler):
     """`optuna.samplers.CmaEsSampler` that reads only its own state from a journal or database.
 
-    Optuna unpickles the state that it finds in a study's trials, so a study from another person could run code.
+    Optuna unpickles the state in a study's trials, so another person's study could run code.
     """
 
     def _restore_optimizer(self, completed_trials: list[FrozenTrial]):
@@ -33,7 +33,7 @@ class CmaEsSampler(optuna.samplers.CmaEsSampler):
 
 
 def read_state(text: str):
-    """The optimizer whose state a study holds, a pickle as hexadecimal digits.
+    """The optimizer stored in a study, a pickle as hexadecimal digits.
 
     Raises:
         ValueError: if it is not such a state, or names anything but an optimizer of `cmaes` and arrays of NumPy.

@@ -38,7 +38,7 @@ def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -
 def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]) -> np.ndarray:
     """Derivatives of `full_covariance` by its correlations, (n (n - 1) / 2, n, n).
 
-    Only row i of L depends on r_ij: L_ij grows with sqrt(1 - sum_{k<j} L_ik^2), and what stands behind it shrinks
+    Only row i of L depends on r_ij: L_ij grows with sqrt(1 - sum_{k<j} L_ik^2), and later entries shrink
     with r_ij / (1 - r_ij^2).
     """
     n = len(variances)
@@ -69,7 +69,7 @@ def _lower(n: int, correlations: Sequence[float]) -> np.ndarray:
 def correlations_of(cov: np.ndarray) -> list[float]:
     """The correlations from which `full_covariance` makes a covariance (n, n), which may be singular.
 
-    One that nothing determines is 0: that of a state without a variance, or with one that other states determine.
+    An undetermined correlation is 0: that of a state with no variance, or with one determined by other states.
     """
     deviations = np.sqrt(np.diag(cov))
     scale = np.where(deviations > 0, deviations, 1.0)

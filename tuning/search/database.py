@@ -1,4 +1,4 @@
-"""Databases as storages of studies, patient with outages, and the proxy of one.
+"""Databases as storages of studies, tolerant of outages, and their proxy.
 
 Only a study in a database loads SQLAlchemy, which takes a tenth of a second.
 """
@@ -43,7 +43,7 @@ def open_database(url: str, on_lost: OnLost) -> BaseStorage:
 
     Args:
         url: of the database.
-        on_lost: called with a study and a trial of it that has given no sign of life for a while.
+        on_lost: called with a study and one of its trials whose heartbeat has stopped.
     """
     return _proxy(url) if url.startswith("grpc://") else _PatientStorage(_database(url, on_lost))
 
@@ -95,7 +95,7 @@ class Outage:
         self._told = False
 
     def answered(self, name: str) -> None:
-        """Note that a call was answered; one that writes has certainly been so by the database, not by a cache."""
+        """Note that a call was answered: if it writes, certainly by the database, not by a cache."""
         if self._failing:
             self._failing = set() if not name.startswith(("get", "_get")) else self._failing - {name}
             if not self._failing:

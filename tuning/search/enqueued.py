@@ -1,4 +1,4 @@
-"""Trials that a finished trial calls for: a sampler would find them by chance only, and late.
+"""Trials enqueued after a finished trial: a sampler would find them only late and by chance.
 
 NIS is the normalised innovation squared.
 """
@@ -37,7 +37,7 @@ MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is trie
 
 
 def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
-    """Enqueue what an interrupted study left out: the rescaled last trial, and the next filter type."""
+    """Enqueue what an interrupted study still lacks: the rescaled last trial, and the next filter type."""
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if finished and _rescales(plan):
         _enqueue_rescaled(study, plan, finished[-1])
@@ -45,11 +45,11 @@ def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
 
 
 def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
-    """Enqueue the trials that the last one calls for.
+    """Enqueue the trials that follow from the last one.
 
     After the first one these are the baselines and the maximum-likelihood trial, which is repeated later with the
-    other parameters of the best trial. Further the same trial with rescaled Q and R, a smaller ensemble, and its Q
-    and R for other filter types; and the next filter type when these are done.
+    other parameters of the best trial. Further trials have rescaled Q and R, a smaller ensemble, or its Q
+    and R for other filter types; then comes the next filter type.
     """
     if _rescales(plan):
         _enqueue_rescaled(study, plan, last)

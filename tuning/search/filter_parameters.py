@@ -1,4 +1,4 @@
-"""The parameters that filters have beside their model, as a study may choose them, with ranges."""
+"""The parameters of filters besides their model that a study may choose, with ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study over several filter types reports of each."""
+"""The report of a study over several filter types on each type."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tuning.search.space import FILTER_TYPE
 
 
 class FilterType(NamedTuple):
-    """How a filter type did in a study."""
+    """The results of a filter type in a study."""
 
     name: str
     trials: int  # finished ones

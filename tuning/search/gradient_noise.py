@@ -23,13 +23,12 @@ MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states or parameters, and to
 
 
 def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
-    """The Q and R, or own parameters, to which gradients of an objective lead, kept with the study.
+    """The Q and R, or own parameters, found by gradients of an objective, stored with the study.
 
-    They are those of the tuned filter where it has gradients, learns no noise, and the model has few states, else
-    of an extended Kalman filter, by an ascent: of models of few states from three starts. Near the best Q and R
-    the score is so flat that a sampler finds the place late, and among many correlations never; where the model is
-    wrong the trial is one among many. None for parameters that change functions of the model, which have no such
-    gradient.
+    They are those of the tuned filter if it has gradients, learns no noise, and the model has few states,
+    otherwise of an extended Kalman filter; models of few states get three starts. Near the best Q and R the score
+    is so flat that a sampler finds the optimum late, and with many correlations never; with a wrong model the trial
+    is one among many. None for parameters that change functions of the model, which have no such gradient.
     """
     if not all(filter_class(name).has_covariance for name in plan.filter_types):
         return None

@@ -17,7 +17,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """Within this context the first Ctrl-C makes the yielded function return True, with a message to listeners.
 
     An exception within compiled code or a storage's lock could get lost or leave the lock behind. Outside the main
-    thread, where Python delivers no signals, nothing changes.
+    thread, where Python delivers no signals, this has no effect.
     """
     caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -39,9 +39,9 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Within this context Ctrl-C waits, and processes are started that ignore it: their parent ends them.
+    """Within this context Ctrl-C waits, and new processes ignore it: their parent ends them.
 
-    Otherwise they would get it, too, while they load packages, and each would print a traceback.
+    Otherwise they would receive it while they load packages, and each would print a traceback.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -19,7 +19,7 @@ BEGINNING = b'{"op_code":'  # of each entry of a journal
 
 
 class Journal(JournalStorage):
-    """Optuna's storage of a journal, to which a trial that another process has ended is an error once."""
+    """Optuna's journal storage, which reports a trial ended by another process as an error once."""
 
     def _sync_with_backend(self) -> None:
         """Read what is new; each value that waited would raise the error anew, in calls that others make."""
@@ -37,7 +37,7 @@ class JournalFile(JournalFileBackend):
     A disk takes a millisecond to store data permanently, more than a trial of a cheap filter. The file is
     therefore synchronised only for what must survive a power cut: a finished trial, with everything before it, and
     the attributes of a study. The values of single seeds of a running trial, which would be repeated anyway, are
-    not needed elsewhere at once: they wait for the next entry of another kind, or the next reader in this process.
+    not urgent: they wait for the next entry of another kind, or the next reader in this process.
     """
 
     def __init__(self, path: Path, lock: JournalFileOpenLock):

@@ -1,4 +1,4 @@
-"""Every second trial of the default sampler is near the best one: wide ranges are searched without losing aim."""
+"""Every second trial of the default sampler is near the best one, so that wide ranges do not slow the search."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ MOVED = 0.5  # probability that a number is moved
 
 
 def is_local(plan: Plan, number: int) -> bool:
-    """Whether the trial after one of this number shall be near the best: of one objective, filter and sampler."""
+    """Whether the trial after this number is to be near the best one: with one objective, one filter type and "tpe"."""
     return plan.sampler == "tpe" and len(plan.objectives) == len(plan.filter_types) == 1 and number % 2 == 1
 
 
 def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, number: int) -> dict:
-    """The parameters of the best trial with some of them moved by normal steps, all of one random size.
+    """The parameters of the best trial, some of them changed by normal steps of a common random size.
 
         log10 x' = log10 x + s n,  n ~ N(0, 1),  log10 s ~ U(-1.5, 0); of a linear range s times a tenth of it
 
-    The same number of a study of the same seed gives the same trial.
+    The same trial number in a study with the same seed gives the same trial.
 
     Source: Beyer, Schwefel (2002), "Evolution strategies, a comprehensive introduction", Natural Computing 1.
     """

@@ -92,12 +92,12 @@ def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
 
         theta = log(V_1 / V_2),   var = sum over problems of (B - 1)/B sum_b (theta_(b) - mean theta_(b))^2
 
-    It is paired: a run is left out of both. Below 1 (or 0) the first is better.
+    It is paired: each run is left out of both. Below 1 (or 0) the first is better.
 
     Args:
         one: of one filter.
         other: of the other, on the same runs.
-        ratio: whether objectives are errors, of which the ratio counts; else the difference.
+        ratio: whether objectives are errors, compared by their ratio; otherwise by their difference.
 
     Source: Efron, Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3).
     """

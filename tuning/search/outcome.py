@@ -16,8 +16,8 @@ from tuning.search.trials import CONSISTENCY
 def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
     """The complete trial with the lowest first objective, among the consistent ones if there are any.
 
-    A trial over the budget is never complete. Where no trial is consistent, the distance of the mean NIS from its
-    band does not matter: an estimate that is many times worse can be closer to it.
+    A trial over the budget is never complete. If no trial is consistent, the distance of the mean NIS from its
+    band is ignored: an estimate that is many times worse can be closer to it.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     complete.sort(key=lambda trial: trial.values[0])  # so that few are asked for their constraints

@@ -50,7 +50,7 @@ class Correlation:
     is_variance: ClassVar[bool] = False
 
     def get(self, choice) -> float:
-        """The correlation in a choice; zero where the covariance is diagonal."""
+        """The correlation in a choice; zero if the covariance is diagonal."""
         cov = choice.model.get(self.covariance)
         return 0.0 if cov is None or np.ndim(cov) < 2 else correlations_of(np.asarray(cov))[self.index]
 
@@ -105,11 +105,11 @@ def model_parameters(
 
     Args:
         problem: the ranges follow from its untuned values.
-        hold_r: leave R as on the sensor's data sheet.
+        hold_r: keep R from the sensor's data sheet.
         full_q: choose the correlations of Q, too (`correlations.full_covariance`).
         full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
-        where: relations among them (`tuning.search.relations`), which leave fewer of them free.
+        where: relations among them (`tuning.search.relations`), which reduce the free ones.
     """
     found = _all_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
     return related(found, where) if where else found

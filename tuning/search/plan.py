@@ -56,7 +56,7 @@ class Plan(NamedTuple):
 
     @property
     def identity(self) -> dict:
-        """What has to be the same for a study to be continued: of a user's own estimator, its code, too."""
+        """What must be the same for a study to be continued, including the code of a user's own estimator."""
         own = {name: digest_of(estimator_named(name)) for name in self.filter_types if is_code(name)}
         return {
             **({"estimators": own} if own else {}),
@@ -193,7 +193,7 @@ class Plan(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What of the model is tuned, as `model_parameters` has it."""
+        """The tuned parts of the model, as arguments of `model_parameters`."""
         prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
         told = {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
         return {**told, "where": self.where}
@@ -207,7 +207,7 @@ class Plan(NamedTuple):
         return [data_of(one, one.training_seeds(self.seed, TRAINING_SEEDS)) for one in self.scenarios]
 
     def validation_data(self) -> list[Data]:
-        """Data on which the best trials meet the baselines, one for each scenario."""
+        """Data on which the best trials are compared with the baselines, one for each scenario."""
         return [one.data(one.validation_seeds(self.seed, VALIDATION_SEEDS)) for one in self.scenarios]
 
     def size_data(self) -> list[Data]:

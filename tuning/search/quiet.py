@@ -1,4 +1,4 @@
-"""Optuna's own messages, which a program that shows its progress does without."""
+"""Suppress Optuna's messages in programs that show their own progress."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import optuna
 
 @contextmanager
 def quiet_optuna() -> Iterator[None]:
-    """Within this context Optuna reports errors only: there is progress of our own."""
+    """Within this context Optuna reports only errors, since we show our own progress."""
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:

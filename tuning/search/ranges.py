@@ -1,4 +1,4 @@
-"""The ranges of a study's numbers in words, and numbers that end at an end of theirs."""
+"""The ranges of a study's parameters in words, and parameters at an end of their range."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def model_ranges(plan: Plan) -> dict[str, Parameter]:
 
 
 def range_words(plan: Plan) -> str:
-    """The ranges of the model's parameters in words; empty where none is chosen."""
+    """The ranges of the model's parameters in words; empty if none is chosen."""
     parts = [
         f"{name} {one.low:.3g} to {one.high:.3g} {one.unit}".rstrip() for name, one in model_ranges(plan).items()
     ]

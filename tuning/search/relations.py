@@ -1,6 +1,6 @@
-"""Relations among the numbers of a model that a search keeps: equal, in proportion, fixed, bounded.
+"""Relations among a model's parameters that a search obeys: equal, in proportion, fixed, bounded.
 
-What depends on a free number is set with it, so that nothing else has to know of relations. They are written so:
+Setting a free parameter also sets those that depend on it, so other code need not handle relations. Examples:
 
     Q22 = 4 Q11         four times Q11, whatever Q11 is
     Q33 = Q11           the same
@@ -30,7 +30,7 @@ RULE = "a relation must be NAME = [FACTOR] NAME, NAME = VALUE or NAME = LOW..HIG
 
 
 class Relation(NamedTuple):
-    """What is said of one number: that it is in proportion to another one, has a value, or lies in a range."""
+    """The relation of one parameter: proportional to another, fixed, or within a range."""
 
     name: str
     of: str | None = None
@@ -53,15 +53,15 @@ def relation_of(text: str) -> Relation:
 
 
 def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[Parameter]:
-    """The parameters that are free under some relations; what they set in a choice obeys these.
+    """The free parameters under some relations; choices that they set obey these.
 
     Args:
         parameters: all parameters.
         relations: texts, such as "Q22 = 4 Q11".
 
     Raises:
-        ValueError: for another form, an unknown name, a number with two relations or in proportion to one that is
-            not free, a value that the number cannot have, and where nothing is left to tune.
+        ValueError: for another form, an unknown name, a parameter with two relations or in proportion to one that
+            is not free, an invalid value, or if no parameter is left to tune.
     """
     found = [relation_of(text) for text in relations]
     known = {one.name: one for one in parameters}
@@ -108,7 +108,7 @@ def _check(one: Parameter, relation: Relation, text: str) -> None:
 
 
 def obeying(choice, parameters: Sequence[Parameter]):
-    """The choice with the same free numbers, within their ranges, and all that is tied to these or held."""
+    """The choice with the same free parameters, within their ranges, and the dependent and fixed ones set."""
     for one in parameters:
         if (value := one.get(choice)) is not None:
             choice = one.set(choice, min(max(value, one.low), one.high))

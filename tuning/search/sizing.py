@@ -1,4 +1,4 @@
-"""The ensemble size of a study's choice, from a table that the study keeps."""
+"""The ensemble size of a study's choice, from a table stored in the study."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
 def sizes_of(
     study: optuna.Study, choice: Choice, plan: Plan, data: Sequence[Data], consistent: bool
 ) -> list[SizeRow]:
-    """The table of ensemble sizes of a choice, kept with the study; empty where there is none."""
+    """The table of ensemble sizes of a choice, stored with the study; empty if there is none."""
     if not has_ensemble(choice.name) or len(plan.objectives) > 1:
         return []
     kept = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
@@ -29,7 +29,7 @@ def sizes_of(
 
 
 def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[SizeRow], consistent: bool) -> Choice:
-    """A choice with the smallest sufficient ensemble; unchanged where it has none."""
+    """A choice with the smallest sufficient ensemble; unchanged without an ensemble."""
     if sizes:
         return choice.with_size(sufficient_size(sizes, consistent))
     recorded = all(scenario.leads_in for scenario in plan.scenarios)

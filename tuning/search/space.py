@@ -49,7 +49,7 @@ class Choice(NamedTuple):
     numbers: dict[str, Any]  # the filter's parameters, such as `ensemble_size`
 
     def filter(self, problem: Problem) -> Filter:
-        """The filter of this choice, with the model that the problem lets it assume."""
+        """The filter of this choice, with the problem's assumed model."""
         return make_filter(self.name, problem.model(**self.model), **self.numbers)
 
     def with_size(self, ensemble_size: int) -> Choice:
@@ -68,7 +68,7 @@ def given_choice(name: str, problem: Problem) -> Choice | None:
 
 
 def oracle_choice(name: str, problem: Problem) -> Choice | None:
-    """The filter that knows the plant's own Q and R, with the untuned ensemble size; None if they are unknown."""
+    """The filter with the plant's own Q and R and the untuned ensemble size; None if they are unknown."""
     return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
 
 
@@ -127,7 +127,7 @@ def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -
     """The choices of a study among several filter types, by the names of the trials' parameters.
 
     Parameters of the model (Q, R, P_0) are shared by all filter types. The parameters of one type, such as
-    "enkf N", are chosen only in trials of that type. Of a single type these are its `parameters`.
+    "enkf N", are chosen only in trials of that type. For a single type these are its `parameters`.
     """
     found = {}
     for name in filter_types:
@@ -195,9 +195,9 @@ def within_ranges(parameters: Mapping, space: Mapping[str, BaseDistribution]) ->
 def choice_of(
     name: str, values: Mapping[str, float | int | str], problem: Problem, where: Sequence[str] = ()
 ) -> Choice:
-    """The choice of a trial's parameters; parameters that it lacks are those of the untuned filter.
+    """The choice of a trial's parameters; missing parameters are those of the untuned filter.
 
-    Relations `where` hold for it.
+    It obeys the relations `where`.
 
     For the name "auto" the parameter "filter" names the filter.
     """
@@ -214,7 +214,7 @@ def choice_of(
 
 
 def everything_of(problem: Problem) -> dict[str, Any]:
-    """The options of `parameters` with which a problem has all that a study may choose."""
+    """The options of `parameters` for all that a study of a problem may choose."""
     return {} if problem.parameters is not None else {"full_q": True, "full_r": True, "prior": True}
 
 

@@ -26,7 +26,7 @@ PROCESS, RETRY_OF = (
 def open_storage(storage: str) -> BaseStorage:
     """Open a storage: a URL such as "postgresql+psycopg2://..." or "grpc://host:port", else a journal file.
 
-    A database may be unreachable for a minute; a trial without signs of life is lost, and enqueued once more.
+    A database may be unreachable for a minute; a trial without a heartbeat is lost, and enqueued again.
 
     A last line that a killed process left unfinished in a journal is cut off, with a warning.
 
@@ -71,7 +71,7 @@ def this_process() -> str:
 
 
 def retry_orphans(study: optuna.Study) -> int:
-    """Fail running trials whose process on this host is gone, and enqueue each once more; return how many."""
+    """Fail running trials whose process on this host is gone, and enqueue each again; return how many."""
     retried = 0
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         signed = _wait_for_signature(study, trial)
@@ -86,7 +86,7 @@ def retry_orphans(study: optuna.Study) -> int:
 
 
 def retry_once(study: optuna.Study, trial: FrozenTrial) -> bool:
-    """Enqueue a lost trial once more, unless it is a second try or has no parameters yet; return whether so."""
+    """Enqueue a lost trial again, unless it is a second try or has no parameters yet; return whether it was."""
     parameters = {**trial.system_attrs.get("fixed_params", {}), **trial.params}  # first those it was enqueued with
     if RETRY_OF in trial.user_attrs or not parameters:
         return False

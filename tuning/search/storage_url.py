@@ -1,4 +1,4 @@
-"""What may be shown of a storage's URL: scheme, host and database, never the user, the password or an option."""
+"""The parts of a storage's URL that may be shown: scheme, host and database, not user, password or options."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MISSPELT = re.compile(rf"({'|'.join(DATABASES)})(\+\w+)?:(?!//)", re.IGNORECASE
 def shown_storage(storage: str) -> str:
     """A storage for messages: a path as it is, of a URL scheme, host, port and database.
 
-    Where a URL can be read in two ways, as after a password with a question mark, only its scheme is shown.
+    For an ambiguous URL, such as one with a question mark in the password, only the scheme is shown.
     """
     scheme, separator, rest = storage.partition("://")
     if not separator:
@@ -45,7 +45,7 @@ def _place(rest: str) -> str | None:
 
 
 def without_secrets(text: str, storage: str) -> str:
-    """A message of a database or its driver without any part of the storage's URL that is not to be shown."""
+    """A message of a database or its driver without the hidden parts of the storage's URL."""
     shown = shown_storage(storage)
     if shown == storage:
         return text
@@ -68,5 +68,5 @@ def without_secrets(text: str, storage: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first, or what it is called."""
+    """The first line of an error, or its class's name."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]

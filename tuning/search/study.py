@@ -69,7 +69,7 @@ class StudyResult(NamedTuple):
         return sum(trial.state == TrialState.PRUNED for trial in self.trials)
 
     def or_interrupted(self) -> StudyResult:
-        """This result; KeyboardInterrupt if Ctrl-C ended the study, for a caller whose work has to end, too."""
+        """This result; KeyboardInterrupt if Ctrl-C ended the study, for callers that must end, too."""
         if self.interrupted:
             raise KeyboardInterrupt
         return self
@@ -97,7 +97,7 @@ def open_study(
         name: name of the study.
         plan: what the study is for.
         storage: from `open_storage`; None for a study in memory.
-        start: the first trial, in place of untuned ones.
+        start: the first trial, instead of untuned ones.
         worker: index of this process among those that share the study; 0 if it may be the only one.
 
     Raises:
@@ -232,7 +232,7 @@ def _begun(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def chosen_of(study: optuna.Study) -> dict | None:
-    """The validation of a study's best trials, if there have been no trials since; else None."""
+    """The validation of a study's best trials, or None if there have been trials since."""
     found = study.user_attrs.get(CHOSEN)
     same = isinstance(found, dict) and found.get("trials") == len(_begun(study))
     return found if same else None

@@ -36,7 +36,7 @@ NIS = "mean NIS over the number of channels"
 
 
 def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
-    """A paired test over seeds; or no pruning, also of two objectives."""
+    """A paired test over seeds, or no pruning; two objectives are never pruned."""
     return PairedPruner() if plan.prune and len(plan.objectives) == 1 else optuna.pruners.NopPruner()
 
 
@@ -95,10 +95,10 @@ def measure(
 ) -> list[Evaluation]:
     """Run a choice on all data; with a trial, report each seed's score to it and stop if it should be pruned.
 
-    All runs of all problems count. Where problems have different numbers of runs, a score that is reported is of
-    an equal share of each problem's: a run of the one with the fewest, and the mean of some of each other's.
+    All runs of all problems count. If problems have different numbers of runs, each reported score is of
+    equal shares of the problems' runs: one run of the smallest problem, and the mean of several of the others'.
 
-    The NEES and errors of outputs are computed where an objective needs them, and no interval.
+    The NEES and errors of outputs are computed if an objective needs them, intervals never.
     """
     objectives = plan.found_objectives()
     needs = {need for one in objectives for need in one.needs}
