@@ -1,4 +1,4 @@
-"""What all plants share: the state-space model, truth drawn from it, disturbances, and the mechanics of an env."""
+"""Common to all plants: the state-space model, truth drawn from it, disturbances, and the mechanics of an env."""
 
 from gymnasium.envs.registration import register, registry
 

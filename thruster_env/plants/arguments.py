@@ -15,12 +15,12 @@ def takes_arguments_of(
 ) -> Callable[[Function], Function]:
     """Return a decorator: a function of (self, **arguments) takes those of other functions, names and defaults.
 
-    It is called with all of them, and has the signature that `inspect.signature` and `help` then show. A method's
+    It is called with all of them, and `inspect.signature` and `help` show them. A method's
     first argument may be given by position, the others by name; its own named arguments come last.
 
     Args:
-        definitions: where the arguments stand; none may stand in two.
-        leaving_out: names that are not taken.
+        definitions: the functions that define the arguments; each argument in only one of them.
+        leaving_out: excluded names.
         defaults: other defaults, by name.
     """
     changed = {} if defaults is None else defaults
@@ -56,6 +56,6 @@ def takes_arguments_of(
 
 
 def arguments_of(definition: Function, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of some arguments by name that a function takes."""
+    """The arguments by name that a function accepts."""
     known = inspect.signature(definition).parameters
     return {name: value for name, value in given.items() if name in known}

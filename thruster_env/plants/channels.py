@@ -1,4 +1,4 @@
-"""Channels: what a sensor measures of a plant, as one definition for the plant's step and for a filter's model."""
+"""Channels: a sensor's measurement of a plant, defined once for the plant's step and for a filter's model."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Channel(NamedTuple):
     Attributes:
         quantity: the measured quantity, with its unit.
         variance: default variance of the channel's Gaussian noise [unit^2].
-        code: unique integer that identifies the channel in compiled code; it never changes, so that the order in
-            which channels are listed has no meaning.
+        code: unique integer that identifies the channel in compiled code; it never changes, so the order of
+            channels has no meaning.
         read: h(x, y, u, c).
         slopes: `slopes(x, dy, c)`, the n derivatives dh/dx, where row i of dy is the gradient of output i; None if
             the channel depends on the input.
@@ -41,8 +41,8 @@ def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callabl
 
     Args:
         channels: data for compiled code.
-        of_copy: `of_copy(read)` makes a function of the arguments that finds what a channel's `read` takes of a
-            copy, and reads it; so compiled code finds nothing that this channel does not need.
+        of_copy: `of_copy(read)` makes a function of the arguments that finds the inputs of a channel's `read` in a
+            copy, and reads it; so compiled code computes only what this channel needs.
         arguments: their names, "memory, b, j".
 
     Raises:

@@ -1,4 +1,4 @@
-"""Actions of an env as the commands of a plant, checked before anything moves."""
+"""Actions of an env as the commands of a plant, checked before the step."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def some_numbers(action, quantities: tuple[Quantity, ...]) -> np.ndarray:
 
 
 def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: np.ndarray | None) -> np.ndarray:
-    """Commands (copies, p) of many copies, or (copies,) where p is 1.
+    """Commands (copies, p) of many copies, or (copies,) if p is 1.
 
     Args:
-        actions: (copies, p); (copies,) will do where p is 1.
+        actions: (copies, p), or (copies,) if p is 1.
         copies: their number.
         quantities: the p inputs.
         ignored: copies (copies,) whose actions are not used, and may be NaN; None if there are none.

@@ -1,4 +1,4 @@
-"""`ContinuousModel`: rates of a plant in continuous time, from which follows a model for any sample time."""
+"""`ContinuousModel`: rates of a plant in continuous time, which give a model for any sample time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROUNDING = 1e-9  # of a step that is divided
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContinuousModel:
-    """A plant in continuous time, whose noise is white, measured at any times.
+    """A plant in continuous time with white noise, measured at any times.
 
         dx/dt = rates(x, u, c) + w(t),  E[w(t) w(s)'] = S delta(t - s);   z = h(x, c) + v,  v ~ N(0, R)
 
@@ -68,16 +68,16 @@ class ContinuousModel:
 
     @classmethod
     def of(cls, model: StateSpaceModel, rates: Callable) -> Self:
-        """The plant of which a discrete model is that of one sample time: `at(dt)` of this is the model itself.
+        """The continuous plant of a discrete model: its `at(dt)` is the model itself.
 
-        The densities are those whose Q is the model's, and no Runge-Kutta step is longer than the model's.
+        Its densities give the model's Q, and no Runge-Kutta step is longer than the model's.
 
         Args:
             model: whose transition is a Runge-Kutta step of `rates`, of the constant `substep`.
             rates: dx/dt, as the class takes it.
 
         Raises:
-            ValueError: for a model of other rates, or whose Q no white noise has.
+            ValueError: for a model of other rates, or a Q that no white noise gives.
         """
         _check_constants(model.constants)
         names = {one.name for one in dataclasses.fields(model)}
@@ -104,7 +104,7 @@ class ContinuousModel:
     def at(self, dt: float, substeps: int | None = None) -> StateSpaceModel:
         """The model for a sample time [s]: Runge-Kutta in some equal parts, and Q by van Loan.
 
-        The parts are as few as `longest` allows, unless their number is given. A filter of it can be `live`, with
+        The parts are as few as `longest` allows, unless their number is given. A filter on it can be `live`, with
         `noise=continuous.noise`.
         """
         dt = positive("dt", dt)
@@ -146,7 +146,7 @@ class ContinuousModel:
 
 
 def continuous_of(offer: Any) -> ContinuousModel | None:
-    """The model in continuous time that something is, or makes without arguments; None for anything else."""
+    """An object that is a model in continuous time, or the one it makes without arguments; otherwise None."""
     if isinstance(offer, ContinuousModel) or not callable(offer) or hasattr(offer, "state_space_model"):
         return offer if isinstance(offer, ContinuousModel) else None
     try:
@@ -157,7 +157,7 @@ def continuous_of(offer: Any) -> ContinuousModel | None:
 
 
 def in_discrete_time(offer: Any) -> Any:
-    """What makes models for a sample time `dt`, of what is or makes one in continuous time; others as they are."""
+    """A function that makes models for a sample time `dt` from a continuous one or its maker; others unchanged."""
     if continuous_of(offer) is None:
         return offer
     return offer.at if isinstance(offer, ContinuousModel) else AtDt(offer)
@@ -165,7 +165,7 @@ def in_discrete_time(offer: Any) -> Any:
 
 @dataclass(frozen=True)
 class AtDt:
-    """A function that makes models in continuous time, as one that makes those of a sample time.
+    """A function that makes models in continuous time, turned into one for a sample time.
 
     Attributes:
         make: the function, whose arguments this has, and `dt` [s].

@@ -1,4 +1,4 @@
-"""Many copies of a plant that are stepped in place, all of them in one call of compiled code."""
+"""Many copies of a plant, stepped in place in one call of compiled code."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class PlantCopies:
 
     A plant's class defines the rows of commands and reports, packs its parameters and finds its compiled step,
     `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin` it starts an
-    episode of every copy from the keys in its memory and takes the first measurement; else it applies the
-    commands for one sample time. It writes the rows that it reports to out (reported, blocks, width).
+    episode of every copy from the keys in its memory and takes the first measurement; otherwise it applies the
+    commands for one sample time. It writes its report to out (reported, blocks, width).
 
     Attributes:
         commands: rows of the memory that hold the inputs of the next step.
-        reported: the row behind the last one that a step reports.
+        reported: the row after the last one that a step reports.
     """
 
     commands: tuple[int, ...]
@@ -51,7 +51,7 @@ class PlantCopies:
         self._find_machine_code()
 
     def machine_code(self) -> tuple[Callable, CompiledOrPython]:
-        """The compiled step, and the same for threads to share out, as `machine_code_of` gives both."""
+        """The compiled step, and the same for several threads, from `machine_code_of`."""
         raise NotImplementedError
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
@@ -78,13 +78,13 @@ class PlantCopies:
 
     @property
     def bytes_per_copy(self) -> int:
-        """Memory that one copy takes."""
+        """Memory per copy."""
         return self.memory.nbytes // (self.memory.shape[0] * self.memory.shape[2])
 
     def begin(self, keys: np.ndarray, which: np.ndarray | None = None, numbers=None) -> np.ndarray:
         """Start episodes with keys (count, 2) for all copies, or for those named by `which`; return their report.
 
-        `numbers` may stand in for the plant's own, with another initial state.
+        `numbers` may replace the plant's own, with another initial state.
         """
         numbers = self.numbers if numbers is None else numbers
         memory = self.memory if which is None else gathered(self.memory, which)
@@ -106,7 +106,7 @@ class PlantCopies:
         return self._run(self.memory, self.numbers, False)[:, : self.count]
 
     def report(self) -> np.ndarray:
-        """What the last step reported, without a step."""
+        """The report of the last step, without a step."""
         reported = self.memory[:, : self.reported].transpose(1, 0, 2)
         return reported.reshape(self.reported, -1)[:, : self.count].copy()
 
@@ -122,7 +122,7 @@ class PlantCopies:
 
 
 def machine_code_of(step: Callable) -> tuple[Callable, CompiledOrPython]:
-    """The step of a plant's class as `PlantCopies.machine_code` has to give it, from a plain function."""
+    """The step of a plant's class for `PlantCopies.machine_code`, from a plain function."""
     return _machine_code_of(step, is_interpreting())
 
 

@@ -21,17 +21,17 @@ def noise_for_dt(
 ) -> np.ndarray:
     """Q of a step of another sample time: Q dt_to/dt_from, that of Gaussian diffusion.
 
-    It is exact where the states change little within a step; otherwise a first guess. With the slope A of the
-    rates it is exact for them: white noise of the densities whose Q of `dt_from` is the given one.
+    It is exact if the states change little within a step; otherwise a first guess. With the slope A it is exact
+    for linear rates: white noise of the densities that give this Q at `dt_from`.
 
     Args:
-        process_noise_cov: Q a step of `dt_from`, a matrix, variances or one.
-        dt_from: sample time that it belongs to [s].
-        dt_to: sample time that is wanted [s].
+        process_noise_cov: Q per step of `dt_from`, a matrix, variances or one.
+        dt_from: its sample time [s].
+        dt_to: the new sample time [s].
         slope: A, the derivative of the rates by the state, (n, n); zero if None.
 
     Raises:
-        ValueError: with a slope, where no white noise has such a Q.
+        ValueError: with a slope, if no white noise gives such a Q.
     """
     if slope is None:
         return np.asarray(process_noise_cov, dtype=np.float64) * (dt_to / dt_from)
@@ -39,7 +39,7 @@ def noise_for_dt(
 
 
 def noise_of_densities(densities: ArrayLike, slope: ArrayLike, dt: float) -> np.ndarray:
-    """Q of a step of white noise, of the spectral densities S (n, n), that acts on linear rates of the slope A.
+    """Q per step of white noise with spectral densities S (n, n) on linear rates with slope A.
 
         Q = int_0^dt e^{A t} S e^{A' t} dt,   exp([-A, S; 0, A'] dt) = [., G; 0, F'],   Q = F G
 
@@ -54,10 +54,10 @@ def noise_of_densities(densities: ArrayLike, slope: ArrayLike, dt: float) -> np.
 
 
 def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> np.ndarray:
-    """S (n, n), whose Q of a step dt is the given one: `noise_of_densities`, linear in S, solved for it.
+    """S (n, n) that gives this Q per step dt: `noise_of_densities`, linear in S, solved for S.
 
     Raises:
-        ValueError: where S is no covariance: Q is then not that of white noise on such rates.
+        ValueError: if S is no covariance: no white noise on such rates gives this Q.
     """
     n = len(as_floats(slope))
     q, (rows, columns) = covariance("process_noise_cov", process_noise_cov, n), np.triu_indices(n)

@@ -26,14 +26,14 @@ VIEWS = ("_memory", "_command", "_arguments", "_advance", "_report", "_outcome",
 class PlantEnv(RenderedEnv):
     """An env of one copy of a plant, whose compiled step does all the computation.
 
-    A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. Rendering is
-    that of `RenderedEnv`; what it offers to filters is in `thruster_env.plants.modelled`. The vector env is then a
+    A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. `RenderedEnv`
+    renders it, and `thruster_env.plants.modelled` offers its model to filters. The vector env is then a
     class of two lines, see `thruster_env.plants.vector_env`.
 
     Attributes:
         inputs: the quantities of the p entries of an action.
         plant: the plant; it has `dt`, its sample time [s].
-        task: what the env rewards and how episodes end, if that is a value.
+        task: the reward and the end of episodes, if these are a value.
     """
 
     inputs: tuple[Quantity, ...]
@@ -111,7 +111,7 @@ class PlantEnv(RenderedEnv):
 
     @property
     def spec(self):
-        """The specification that made this env; its objects are kept as mappings, which JSON can hold."""
+        """The specification that made this env; its objects are stored as mappings for JSON."""
         return self._spec
 
     @spec.setter
@@ -161,7 +161,7 @@ class PlantEnv(RenderedEnv):
 
 
 def as_json(value):
-    """An argument of an env as JSON can hold it, effects and parameters as mappings of plain numbers."""
+    """An argument of an env for JSON, effects and parameters as mappings of plain numbers."""
     if hasattr(value, "as_mapping"):
         return value.as_mapping()
     if hasattr(value, "_asdict"):

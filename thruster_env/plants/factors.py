@@ -1,4 +1,4 @@
-"""Parameters multiplied by factors: a plant that differs from the true one, as a filter may assume it."""
+"""Parameters multiplied by factors, for a filter that assumes another plant than the true one."""
 
 from __future__ import annotations
 

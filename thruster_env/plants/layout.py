@@ -1,4 +1,4 @@
-"""Where a model's numbers stand in the float64 row that compiled code reads."""
+"""Places of a model's numbers in the float64 row that compiled code reads."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def number_places(n: int, m: int) -> NumberPlaces:
 
 
 def with_root(cov: np.ndarray) -> np.ndarray:
-    """A covariance (d, d) and its lower triangular root, as they lie one behind the other in a model's row."""
+    """A covariance (d, d) followed by its lower triangular root, as in a model's row."""
     return np.concatenate([cov.ravel(), covariance_root(cov).ravel()])
 
 
 def starts_of(*lengths: int) -> list[int]:
-    """First places of parts that lie one behind the other, and where the last one ends."""
+    """First places of consecutive parts, and the end of the last one."""
     return [0, *np.cumsum(lengths).tolist()]
 
 

@@ -1,4 +1,4 @@
-"""A short hash that identifies a model: its quantities, and what its functions compute at fixed points."""
+"""A short hash that identifies a model: its quantities, and its functions' values at fixed points."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ SMALL = 1e-2  # of the largest number at a point: of less, less digits are sure,
 def digest_of(model: StateSpaceModel) -> str:
     """A hash of names, units, sizes and substeps, and of the values of f and h at fixed points.
 
-    The hash leaves out noise and prior, which tuning changes, Jacobians, which follow from the functions, and
+    The hash omits noise and prior, which tuning changes, Jacobians, which follow from the functions, and
     operating points and ranges, which only help a filter. The points are the same for all models of a size: points
     about the prior would change with it. Values are rounded to ten digits, so that other machines and versions of
-    Python find the same hash.
+    Python compute the same hash.
     """
     constants = getattr(model.constants, "_fields", len(model.constants))
     parts = {

@@ -24,7 +24,7 @@ class ModelEnv(gym.Env):
         x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
 
     The first episode after `reset(seed=s)` is the trajectory that `thruster_env.plants.simulate.simulate` draws
-    for the key of seed s under the same inputs; a tuning problem of the same model has it as the data of seed s.
+    for the key of seed s under the same inputs, and the data of seed s in a tuning problem of the same model.
     `info` holds "state" (n,) and "measurement" (m,) in float64. The reward is 0 and episodes do not end; use
     `gymnasium.wrappers.TimeLimit` to end them.
 
@@ -34,7 +34,7 @@ class ModelEnv(gym.Env):
             one from changes by name; the truth if None.
         low: smallest input, one number or p, in the units of the inputs.
         high: largest input, one number or p.
-        dt: sample time [s], which tuned files are checked against; None if unknown. It changes nothing else:
+        dt: sample time [s], compared with that of tuned files; None if unknown. It has no other effect:
             covariances are per step and do not scale with dt.
 
     Raises:
@@ -91,7 +91,7 @@ def with_noise(
     measurement_noise_cov=None,
     prior_cov_factor: float | None = None,
 ) -> StateSpaceModel:
-    """A model with another Q or R, where given, and with P_0 multiplied by a factor, where given."""
+    """A model with another Q or R, and with P_0 multiplied by a factor, if given."""
     changes = {"process_noise_cov": process_noise_cov, "measurement_noise_cov": measurement_noise_cov}
     if prior_cov_factor is not None:
         changes["prior_cov"] = positive("prior_cov_factor", prior_cov_factor) * model.prior_cov

@@ -1,4 +1,4 @@
-"""What an env or vector env of a plant offers to filters: its model, and checks of tuned files."""
+"""The interface of a plant's env or vector env for filters: its model, and checks of tuned files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ModelledEnv:
     """An env with a `plant`, which offers the plant's model to filters.
 
     Attributes:
-        plant_name: what messages call the plant.
+        plant_name: the plant's name in messages.
     """
 
     plant_name: ClassVar[str] = "a plant"
@@ -25,9 +25,9 @@ class ModelledEnv:
         raise NotImplementedError
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
-        """What a tuned file's plant differs in from the env's, and filters yet may run; ValueError for another.
+        """Minor differences between a tuned file's plant and the env's; ValueError for essential ones.
 
-        Nothing, unless the plant says more: states, inputs, sensors and dt are compared for every model.
+        None by default: states, inputs, sensors and dt are compared for every model.
         """
         return []
 
@@ -45,7 +45,7 @@ class ModelledEnv:
         return make(self.plant, **changes)
 
     def check_tuned_for(self, tuned_for: Mapping | None, file: str) -> None:
-        """Raise ValueError if a tuned file is for another plant than the env's; warn where it is for other noise.
+        """Raise ValueError if a tuned file is for another plant than the env's; warn if it is for other noise.
 
         A file without this entry (None) is not compared.
         """

@@ -24,7 +24,7 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
     Args:
         size: number of rows.
         first: the first of them.
-        root: where the lower triangular L (size, size) lies in numbers, by rows.
+        root: the place of the lower triangular L (size, size) in numbers, by rows.
         stream: the purpose of the noise, from `thruster_env.numerics.streams`.
     """
     of_copy = "memory[b, KEY_0, j], memory[b, KEY_1, j]"

@@ -10,9 +10,9 @@ from gymnasium.vector.utils import batch_space
 
 
 class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
-    """Observe the true state of a plant in place of the measurement.
+    """Observe the true state of a plant instead of the measurement.
 
-    What the env appends to its measurement (validity flags, a reference signal) stays at the end.
+    Entries that the env appends to its measurement (validity flags, a reference signal) stay at the end.
 
     Args:
         env: an env of a plant.

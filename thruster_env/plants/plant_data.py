@@ -1,4 +1,4 @@
-"""A plant as JSON data, for files that record which plant they belong to, and differences between two plants."""
+"""A plant as JSON data, for files that record their plant, and differences between two plants."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thruster_env.plants.disturbances.effects import Effect
 
 
 class Entries(NamedTuple):
-    """What the data of a plant consist of; each has "preset", None or a name, and "parameters", a mapping."""
+    """The entries of a plant's data; each plant has "preset", None or a name, and "parameters", a mapping."""
 
     essential: tuple[str, ...]  # what makes it another plant, on which Q and R mean nothing
     names: tuple[str, ...]  # all entries
@@ -20,12 +20,12 @@ class Entries(NamedTuple):
 
 
 def check_same(entries: Entries, tuned_for: Mapping, data: Mapping, file: str | Path) -> list[str]:
-    """Raise ValueError, with what differs, if a tuned file is for another plant; return what else differs.
+    """Raise ValueError with the differences if a tuned file is for another plant; return minor differences.
 
     Args:
-        entries: what the data of such plants consist of.
+        entries: the entries of such plants' data.
         tuned_for: the file's data of a plant.
-        data: those of the plant where it is to be used.
+        data: those of the plant that it is used with.
         file: its path.
     """
     try:
@@ -56,7 +56,7 @@ def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str
 
 
 def mappings(effects: tuple[Effect, ...]) -> list[dict]:
-    """Effects as JSON can hold them."""
+    """Effects as mappings for JSON."""
     return [effect.as_mapping() for effect in effects]
 
 

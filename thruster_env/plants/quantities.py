@@ -82,7 +82,7 @@ def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> 
         given: a sequence with `count` entries, or None.
         count: number of components.
         letter: default symbol of components without names.
-        counted: the argument that says how many there are, for messages: "prior_mean".
+        counted: the argument that defines their number, for messages: "prior_mean".
 
     Raises:
         ValueError: if there are not `count` of them, symbols are equal, or a name, symbol, unit or angle is wrong.

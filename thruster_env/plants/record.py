@@ -1,4 +1,4 @@
-"""Trajectories of many copies of a plant: the reports of a batch that is stepped through given inputs."""
+"""Trajectories of many copies of a plant: the reports of a batch stepped through given inputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def record(
     Args:
         copies_of: `copies_of(count)` makes that many copies.
         keys: of their episodes, (B, 2).
-        inputs: (B, K, p), or (B, K) where p is 1.
+        inputs: (B, K, p), or (B, K) if p is 1.
         name: the name of the inputs, for messages.
         count: their number p.
 

@@ -1,4 +1,4 @@
-"""What a policy remembers from one step of its env to the next."""
+"""A policy's memory between two steps of its env."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
-    """The state (..., k) of the last call, or its initial value where an episode starts."""
+    """The state (..., k) of the last call, or its initial value at the start of an episode."""
     if state is None:
         return at_start
     if episode_start is None:

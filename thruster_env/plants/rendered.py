@@ -1,4 +1,4 @@
-"""Rendering that is common to all envs of plants."""
+"""Rendering, common to all envs of plants."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def checked_size(size: Sequence[int] | None) -> tuple[int, int] | None:
 
 
 class RenderedEnv(gym.Env):
-    """An env with a `plant` that may draw itself, in the modes that its `metadata` name.
+    """An env with a `plant` that can draw itself, in the modes of its `metadata`.
 
-    A plant's env defines `make_renderer`, which returns its renderer, and `moment_of`, what the renderer adds of a
+    A plant's env defines `make_renderer`, which returns its renderer, and `moment_of`, the renderer's input from a
     step's report.
     """
 
@@ -44,11 +44,11 @@ class RenderedEnv(gym.Env):
     _renderer: PlantRenderer | None = None
 
     def make_renderer(self) -> PlantRenderer:
-        """What draws this env in its `render_mode`."""
+        """The renderer of this env for its `render_mode`."""
         raise NotImplementedError
 
     def moment_of(self, report: list[float]) -> tuple:
-        """What the renderer adds of a report."""
+        """The renderer's input from a report."""
         raise NotImplementedError
 
     def _prepare_rendering(self, render_mode: str | None, render_size: Sequence[int] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""`ReplayEnv`: a recorded run as a Gymnasium env, on which filter wrappers work as on any other env."""
+"""`ReplayEnv`: a recorded run as a Gymnasium env, for filter wrappers as any other env."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class ReplayEnv(gym.Env):
     """A log as an env: step k returns the measurement of row k for any action; an episode is the whole log.
 
     The inputs come from the log, too: `info["recorded_input"]` (p,) is the input of the step, and filter wrappers
-    predict with it instead of the action. Where a measurement is missing, the observation repeats the last value
-    (0 at first), and `info["measurement_valid"]` is false there. `info["references"]` holds the values of the
+    predict with it instead of the action. For a missing measurement, the observation repeats the last value
+    (0 at first), and `info["measurement_valid"]` is false. `info["references"]` holds the values of the
     reference channels in the row. The reward is 0.
 
     Args:
         log: a `Log`, or the path of a file that `thruster_env.plants.logs.read.read_log` reads.
         model: defines the log's columns and is the `state_space_model` offered to filters: a `StateSpaceModel`; a
-            function that makes one, of the log's sample time where it takes `dt`; a `ContinuousModel`, or a
-            function that makes one, at that sample time; an object that offers `state_space_model`, such as an
+            function that makes one, for the log's sample time if it has an argument `dt`; a `ContinuousModel`, or
+            a function that makes one, at that sample time; an object that offers `state_space_model`, such as an
             env; or "module:object" for any of these.
         columns: headers by quantity, as `read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
@@ -74,7 +74,7 @@ class ReplayEnv(gym.Env):
         self._row, self._last = 0, np.zeros(m)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Go back to the first row; ValueError for a log on its own stamps, whose steps have no one length."""
+        """Go back to the first row; ValueError for a log on its own stamps, whose steps differ in length."""
         if self.log.stamps is not None:
             raise ValueError(f"a log must lie on a grid to be replayed, but {self.log.name} has its own stamps")
         super().reset(seed=checked_seed(seed))

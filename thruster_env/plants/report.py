@@ -25,7 +25,7 @@ class ReportRows(NamedTuple):
 
     @property
     def states(self) -> int:
-        """Number of states, of a plant whose info has them."""
+        """Number of states, for a plant whose info has them."""
         place = self.info["state"]
         return place.stop - place.start if isinstance(place, slice) else 1
 
@@ -66,8 +66,8 @@ def views_of(report: np.ndarray, rows: ReportRows) -> tuple[np.ndarray, ...]:
 def info_maker(rows: ReportRows) -> Callable[[np.ndarray, tuple[np.ndarray, ...]], dict]:
     """Return `info(report, views)`: the info of one copy, in separate arrays.
 
-    It is generated for the plant's entries, because a step has to be quick. Numbers are NumPy scalars, as clients
-    ask every value for its dtype.
+    It is generated for the plant's entries, because a step has to be fast. Numbers are NumPy scalars, because
+    clients ask every value for its dtype.
     """
     places = tuple((name, None if isinstance(place, slice) else place) for name, place in rows.info.items())
     return _info_maker(places, bool(rows.dropping))

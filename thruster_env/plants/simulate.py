@@ -125,7 +125,7 @@ def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Tr
 
     Args:
         model: the model, with Q, R and the prior.
-        keys: random keys, one a trajectory, (B, 2).
+        keys: random keys, one per trajectory, (B, 2).
         inputs: u, (B, K, p), in the units of the inputs.
 
     Returns:

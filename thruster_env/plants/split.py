@@ -12,9 +12,9 @@ class Split(NamedTuple):
     """Indices of an env's channels that are inputs of a model, and of those that are measurements.
 
     Attributes:
-        inputs: those of the model's last inputs, in their order.
-        measurements: those that it measures.
-        channels: number of channels that the env has.
+        inputs: channels of the model's last inputs, in their order.
+        measurements: channels of its measurements.
+        channels: number of the env's channels.
     """
 
     inputs: tuple[int, ...]
@@ -25,7 +25,7 @@ class Split(NamedTuple):
 def split(model: StateSpaceModel, actions: int, channels: Sequence[str]) -> Split | None:
     """Find a model's inputs beyond the first `actions`, and its measurements, among channels by their symbols.
 
-    None where there are no such inputs, or the model has some that are no channels.
+    None if there are no such inputs, or if one of them is no channel.
     """
     told = [quantity.symbol for quantity in model.input_quantities[actions:]]
     seen = [quantity.symbol for quantity in model.measurements]

@@ -40,9 +40,9 @@ class StateSpaceModel:
     run as Python, slower, with the same results.
 
     Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;
-    it is complex where a Jacobian is found by complex steps (`np.empty_like(x)` makes another such array). It is
+    it is complex if a Jacobian is computed by complex steps (`np.empty_like(x)` makes another such array). It is
     indexed in the same way, and functions may return arrays or tuples of any size. A Jacobian of more than a
-    thousand entries should be an array, or a tuple of rows that hold floats only.
+    thousand entries should be an array, or a tuple of rows of floats.
 
     Models can be copied and pickled, and so can filters and wrapped envs that hold them. Pickle stores functions
     by name: define yours in a module. Nested functions and lambdas need cloudpickle.
@@ -60,7 +60,7 @@ class StateSpaceModel:
         observe_jacobian: dh/dx(x, c); central differences if None.
         analytic: whether f and h are analytic functions that take complex numbers: Jacobians that are None are
             then found by complex steps, exactly (`derivatives.complex_step`).
-        substeps: how often `transition` is applied in one step.
+        substeps: number of applications of `transition` per step.
         operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
         operating_input: u* (p,), the input that goes with it.
         operating_points: `operating_points(count)` returns that many pairs (x*, u*) over the range of a single
@@ -185,7 +185,7 @@ class StateSpaceModel:
 
     @property
     def given_constants(self) -> tuple | np.ndarray:
-        """The constants as functions get them: an array where there are more than fit into a tuple."""
+        """The constants as functions get them: an array if there are too many for a tuple."""
         return np.array(self.constants) if constants_are_array(self.shape.form) else self.constants
 
     def replace(self, **changes) -> Self:
@@ -245,7 +245,7 @@ class StateSpaceModel:
 
     @property
     def numbers_from(self) -> tuple:
-        """What `numbers` follow from, as a value that can be compared: arrays may have been written to."""
+        """The inputs of `numbers` as a comparable value, because arrays may have been written to."""
         q, r, mean, cov = self.process_noise_cov, self.measurement_noise_cov, self.prior_mean, self.prior_cov
         return q.tobytes(), r.tobytes(), mean.tobytes(), cov.tobytes(), self.substeps, self.constants
 

@@ -78,7 +78,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
 
     @property
     def bytes_per_copy(self) -> int:
-        """Memory that one copy takes while it is stepped [bytes]; its generator and next keys come on top."""
+        """Memory of one copy while it is stepped [bytes], without its generator and next keys."""
         return self._copies.bytes_per_copy
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
@@ -98,7 +98,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         return observations_of(report, self._observed), self._info(report, mask)
 
     def step(self, actions):
-        """Apply one action a copy, (num_envs, p), for one sample time; (num_envs,) will do where p is 1.
+        """Apply one action per copy, (num_envs, p), or (num_envs,) if p is 1, for one sample time.
 
         Raises ValueError for actions of another shape, and for NaN in a copy that is not about to be reset.
         """

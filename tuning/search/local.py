@@ -16,7 +16,7 @@ MOVED = 0.5  # probability that a number is moved
 
 
 def is_local(plan: Plan, number: int) -> bool:
-    """Whether the trial after this number is to be near the best one: with one objective, one filter type and "tpe"."""
+    """Whether the trial after this number is to be near the best: "tpe" with one objective and filter type."""
     return plan.sampler == "tpe" and len(plan.objectives) == len(plan.filter_types) == 1 and number % 2 == 1
 
 
