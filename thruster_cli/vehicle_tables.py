@@ -59,7 +59,7 @@ def published_table(paper: str, result: PathResult, found: list[Finding]) -> Tab
     caption = (
         f"{POSES} By yaw alone: the papers' transformation, against the true path. Both by yaw: against the "
         "path that true velocities give by yaw alone. Full: with roll and pitch. s: seconds of a run, "
-        'published above ours, of one core. "Of the size" means within a factor of 3.'
+        'published above ours, of one core. "Similar" means within a factor of 3.'
     )
     title = f"{paper}, path {_name(result)}: published RMSE against ours"
     return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY)

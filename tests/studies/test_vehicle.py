@@ -174,11 +174,11 @@ def test_why_differences_are_told_by_size(as_python):
     scores = result.scores["EKF8"]
     pose = dict(zip(("x", "y", "psi"), scores.rmse("full")[[0, 1, 3]], strict=True))
     full = why_different(PrintedRow(pose, 1.0), scores, result)
-    assert full == "of the size of ours by the full transformation"
+    assert full == "similar to ours by the full transformation"
     tiny = why_different(PrintedRow({"psi": 1e-3 * result.bound.pose[3]}, 1.0), scores, result)
-    assert "psi less than measured" in tiny
+    assert "psi below the limit" in tiny
     huge = why_different(PrintedRow({"x": 1e3, "psi": pose["psi"]}, 1.0), scores, result)
-    assert "x unlike any of ours" in huge and "psi of the size" in huge
+    assert "x unlike any of ours" in huge and "psi similar to" in huge
 
 
 def test_digits_stand_apart_by_thousands():

@@ -13,9 +13,9 @@ from thruster_env.studies.vehicle.scores import Scores
 
 FACTOR = 3.0  # up to which two errors are of the same size: path and duration are not printed
 FIELDS = {
-    "full": "of the size of ours by the full transformation",
-    "planar_both": "of the size of ours with path and estimate both by yaw alone",
-    "planar": "of the size of ours by yaw alone, which no filter can mend",
+    "full": "similar to ours by the full transformation",
+    "planar_both": "similar to ours with path and estimate both by yaw alone",
+    "planar": "similar to ours by yaw alone, an error that no filter can correct",
 }
 ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # our counterparts of the printed filters
 
@@ -63,7 +63,7 @@ def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> st
         said = likest or ["unlike any of ours"]
     below = [name for name, value in printed.rmse.items() if value < result.bound.pose[POSE.index(name)] / FACTOR]
     if below:
-        said.append(f"{', '.join(below)} less than measured u, v, w, r allow against a true path")
+        said.append(f"{', '.join(below)} below the limit set by measured u, v, w, r on a true path")
     return "; ".join(said)
 
 
