@@ -33,7 +33,7 @@ class OldNames(MetaPathFinder, Loader):
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         """The module by its name of today."""
         if "." not in spec.name:
-            rule = f"{spec.name} is thruster_env.{spec.name} now; the old name goes with the next version"
+            rule = f"{spec.name} is thruster_env.{spec.name} now; the old name will be removed in the next version"
             warnings.warn(rule, FutureWarning, stacklevel=2)
         module = importlib.import_module(f"thruster_env.{spec.name}")
         spec.loader_state = module.__spec__

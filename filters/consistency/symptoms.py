@@ -24,5 +24,5 @@ def symptoms(report: ConsistencyReport) -> list[str]:
             "out"
         )
     if report.divergences:
-        said.append("more substeps of the model, or a smaller sample time, for estimates blow up")
+        said.append("more substeps of the model, or a smaller sample time, because estimates blow up")
     return said

@@ -170,9 +170,9 @@ def ranks_verdict(ranks: Uniformity) -> str:
     """
     (first_low, first_high), (last_low, last_high) = ranks.frequency_band[[0, -1]]
     if min(first_low, last_low) > 1:
-        return "too often outermost, for the members lie too close together"
+        return "too often outermost, because the members are too close together"
     if max(first_high, last_high) < 1:
-        return "too rarely outermost, for the members lie too far apart"
+        return "too rarely outermost, because the members are too far apart"
     if _alike(ranks):
         return EVEN
     return "lopsided, for the members lie too " + (
@@ -221,7 +221,7 @@ def remedy_sentence(report: ConsistencyReport) -> str:
     elif slow or quick:
         what = "raise Q and lower R, or repair the model" if slow else "lower Q and raise R"
     elif "overconfident" in word and _ranks_are_right(report):
-        what = "more members; their ranks are right, it is their covariance that is a rough estimate"
+        what = "more members; their ranks are right, but their covariance is a rough estimate"
     elif word == "overconfident":
         what = "raise Q where nothing is measured, or repair the model there"
         what += "; the innovations are consistent" if white else ""

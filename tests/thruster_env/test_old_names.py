@@ -15,7 +15,7 @@ import thruster_env.plants.logs.grid, thruster_env.plants.logs.read as now, thru
 assert read_log is now.read_log and plants is plants_now and plants.logs.grid is plants_now.logs.grid
 assert plants.__spec__.name == plants.__name__ == "thruster_env.plants"
 said = [str(one.message) for one in told if one.category is FutureWarning]
-assert said[0] == "plants is thruster_env.plants now; the old name goes with the next version", said
+assert said[0] == "plants is thruster_env.plants now; the old name will be removed in the next version", said
 assert len(said) == 4, said
 try:
     import plants.nothing

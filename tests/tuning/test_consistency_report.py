@@ -174,9 +174,7 @@ def test_a_small_ensemble_is_overconfident_though_its_members_are_right_and_is_t
     said = sentences(report)
     assert "that of the members themselves is 0.6" in said[6]
     assert said[7].startswith("Ranks of the truth among the 8 members, state 1: even")
-    assert (
-        said[-1] == "To try: more members; their ranks are right, it is their covariance that is a rough estimate."
-    )
+    assert said[-1] == "To try: more members; their ranks are right, but their covariance is a rough estimate."
 
 
 def test_sentences_follow_their_numbers():

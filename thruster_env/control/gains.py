@@ -44,7 +44,7 @@ def lambda_gains(
     a_d, b_d, c = sampled_plant(plant, voltage)
     moduli, slope = np.abs(np.linalg.eigvals(a_d)), float((c @ b_d).item())
     if moduli.max() >= 1 or slope == 0:
-        rule = "operating_voltage must be one where the plant is stable and its thrust has a slope"
+        rule = "operating_voltage must be such that the plant is stable and its thrust has a slope"
         raise ValueError(f"{rule}, but got {voltage}")
     motor = float(moduli.min())
     if time_constant is None:

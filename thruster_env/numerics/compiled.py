@@ -267,7 +267,7 @@ class CompiledOrPython:
                 return self._run(*arguments)
             except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
                 warnings.warn(
-                    f"the model runs as Python, slowly, for numba refuses it: {_reason(error)}", stacklevel=3
+                    f"the model runs as Python, slowly, because numba refuses it: {_reason(error)}", stacklevel=3
                 )
                 self._run = self._python
             finally:

@@ -66,7 +66,7 @@ def _why(over_optimum: np.ndarray, from_optimum: np.ndarray, from_unupdated: np.
         return "a tie: within one run's scatter of the optimum"
     factors = " and ".join(f"{factor:.1f}" for factor in over_optimum)
     if free:
-        return f"{factors} times the optimum: as an ensemble that is never updated"
+        return f"{factors} times the optimum: like an ensemble that is never updated"
     return f"{factors} times the optimum: no mechanism known to us"
 
 
@@ -78,18 +78,18 @@ def general_statements(comparisons: list[Comparison]) -> list[str]:
     start = 100 * np.abs([c.kf_identity.rmse / c.kf.rmse - 1.0 for c in comparisons])
     return [
         "On a linear Gaussian model the Kalman filter (KF) is optimal, and the ensemble Kalman filter (EnKF) "
-        "tends to it as the ensemble grows. That the EnKF beats the KF cannot come out: it is a tie at the "
+        "tends to it as the ensemble grows. So the EnKF cannot beat the KF: they tie at the "
         f"Riccati value. Here EnKF/KF lies between {ratios.min():.3f} and {ratios.max():.3f}.",
         f"The KF's 95 % interval covers the Riccati optimum in {covered.sum()} of {covered.size} cells; one "
         "in twenty may miss it by chance.",
         f"The RMSE of a single run of {STEPS} steps scatters by {scatter.min():.0f} to {scatter.max():.0f} % "
-        "(standard deviation), so one run, which is what the papers seem to rest on, decides nothing.",
+        "(standard deviation), so the papers' single run, as it seems, decides nothing.",
         f"Starting from P_0 = I changes the KF's RMSE by {start.max():.2f} % at most. With P_0 = P_inf and "
         "Q = R = q I every error is proportional to sqrt(q): the four noise levels are one experiment, done "
         "here four times with other draws.",
         "The un-updated ensemble: the members run free, the gain comes from their covariance, only the mean "
         "is corrected, and the measurements carry no noise, so its U_a in the tunnel case can fall below "
-        "the optimum. On the unstable open-bladed system the members' covariance grows for ever, and the "
+        "the optimum. On the unstable open-bladed system the members' covariance grows without limit, and the "
         "gain follows it.",
     ]
 

@@ -59,9 +59,9 @@ PAPER = Paper(
     source="Ngatini, E. Apriliani, H. Nurhadi (2017), Expert Systems with Applications 68, 29-35, by their slides",
     remarks=(
         "Not fully specified: what the matrices of a rule are, whether a tangent has its offset, how a rule's "
-        "weight follows from six memberships, and whether a rule goes on from its own estimate or the common one. "
-        "Here each rule is the tangent at its corner at cruise, its weight the product of memberships within 0 "
-        "and 1, and all go on from the common estimate.",
+        "weight follows from six memberships, and whether a rule continues from its own estimate or the common "
+        "one. Here each rule is the tangent at its corner at cruise, its weight the product of memberships within "
+        "0 and 1, and all continue from the common estimate.",
         "Memberships of minimum and maximum are exchanged in name, and both are called mu_u1.",
         "B_3 keeps the term m dw/dt within the bracket, though dw/dt stands on the left.",
         "The matrix E is printed with 8 columns, on one slide with 7. It is 6 x 6.",

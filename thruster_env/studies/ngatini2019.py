@@ -44,7 +44,7 @@ PAPER = Paper(
     remarks=(
         "Equation (24) moves the mean, and no member: every forecast member is f(mean) plus noise, whose "
         "covariance is Q whatever the measurements said. The slides of ngatini2017 move the members.",
-        "The text has an accuracy above 55 %, without a definition: it cannot be done again.",
+        "The text has an accuracy above 55 %, without a definition: it cannot be reproduced.",
         "The seconds are linear in the number of members, 0.056 to 0.061 s each, so members were looped over. "
         "At 0.001 s a step a path of 18 m takes some 20 000 steps, which would leave 3 us of Octave for the "
         "dozen statements of a member's step: the run was probably shorter than the path.",

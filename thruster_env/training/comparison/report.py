@@ -31,7 +31,7 @@ def check_page(page: Path) -> None:
         raise ValueError(f"{rule}, but {page} has none")
 
 
-ROUGH = "**Rough**, by `--quick`: it shows that all runs, not which policy is better."
+ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
 
 
 def write_report(results: Sequence[Result], comparison: Comparison, page: Path, rough: bool = False) -> list[Path]:
