@@ -27,8 +27,8 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
 
     They are those of the tuned filter if it has gradients, learns no noise, and the model has few states,
     otherwise of an extended Kalman filter; models of few states get three starts. Near the best Q and R the score
-    is so flat that a sampler finds the optimum late, and with many correlations never; with a wrong model the trial
-    is one among many. None for parameters that change functions of the model, which have no such gradient.
+    is so flat that a sampler finds the optimum late, and with many correlations never; with a wrong model the
+    trial is one among many. None for parameters that change functions of the model, which have no such gradient.
     """
     if not all(filter_class(name).has_covariance for name in plan.filter_types):
         return None
