@@ -241,7 +241,7 @@ def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thr
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
         (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
         (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),
-        (("--augment", "ambient_velocity:x"), "--augment\) must be NAME, NAME:STD, NAME:STD:WALK or"),
+        (("--augment", "ambient_velocity:x"), "--augment) must be NAME, NAME:STD, NAME:STD:WALK or"),
         (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
         (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
         (("missing.json",), "a tuned file must be readable"),
