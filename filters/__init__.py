@@ -29,6 +29,7 @@ from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.registry import FILTERS, make_filter
+from filters.smoothers.modes import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
 from filters.tensors import torch
 from filters.transformed import transformed_model
@@ -73,6 +74,7 @@ __all__ = [
     "SchmidtKalmanFilter",
     "SerialSquareRootFilter",
     "Smoothed",
+    "SmoothedModes",
     "StateSpaceModel",
     "SteadyStateKalmanFilter",
     "UnscentedKalmanFilter",
@@ -84,6 +86,7 @@ __all__ = [
     "make_filter",
     "run",
     "smooth",
+    "smooth_modes",
     "torch",
     "transformed_model",
 ]

@@ -9,24 +9,13 @@ import numpy as np
 from filters.engine.batch import run, trajectories
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
-from filters.gaussian.cubature import CubatureKalmanFilter
-from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.gaussian.iterated import IteratedExtendedKalmanFilter
-from filters.gaussian.kalman import KalmanFilter
-from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
 from filters.smoothers.ensemble import smooth_ensembles
-from filters.smoothers.points import CUBATURE, UNSCENTED
-from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation, smooth_backwards
+from filters.smoothers.modes import smooth_modes
+from filters.smoothers.relations import relation_of
+from filters.smoothers.rts import smooth_backwards
 from thruster_env.numerics.checks import at_least
-
-RELATIONS: dict[type[Filter], Relation] = {
-    KalmanFilter: LINEARISED,
-    ExtendedKalmanFilter: LINEARISED,
-    IteratedExtendedKalmanFilter: LINEARISED,
-    UnscentedKalmanFilter: UNSCENTED,
-    CubatureKalmanFilter: CUBATURE,
-}
 
 
 class Smoothed(NamedTuple):
@@ -52,6 +41,7 @@ def smooth(
 
     - Kalman filters, also scheduled, extended or iterated extended, unscented and cubature Kalman filters: the
       recursion of Rauch, Tung and Striebel backwards, on the filter's own linearisation or sigma points.
+    - Filters of several models: `smooth_modes`, which also tells the probabilities of the modes; without a lag.
     - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
       of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
 
@@ -85,19 +75,11 @@ def smooth(
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
     if isinstance(filter_, EnsembleFilter):
         return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag))
-    relation = relation_of(filter_, "a smoother", " or an ensemble Kalman filter")
+    if isinstance(filter_, MultipleModelFilter):
+        if lag < steps:
+            raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
+        found = smooth_modes(filter_, keys, inputs, measurements)
+        return Smoothed(found.means, found.covs)
+    relation = relation_of(filter_, "a smoother", ", imm, mmae or an ensemble Kalman filter")
     assert isinstance(filter_, PageFilter)
     return Smoothed(*smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag))
-
-
-def relation_of(filter_: Filter, what: str, others: str = "") -> Relation:
-    """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
-    kind = type(filter_)
-    if filter_.model.bounds:
-        raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")
-    if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:
-        return SCHEDULED
-    if kind in RELATIONS:
-        return RELATIONS[kind]
-    known = ", ".join(known.name for known in RELATIONS)
-    raise ValueError(f"{what} needs a filter of {known}{others}, but got {filter_.name!r}")

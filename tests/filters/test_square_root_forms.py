@@ -84,9 +84,7 @@ def test_an_unknown_form_and_a_model_without_a_program_are_refused():
     for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter):
         with pytest.raises(ValueError, match="form must be one of covariance, square-root"):
             kind(model=pendulum(), form="cholesky")
-    with pytest.raises(
-        ValueError, match=r"beta of the square-root form must be at least alpha\^2, 1, but got 0.5"
-    ):
+    with pytest.raises(ValueError, match="beta of the square-root form must be at least"):
         UnscentedKalmanFilter(model=pendulum(), form="square-root", beta=0.5)
     with pytest.raises(ValueError, match="is for models that are small and can be traced, but this one is not"):
         ExtendedKalmanFilter(model=pendulum(transition=swing_if), form="ud").init()
