@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.batch import trajectories
+from filters.engine.session import Session
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
 from filters.smoothers.relations import relation_of
@@ -118,7 +119,7 @@ def _filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray
     (count, times, _), n, modes = z.shape, filter_.model.n, len(filter_.mode_filters)
     means, covs = np.empty((count, times, modes, n)), np.empty((count, times, modes, n, n))
     mu, divergences = np.empty((count, times, modes)), np.zeros((count, times))
-    session = filter_.session()
+    session = Session(filter_)
     for b in range(count):
         for k in range(times):
             if k:
