@@ -68,7 +68,7 @@ class KalmanFilter(AffineFilter):
 
     name: ClassVar[str] = "kf"
     page: ClassVar[Page] = ExtendedKalmanFilter.page
-    forms: ClassVar[Mapping[str, Page]] = {**ExtendedKalmanFilter.forms, "information": INFORMATION}
+    forms: ClassVar[Mapping[str, Page]] = {"information": INFORMATION, **ExtendedKalmanFilter.forms}
     form: str = "covariance"
     schedule: int = 1
 

@@ -140,14 +140,9 @@ def turn_if(x, u, c):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Formed(ExtendedKalmanFilter):
-    """The extended filter in another form."""
+    """The extended filter in all forms of the Kalman filter."""
 
-    form: str = "covariance"
-    parameters = {}
-
-    @property
-    def written_page(self):
-        return self.forms.get(self.form, self.page)
+    forms = KalmanFilter.forms
 
 
 def test_all_filters_with_pages_are_tried():

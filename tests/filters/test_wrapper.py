@@ -386,7 +386,7 @@ def test_a_filter_that_is_made_is_run_as_it_is():
         ),
         (
             {"filter": "ekf", "ensemble_size": 9},
-            "one of none .* but got 'ensemble_size'",
+            "one of form .* but got 'ensemble_size'",
         ),
         (
             {"process_noise_cov": [1.0, 1.0]},
