@@ -36,7 +36,10 @@ LEAST = 1e-12  # of a variance that a bound leaves
 
 @lru_cache(maxsize=64)
 def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str) -> Kernels:
-    """Kernels of the same filter whose mean and covariance keep bounds; its own lie behind its other memory."""
+    """Kernels of the same filter whose mean and covariance keep bounds.
+
+    Its own mean (n,) and covariance (n, n) are the last of `Belief.extras`: with these it goes on.
+    """
     n, places = kernels.n, memory_places(kernels.n, kernels.m)
     mean, free = places.mean, places.extras + kernels.extras + kernels.scratch
     size = n + n * n  # mean and covariance are neighbours
