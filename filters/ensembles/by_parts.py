@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from math import prod
 from statistics import NormalDist
 from typing import Any, ClassVar
 
@@ -134,9 +133,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     observe, silence = functions.observe, silencer(n, shape.measurement_angles)
     tell, summarise, first = plain.update, plain.summarise, number_places(n, m).r
-    place, places = own_place(shape), {}
-    for name, its_shape in page.own:
-        places[name], place = place, place + prod(its_shape)
+    places = page.places(own_place(shape))
     taper, relaxation, tail = places["taper"], places["relaxation"], places["tail"]
     move = gaussian_moves if moves_of is None else moves_of
 
@@ -224,4 +221,5 @@ class LocalisedByParts(LocalisedFilter, DeterministicUpdateFilter):
             return super().kernels()
         page, model = self.page_with(self.inflation != 1.0, relaxation=False), self.kernel_model
         kernels = kernels_by_parts(page, model.functions, model.shape, type(self).moves_of)
+        kernels = self.adapted(kernels, page)
         return with_rotation(kernels) if self.rotations else kernels

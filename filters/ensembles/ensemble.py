@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from filters.engine.belief import Kernels
+from filters.engine.layout import own_place
+from filters.ensembles.adaptive import with_adaptive_inflation
 from filters.ensembles.inflation import inflated, relaxed
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
@@ -17,7 +20,7 @@ from thruster_env.numerics.checks import at_least, positive, shown
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = "ensemble_size", "rotations", "radius"  # parameters that no page reads
+OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation"  # parameters that no page reads
 
 
 def advance(model, x, u):
@@ -54,6 +57,10 @@ def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
     """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
     if getattr(filter_, "rotations", 0):
         raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
+    if filter_.adaptive_inflation:
+        raise ValueError(
+            f"an ensemble {where} must have no adaptive_inflation, but got {filter_.adaptive_inflation:g}"
+        )
     if filter_.by_parts:
         radius = getattr(filter_, "radius", 0.0)
         given = f"{filter_.name!r}{f' with a radius of {radius:g}' if radius else ''}"
@@ -77,6 +84,8 @@ class EnsembleFilter(FilterWithPage):
         inflation: factor on the spread of the members about their mean in every step of the model's dt, after the
             process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
         relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is given back.
+        adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast that
+            is learnt from the innovations and never below 1; 0 for none. See `filters.ensembles.adaptive`.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
@@ -86,6 +95,7 @@ class EnsembleFilter(FilterWithPage):
     ensemble_size: int = 100
     inflation: float = 1.0
     relaxation: float = 0.0
+    adaptive_inflation: float = 0.0
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
@@ -98,6 +108,8 @@ class EnsembleFilter(FilterWithPage):
         object.__setattr__(self, "ensemble_size", size)
         object.__setattr__(self, "inflation", positive("inflation", self.inflation))
         object.__setattr__(self, "relaxation", relaxation)
+        deviation = positive("adaptive_inflation", self.adaptive_inflation, zero_allowed=True)
+        object.__setattr__(self, "adaptive_inflation", deviation)
 
     @property
     def by_parts(self) -> bool:
@@ -108,6 +120,12 @@ class EnsembleFilter(FilterWithPage):
     def size(self) -> int:
         """Number of ensemble members."""
         return self.ensemble_size
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Fields that the page reads, and the deviation of an adaptive inflation, if it is chosen."""
+        deviation = {"deviation": self.adaptive_inflation} if self.adaptive_inflation else {}
+        return {**super().parameters, **deviation}
 
     def _fields(self) -> Iterator[str]:
         return (name for name in super()._fields() if name not in OF_THE_ENGINE)
@@ -126,7 +144,14 @@ class EnsembleFilter(FilterWithPage):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        model, page = self.kernel_model, self.written_page
+        return self.adapted(members_kernels(page, model.functions, model.shape), page)
+
+    def adapted(self, kernels: Kernels, page: Page) -> Kernels:
+        """Kernels of a page with adaptive inflation, if it is chosen."""
+        if not self.adaptive_inflation:
+            return kernels
+        return with_adaptive_inflation(kernels, page.places(own_place(self.kernel_model.shape))["deviation"])
 
     def analysis(self, functions: Functions, shape: Shape) -> Callable:
         """Return `analyse(memory, z, numbers, size)`: the update of a model's members, without relaxation."""

@@ -105,9 +105,9 @@ class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
     def parameters(self) -> Mapping[str, Any]:
         """Those of all ensembles, and what J is made of."""
         size = self.ensemble_size
+        given = super().parameters
         return {
-            "inflation": self.inflation,
-            "relaxation": self.relaxation,
+            **{name: value for name, value in given.items() if name != "certainty"},
             "size": size,
             "degrees": size - 1,
             "low": self.certainty * (size + 1) / size,

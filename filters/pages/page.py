@@ -43,6 +43,13 @@ class Page(NamedTuple):
         names = tuple(name for name, _ in (*self.own, *self.fixed))
         return _own_class(names)(*values, *(value for _, value in self.fixed))
 
+    def places(self, first: int) -> dict[str, int]:
+        """Where each parameter begins, if they lie one behind the other from `first` on."""
+        found = {}
+        for name, shape in self.own:
+            found[name], first = first, first + prod(shape)
+        return found
+
     @property
     def own_size(self) -> int:
         """How many numbers the parameters are."""

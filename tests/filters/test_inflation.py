@@ -104,7 +104,7 @@ def test_next_to_nothing_is_nothing(name):
     """The kernels that can stretch agree with those that cannot."""
     data = some_data(far_plane())
     plain, controlled = filters_of(name, far_plane(), {}, {"inflation": 1.0, "relaxation": 1e-300})
-    assert plain.kernels() is not controlled.kernels()
+    assert plain.kernels() is not controlled.kernels() or name == "rhf"  # which has one kind of kernels
     for one, other in zip(run(plain, *data), run(controlled, *data), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 

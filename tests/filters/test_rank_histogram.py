@@ -83,7 +83,7 @@ def test_an_update_moves_each_rank_to_its_quantile_and_states_by_regression(z):
 
 def test_many_members_of_a_linear_model_have_the_kalman_filter_s_moments():
     model = plane_model(b=np.zeros((2, 0)))
-    z, members = np.array([2.0, -1.0]), make_filter("rhf", model, ensemble_size=800).init(KEY).members
+    z, members = np.array([2.0, -1.0]), make_filter("rhf", model, ensemble_size=1500).init(KEY).members
     with interpreted():
         kalman = KalmanFilter(model=model)
         prior = kalman.init()._replace(mean=members.mean(axis=1), cov=np.cov(members))

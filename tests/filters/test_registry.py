@@ -42,7 +42,7 @@ def test_filters_go_by_their_names():
 
 
 def test_a_filter_is_made_by_name_with_its_own_numbers():
-    ensemble = "ensemble_size", "inflation", "relaxation", "radius", "centred_perturbations"
+    ensemble = "ensemble_size", "inflation", "relaxation", "adaptive_inflation", "radius", "centred_perturbations"
     assert [tunable_numbers(name) for name in ("ekf", "enkf")] == [("form",), ensemble]
     made = make_filter("enkf", thruster_model(), ensemble_size=7)
     assert isinstance(made, EnsembleKalmanFilter)

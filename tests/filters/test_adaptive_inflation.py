@@ -1,0 +1,113 @@
+"""Inflation that adapts: the mode by a search, its place in a step, and a model whose Q is too small."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import multivariate_normal
+
+from filters import StateSpaceModel, make_filter, run
+from filters.c.source import c_filter
+from filters.tensors import torch
+from tests.filters.test_localised import ring
+from tests.models import KEY, plane_model, simulated
+from thruster_env.numerics.compiled import interpreted
+
+DEVIATION = 0.3
+
+
+def naive_factor(t, v, s, r):
+    """The next factor: slopes by differences, the mode by a search."""
+
+    def level(other):
+        return multivariate_normal.logpdf(v, cov=other / t * (s - r) + r)
+
+    slope = (level(t + 1e-5) - level(t - 1e-5)) / 2e-5
+
+    def cost(u):
+        return 0.5 * (u / DEVIATION) ** 2 - np.log(max(1.0 + slope * u, 1e-300))
+
+    found = minimize_scalar(cost, bounds=(-DEVIATION, DEVIATION), method="bounded", options={"xatol": 1e-12})
+    return max(t + found.x, 1.0)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "ienkf", "enkf-n", "rhf", "letkf 2"])
+def test_each_step_stretches_and_each_update_adapts(name):
+    kind, _, radius = name.partition(" ")
+    own = {"radius": float(radius)} if radius else {}
+    model = ring() if radius else plane_model()
+    plain = make_filter(kind, model, ensemble_size=8, **own)
+    adaptive = make_filter(kind, model, ensemble_size=8, adaptive_inflation=DEVIATION, **own)
+    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 12)
+    u, belief, seen = np.zeros(model.inputs), adaptive.init(KEY), []
+    assert belief.extras == [1.0]
+    z[0, 4, 0] = np.nan
+    for k in range(12):
+        factor, here = belief.extras[0], ~np.isnan(z[0, k])
+        forecast = adaptive.predict(belief, u)
+        other = plain.predict(belief._replace(extras=np.empty(0)), u)
+        mean = other.members.mean(axis=1, keepdims=True)
+        np.testing.assert_allclose(forecast.members, mean + factor**0.5 * (other.members - mean), rtol=1e-12)
+        belief, innovation = adaptive.update(forecast, z[0, k])
+        same, _ = plain.update(forecast._replace(extras=np.empty(0)), z[0, k])
+        np.testing.assert_allclose(belief.members, same.members, rtol=1e-12)
+        v, both = innovation.value[here], np.ix_(here, here)
+        expected = naive_factor(factor, v, innovation.cov[both], model.measurement_noise_cov[both])
+        assert belief.extras[0] == pytest.approx(expected, rel=1e-5)
+        seen.append(belief.extras[0])
+    assert max(seen) > 1.2 and len(set(seen)) > 4
+    again, _ = adaptive.update(adaptive.predict(belief, u), np.full(model.m, np.nan))
+    assert again.extras[0] == belief.extras[0]
+
+
+def walk(x, u, c):
+    return (x[0] + 0.1 * x[1], 0.98 * x[1])
+
+
+def place(x, c):
+    return (x[0],)
+
+
+def drifting(noise):
+    """A body whose speed changes with a variance a step."""
+    return StateSpaceModel(
+        transition=walk,
+        observe=place,
+        process_noise_cov=[1e-4, noise],
+        measurement_noise_cov=[0.04],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[0.04, 0.1],
+        inputs=0,
+    )
+
+
+@pytest.mark.usefixtures("as_python")
+def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
+    _, z = simulated(drifting(0.1), 150, count=6)
+
+    def squares(believed, deviation):
+        filter_ = make_filter("etkf", drifting(believed), ensemble_size=30, adaptive_inflation=deviation)
+        found = run(filter_, None, None, z)
+        return (found.innovations[..., 0] ** 2 / found.innovation_covs[..., 0, 0])[:, 30:].mean()
+
+    assert squares(0.001, 0.0) > 4.0
+    assert squares(0.001, 0.3) < 2.0
+    assert abs(squares(0.1, 0.1) - 1.0) < 0.2
+
+
+def test_compiled_code_and_python_are_one():
+    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, adaptive_inflation=0.2, rotations=1)
+    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
+    with interpreted():
+        expected = run(filter_, None, inputs, z)
+    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_pages_alone_and_wrong_numbers_are_refused():
+    filter_ = make_filter("etkf", plane_model(), adaptive_inflation=0.2)
+    for use, where in ((torch, "on tensors"), (c_filter, "in C")):
+        with pytest.raises(ValueError, match=f"an ensemble {where} must have no adaptive_inflation, but got 0.2"):
+            use(filter_)
+    with pytest.raises(ValueError, match="adaptive_inflation must be zero or positive, but got -1"):
+        make_filter("etkf", plane_model(), adaptive_inflation=-1)
