@@ -57,10 +57,8 @@ def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
     """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
     if getattr(filter_, "rotations", 0):
         raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
-    if filter_.adaptive_inflation:
-        raise ValueError(
-            f"an ensemble {where} must have no adaptive_inflation, but got {filter_.adaptive_inflation:g}"
-        )
+    if number := filter_.adaptive_inflation:
+        raise ValueError(f"an ensemble {where} must have no adaptive_inflation, but got {number:g}")
     if filter_.by_parts:
         radius = getattr(filter_, "radius", 0.0)
         given = f"{filter_.name!r}{f' with a radius of {radius:g}' if radius else ''}"

@@ -34,6 +34,11 @@ def curved_model(noise=0.3):
     )
 
 
+def prior_members(model, size):
+    with interpreted():
+        return make_filter("rhf", model, ensemble_size=size).init(KEY).members
+
+
 def updated(model, members, z, name="rhf", **numbers):
     filter_ = make_filter(name, model, ensemble_size=len(members[0]), **numbers)
     with interpreted():
@@ -83,7 +88,7 @@ def test_an_update_moves_each_rank_to_its_quantile_and_states_by_regression(z):
 
 def test_many_members_of_a_linear_model_have_the_kalman_filter_s_moments():
     model = plane_model(b=np.zeros((2, 0)))
-    z, members = np.array([2.0, -1.0]), make_filter("rhf", model, ensemble_size=1500).init(KEY).members
+    z, members = np.array([2.0, -1.0]), prior_members(model, 1500)
     with interpreted():
         kalman = KalmanFilter(model=model)
         prior = kalman.init()._replace(mean=members.mean(axis=1), cov=np.cov(members))
@@ -118,7 +123,7 @@ def test_a_measurement_far_beyond_all_members_leaves_finite_ones_in_their_order(
 
 def test_channels_with_correlated_noise_are_made_independent():
     model, z = wide_model(b=np.zeros((3, 0))), np.array([1.0, -0.5])
-    x = make_filter("rhf", model, ensemble_size=9).init(KEY).members
+    x = prior_members(model, 9)
     root = np.linalg.cholesky(model.measurement_noise_cov)
     _, _, _, c, shift = model.matrices()
     apart = wide_model(
