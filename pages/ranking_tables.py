@@ -31,6 +31,9 @@ ENKF, IENKF = (contender(name, ensemble_size=100) for name in ("enkf", "ienkf"))
 SMALL = contender("enkf", ensemble_size=30)
 INFLATED, SMALL_INFLATED = (contender("enkf", ensemble_size=size, inflation=1.1) for size in (100, 30))
 IENKF_INFLATED = contender("ienkf", ensemble_size=100, inflation=1.1)
+RANKED = contender("rhf", ensemble_size=100)
+SMALL_FINITE = contender("enkf-n", ensemble_size=30)
+SMALL_ADAPTIVE = contender("enkf", ensemble_size=30, adaptive_inflation=0.1)
 FLOW = {"ambient_velocity": None}
 COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS", "log L")
 
@@ -38,7 +41,7 @@ COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS"
 def speed() -> str:
     """|speed| at slow crossings and dwells."""
     by_speed = contender("gsf", component=0)  # the sum is split along omega_m
-    return table_of(leaderboard(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, PF, MANY]))
+    return table_of(leaderboard(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, RANKED, PF, MANY]))
 
 
 def fast() -> str:
@@ -61,7 +64,7 @@ def ambient() -> str:
 
 def published() -> str:
     """The published noise."""
-    ensembles = [SMALL, SMALL_INFLATED, ENKF, INFLATED, IENKF, IENKF_INFLATED]
+    ensembles = [SMALL, SMALL_INFLATED, SMALL_ADAPTIVE, SMALL_FINITE, ENKF, INFLATED, IENKF, IENKF_INFLATED]
     return table_of(leaderboard(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
 
 

@@ -86,6 +86,16 @@ QUICK = {
     ),
     "lorenz63, regularised particles": (lorenz63, Published("pf", lorenz63.particles(800, 0.9, 0.2), 0.28), 0.018),
     "lorenz96": (lorenz96, Published("enkf", {"ensemble_size": 40, "inflation": 1.06}, 0.22), 0.008),
+    "lorenz96, localised": (
+        lorenz96,
+        Published("letkf", {"ensemble_size": 7, "radius": 4, "inflation": 1.04, "rotations": 1}, 0.22),
+        0.008,
+    ),
+    "lorenz96, finite size": (
+        lorenz96,
+        Published("enkf-n", {"ensemble_size": 24, "rotations": 1, "certainty": 2.0}, 0.18),
+        0.01,
+    ),
 }
 
 
@@ -100,6 +110,14 @@ def test_a_published_score_comes_out(study, published, deviation):
     (row,) = against_published(study.problem, study.model, [published])(range(4), lambda row: None)
     assert abs(row.ours.value - published.value) < 3 * deviation / 2 and row.divergences == 0
     assert row.pooled > row.ours.value
+
+
+@pytest.mark.slow
+def test_inflation_that_adapts_keeps_a_small_ensemble_on_the_ring_which_is_lost_without():
+    numbers = {"ensemble_size": 24, "rotations": 1}
+    rows = [Published("etkf", numbers | {"adaptive_inflation": number}, 0.18) for number in (0.0, 0.1)]
+    lost, kept = against_published(lorenz96.problem, lorenz96.model, rows)(range(4), lambda row: None)
+    assert kept.ours.value < 0.2 < 1.0 < lost.ours.value
 
 
 def small(why=""):

@@ -10,6 +10,7 @@ from thruster_env.studies.nurhadi2022 import TABLE as NURHADI_2022
 STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
 BENCHMARKS = {
     "lorenz63": "thruster_env.studies.lorenz63",
+    "lorenz63-sparse": "thruster_env.studies.lorenz63_sparse",
     "lorenz96": "thruster_env.studies.lorenz96",
     "range-bearing": "thruster_env.studies.range_bearing",
 }  # modules by name
