@@ -1,6 +1,8 @@
 """The ensemble smoother against a naive one with the same draws, and against the smoother of a Kalman filter."""
 
+import json
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from filters import (
     SerialSquareRootFilter,
 )
 from filters.smoothers.smooth import smooth
-from tests.models import KEY, scalar_model, simulated, wide_model
+from tests.models import KEY, plane_model, scalar_model, simulated, wide_model
 from tests.oracles import normals
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
@@ -77,3 +79,16 @@ def test_without_process_noise_square_root_smoothers_are_exact_for_their_own_pri
         exact = smooth(KalmanFilter(model=same_prior), KEYS, inputs, measurements, lag=4)
     np.testing.assert_allclose(found.means, exact.means, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found.covs, exact.covs, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_same_members_are_smoothed_as_in_dapper():
+    case = json.loads((Path(__file__).parents[1] / "data" / "dapper_smoother.json").read_text())
+    model = plane_model(b=np.zeros((2, 0)), process_noise_cov=np.zeros((2, 2)))
+    filter_ = EnsembleTransformFilter(model=model, ensemble_size=5)
+    np.testing.assert_allclose(filter_.init(KEY).members, case["prior"], rtol=1e-12)
+    measurements = np.array([[[np.nan, np.nan], *case["z"]]])
+    found = smooth(filter_, KEYS, np.zeros((1, len(case["z"]), 0)), measurements, case["lag"])
+    np.testing.assert_allclose(found.means[0, 1:], np.mean(case["members"], axis=2), rtol=1e-10, atol=1e-10)
+    for cov, members in zip(found.covs[0, 1:], case["members"], strict=True):
+        np.testing.assert_allclose(cov, np.cov(members), rtol=1e-10, atol=1e-10)
