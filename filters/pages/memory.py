@@ -39,7 +39,9 @@ class NumbersMemory:
         self.prior_mean = self.beside("numbers", places.prior_mean, n)
         self.prior_root = self.beside("numbers", places.prior_root, n, n)
         self.scales = self.beside("numbers", places.scales, n)
-        self.constants = self.beside("numbers", places.constants, shape.constants)
+        # Where there are none, they must not lie where the filter's parameters begin: tensors are known by place.
+        at = places.constants if shape.constants else places.substeps
+        self.constants = self.beside("numbers", at, shape.constants)
         self.own = page.parameters(lambda place, size: self.beside("numbers", own + place, *size))
         self.kept: Mapping[str, Matrix] = {}
         self.constants_slope: Matrix | None = None

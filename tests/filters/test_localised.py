@@ -11,6 +11,7 @@ from filters import StateSpaceModel, make_filter, run, smooth
 from filters.c.source import c_filter
 from filters.ensembles.localised import gaspari_cohn
 from filters.tensors import torch
+from tests.filters.test_c import assert_same, built, estimated
 from tests.models import KEY, simulated, wide_model
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.plants.positions import Positions
@@ -153,6 +154,18 @@ def test_few_members_follow_a_long_ring_only_with_a_radius(name):
     assert found.divergences.tolist() == [0, 0]
     plain = run(make_filter(name, model, **numbers), None, inputs, z)
     assert found.log_likelihoods[:, 5:].mean() > plain.log_likelihoods[:, 5:].mean()
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["enkf", "denkf"])
+def test_tapered_covariances_are_those_of_c_and_of_tensors(name, tmp_path):
+    model = ring()
+    filter_ = make_filter(name, model, ensemble_size=SIZE, radius=1.5)
+    inputs, z = simulated(model, 20, missing=0.2)
+    expected = [part[0] for part in run(filter_, None, inputs, z)[:5]]
+    found, *_ = estimated(built(filter_, tmp_path), model, inputs[0], z[0])
+    assert_same(found, expected, 1e-12)
+    assert_same([np.asarray(one)[0] for one in torch(filter_).run(inputs, z)][:5], expected, 1e-10)
 
 
 @pytest.mark.parametrize("name", LOCAL)
