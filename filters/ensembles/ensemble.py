@@ -83,7 +83,8 @@ class EnsembleFilter(FilterWithPage):
             process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
         relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is given back.
         adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast that
-            is learnt from the innovations and never below 1; 0 for none. See `filters.ensembles.adaptive`.
+            is learnt from the innovations and never below 1, in steps of any length; 0 for none. See
+            `filters.ensembles.adaptive`.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
