@@ -22,10 +22,14 @@ def torch(filter_: Filter, **arguments: Any) -> TensorFilter:
     """A filter on batches of tensors, differentiable by torch; arguments are those of `TensorFilter`.
 
     Raises:
-        ValueError: if torch is not installed, for a filter without a page, or for a wrong argument.
+        ValueError: if torch is not installed, for a filter without a page or in the form "ud", or for a
+            wrong argument.
     """
     if find_spec("torch") is None:
         raise ValueError(f"filters.torch needs torch, which is not installed: {to_install('torch')}")
+    form = getattr(filter_, "form", "")
+    if form == "ud":
+        raise ValueError(f"a filter on tensors must have another form, such as 'square-root', but got {form!r}")
     from filters.tensors.filter import TensorFilter  # torch takes seconds to import
 
     return TensorFilter(filter_, **arguments)

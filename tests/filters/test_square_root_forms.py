@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+import filters
 from filters import ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, affine_model, run, smooth
 from tests.filters.test_c import built, estimated
 from tests.filters.test_differentiated import swing_if
@@ -88,6 +89,14 @@ def test_an_unknown_form_and_a_model_without_a_program_are_refused():
         UnscentedKalmanFilter(model=pendulum(), form="square-root", beta=0.5)
     with pytest.raises(ValueError, match="is for models that are small and can be traced, but this one is not"):
         ExtendedKalmanFilter(model=pendulum(transition=swing_if), form="ud").init()
+
+
+def test_on_tensors_there_is_no_ud_form():
+    pytest.importorskip("torch")
+    with pytest.raises(
+        ValueError, match="a filter on tensors must have another form, such as 'square-root', but got"
+    ):
+        filters.torch(ExtendedKalmanFilter(model=pendulum(), form="ud"))
 
 
 def two_alike(small):

@@ -48,7 +48,7 @@ def assert_same(found, expected, accuracy=1e-10):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", [name for name in OWN if not name.endswith(" ud")])
 @pytest.mark.parametrize("which", MODELS)
 def test_estimates_are_those_of_run(name, which):
     model = MODELS[which]()
@@ -67,7 +67,7 @@ def test_a_schedule_of_gains_is_that_of_run():
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", KEPT)
+@pytest.mark.parametrize("name", [name for name in KEPT if not name.endswith(" ud")])
 def test_what_a_filter_keeps_is_that_of_its_belief(name):
     filter_ = made(name, wide_model())
     inputs, z = simulated(filter_.model, 6, missing=0.3)
