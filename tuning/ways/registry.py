@@ -37,7 +37,7 @@ WAYS = {
     ),
     "scoring": Way(
         "maximum likelihood of the innovations by Fisher scoring with the exact information",
-        "to compare: it ends where `likelihood` ends, often in fewer steps",
+        "to compare: from a good start it ends where `likelihood` ends, in fewer steps",
         scoring,
         "Gupta, Mehra (1974)",
         (GRADIENT,),

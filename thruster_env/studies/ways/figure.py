@@ -22,7 +22,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
     """A panel a group: the mean log ratio of each way over the cases, after each budget of passes."""
     groups = [key for key in GROUPS if any(case.group == key for case in protocol.cases)]
     rows = -(-len(groups) // 2)
-    drawn = new_figure((10.0, 3.9 * rows))
+    drawn = new_figure((10.0, 5.2 * rows))
     axes = drawn.subplots(rows, 2, squeeze=False)
     tidy(axes.flat)
     for axis in axes.flat[len(groups) :]:
