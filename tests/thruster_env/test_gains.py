@@ -92,7 +92,7 @@ def test_steady_gain_and_slow_time_constant_would_make_an_unstable_loop():
 
 
 def test_no_gains_are_made_up():
-    with pytest.raises(ValueError, match="operating_voltage must be one where .* a slope, but got 0.0"):
+    with pytest.raises(ValueError, match="operating_voltage must be such that .* a slope, but got 0.0"):
         lambda_gains(make_plant("tunnel"), operating_voltage=0.0)
     with pytest.raises(ValueError, match="operating_voltage must be such that the plant is stable"):
         lambda_gains(make_linear_plant("open_bladed"))
