@@ -305,7 +305,7 @@ def if_fast(x, u, c):
             "on tensors must have a page, as 'ekf' and 'enkf' have, but got 'pf'",
         ),
         (lambda: filters.torch(made("ekf", scalar_model()), dtype=torch.int64), "torch.float64 or torch.float32"),
-        (lambda: filters.torch(made("kf", thruster_model()), transition=if_fast), "a filter of the model itself"),
+        (lambda: filters.torch(made("kf", thruster_model()), transition=if_fast), "a filter on the model itself"),
         (lambda: filters.torch(made("ekf", scalar_model()), observe_jacobian=if_fast), "must come with observe"),
         (lambda: plain().replace(q=1.0), "must be one of process_noise_cov, "),
         (

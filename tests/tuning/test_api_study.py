@@ -264,7 +264,7 @@ WRONG = [
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (
         lambda: tuning.tune(SHORT, trials=1).plot_sizes(),
-        "a figure of ensemble sizes needs an ensemble and truth",
+        "a figure of ensemble sizes needs an ensemble and true states",
     ),
     (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "place must be at most 1, but got 2"),
 ]

@@ -76,7 +76,7 @@ BAD = {
     "scale = 1.0": r"scale must be 2 finite numbers, but got 1.0 \(in my.toml\)",
     "steps = 50": r"steps must be a whole number of at least 51, but got 50 \(in my.toml\)",
     "process_noise_cov = [0.0, 0.0]\ninitial_state = [0.0, 0.0]": "the RMSE of the open loop is",
-    "base = 'published_open_bladed'\nprocess_noise_cov = [1.0, 0.0]": "must have a bound or a stable open loop",
+    "base = 'published_open_bladed'\nprocess_noise_cov = [1.0, 0.0]": "needs a bound or a stable open loop",
     "measurement_noise_cov = 'small'": r"measurement_noise_cov must be a finite number, but got 'small'",
     "excitation = {name = 'steps', height = 3}": "arguments of 'steps' must be among amplitude, hold",
     "excitation = 'prbs'": "each entry of excitation must be a mapping whose name is one of steps",

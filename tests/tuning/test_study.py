@@ -205,7 +205,7 @@ def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
     content = json.loads(path.read_text())
     content["filter"]["model"].update(change)
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="a tuned file must be as it was written"):
+    with pytest.raises(ValueError, match="a tuned file must be unchanged"):
         read_tuned(path)
     path.write_text(json.dumps(sealed(content)))
     with pytest.raises(ValueError, match=rule):

@@ -111,7 +111,7 @@ def test_a_file_edited_by_hand_is_exit_code_2(content, file, monkeypatch, capsys
     with open(path, "w") as stream:
         json.dump({**content, "scenario": "nominal"}, stream)
     code, _, said = thruster(monkeypatch, capsys, "verify", "tuned.json")
-    assert code == 2 and "a tuned file must be as it was written" in said
+    assert code == 2 and "a tuned file must be unchanged" in said
 
 
 def test_a_file_from_before_the_scaled_default_holds(content, file):
