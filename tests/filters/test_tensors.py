@@ -318,7 +318,7 @@ def if_fast(x, u, c):
         (lambda: plain().replace(prior_mean=[2.0]).log_likelihood(*DATA), "but got others: use run"),
         (
             lambda: deciding().run(np.zeros((2, 1, 1)), np.zeros((2, 2, 1))),
-            "transition must be a function of tensors",
+            "transition must accept tensors",
         ),
     ],
 )
