@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.rates import rates
+from benchmarks.rates import measure_again, rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
 from thruster_cli.output import (
@@ -29,7 +29,7 @@ CAPTION = (
     "Ensembles in evaluate and in batches: time a member and step, 500 steps, on all cores; batches are of 256 "
     "trajectories. On copies of a vector env: time a copy and step, env and filter. Times are the best of many "
     "rounds, ratios the median over rounds that measure both in turn. Limit: the operations of the same work, "
-    "each kind at the best rate of this machine in this run; of PPO, the products with its networks' weights. "
+    "each kind at the best of this run's measurements; of PPO, the products with its networks' weights. "
     "Goals are the most that a ratio, a multiple of the limit, or a time may be."
 )
 
@@ -80,7 +80,6 @@ def command(
     announce_compilation()
     rows = []
     with progress_console.status("measuring the machine's arithmetic ...") as status:
-        seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
         for part in (
             steps,
             vectors,
@@ -94,12 +93,13 @@ def command(
             policies,
             processes,
         ):
-            rates.cache_clear()  # measured again: others may have come to use the machine, or gone
+            measure_again()
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")
         status.update("memory of the study ...")
         resident = studies.resident_memory(seed, quick)
+    seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
     facts = machine()
     shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
     memory = [vectors.memory_line(), studies.memory_line(resident)]

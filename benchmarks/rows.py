@@ -36,6 +36,13 @@ class Row(NamedTuple):
         return None if self.limit is None else self.timing.ours / self.limit
 
     @property
+    def limits(self) -> str:
+        """The multiple of the limit as text; a limit that is passed is flagged, for it is none."""
+        if self.of_limit is None:
+            return "-"
+        return rounded(self.of_limit, 2) + (" passed" if self.of_limit < 1 else "")
+
+    @property
     def met(self) -> bool | None:
         """Whether the goal is met; None without a goal."""
         for value, goal in (
@@ -64,7 +71,7 @@ class Row(NamedTuple):
             "-" if self.timing.peer is None else readable(self.timing.peer),
             "-" if self.timing.ratio is None else rounded(self.timing.ratio),
             "-" if self.limit is None else readable(self.limit),
-            "-" if self.of_limit is None else rounded(self.of_limit, 2),
+            self.limits,
             self.goal,
             {True: "yes", False: "no", None: "-"}[self.met],
         ]
