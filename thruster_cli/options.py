@@ -1,4 +1,7 @@
-"""Options that several commands share, and the panels that group them in `--help`."""
+"""Options that several commands share, and the panels that group them in `--help`.
+
+Each command lists its options in its own signature, because Typer reads them there; their texts are here alone.
+"""
 
 from __future__ import annotations
 

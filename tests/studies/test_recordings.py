@@ -178,3 +178,11 @@ def test_goals_on_the_recorded_runs():
     assert averages.max() <= 0.6 and averages.mean() <= 0.4 and best.max() <= 0.8
     assert raw[~steps].max() <= 0.65 and raw[steps].max() <= 0.7
     assert rmse(recorded[0].own, recorded[0], 0.0, window=1) == pytest.approx(1.99, abs=5e-3)  # as filed
+
+
+def test_the_own_estimate_of_another_estimator_is_not_made_up(folder, tmp_path):
+    """Coefficients of runs named CL1state are not known: these are compared with the desired thrust."""
+    (tmp_path / "CL1stateKFRamp.csv").write_text((folder / "Ramp.csv").read_text())
+    (run,) = read_recordings(tmp_path)
+    assert run.own_is_desired
+    np.testing.assert_array_equal(run.own, run.desired)

@@ -32,6 +32,7 @@ def _own(name: str, low: float, high: float, **options) -> Parameter:
 
 
 # Ranges of the parameters that filters have beside Q, R and N; the defaults of all filters lie within them.
+# `rotations` is not tuned: a smoother refuses a filter that has some, and a tuned filter can be smoothed.
 FILTER_PARAMETERS = {
     one.name: one
     for one in (

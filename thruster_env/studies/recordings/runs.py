@@ -19,6 +19,7 @@ FLOW_RATE = 0.1  # weight of a new sample in the smoothed flow
 # The recorder's thrust T = c_n n|n| - c_nv v|n| - c_v v|v|, for its two kinds of model (Boehm 2019).
 OWN = (1.466934e-3, 0.4146275, 0.0)
 OWN_NONLINEAR = (1.4657e-3, 0.375535, 37.7137)  # of runs named NLO2
+UNKNOWN = "CL1state"  # runs so named had an estimator with other coefficients, which the files do not tell
 
 
 class Recording(NamedTuple):
@@ -102,6 +103,8 @@ def read_recording(file: Path) -> Recording:
 
 
 def _own_thrust(name: str, n: np.ndarray, v: np.ndarray) -> np.ndarray:
+    if UNKNOWN in name:
+        return np.full(len(n), np.nan)
     by_speed, by_both, by_flow = OWN_NONLINEAR if "NLO2" in name else OWN
     return by_speed * n * abs(n) - by_both * v * abs(n) - by_flow * v * abs(v)
 
