@@ -126,11 +126,9 @@ def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = N
     freedom = np.where(np.isnan(squares), 0.0, freedom)
     counted = freedom > 0
     squares = np.where(counted, squares, np.nan)
-    runs, total = counted.sum(axis=0), freedom.sum(axis=0)
-    some, below = runs > 0, np.maximum(runs, 1)
-    means = np.where(some, np.nansum(squares, axis=0) / below, np.nan)
-    limits = chdtri(np.maximum(total, 1.0)[:, None], [0.975, 0.025])  # chdtri takes the upper tail
-    band = np.where(some[:, None], limits / below[:, None], np.nan)
+    runs = counted.sum(axis=0)
+    some, band = runs > 0, band_of_means(freedom)
+    means = np.where(some, np.nansum(squares, axis=0) / np.maximum(runs, 1), np.nan)
     inside = (means >= band[:, 0]) & (means <= band[:, 1])
     probability = np.where(counted, chdtr(np.maximum(freedom, 1.0), squares), np.nan)
     return SquaresCheck(
@@ -143,3 +141,16 @@ def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = N
         mean_interval(np.where(counted, probability > 0.95, np.nan)),
         uniformity(probability),
     )
+
+
+def band_of_means(freedom: np.ndarray) -> np.ndarray:
+    """The band (T, 2) in which the mean over runs of a chi-square lies with 95 % probability; NaN without runs.
+
+    The sum over independent runs is chi-squared with the sum of their degrees of freedom.
+
+    Args:
+        freedom: degrees of freedom of each run and step, (B, T); 0 where a run does not count.
+    """
+    runs, total = (freedom > 0).sum(axis=0), freedom.sum(axis=0)
+    limits = chdtri(np.maximum(total, 1.0)[:, None], [0.975, 0.025])  # chdtri takes the upper tail
+    return np.where(runs[:, None] > 0, limits / np.maximum(runs, 1)[:, None], np.nan)

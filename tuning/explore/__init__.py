@@ -1,0 +1,1 @@
+"""What an interactive bench shows: a filter's estimates, consistency and figures for any of its numbers."""

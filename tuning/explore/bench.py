@@ -1,0 +1,218 @@
+"""`Bench`: a filter on a problem whose numbers one may change, and what one then sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from filters.filter import Filter
+from filters.registry import FILTERS
+from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.plants.quantities import Quantity
+from tuning.evaluation.baselines import rule_of_thumb
+from tuning.explore.disturbed import disturbances_of, disturbed
+from tuning.explore.export import command_of, file_of, lines_of
+from tuning.explore.knobs import Knob, checked_values, knobs_of, marks_of, start_of
+from tuning.explore.maps import Map, map_of
+from tuning.explore.shown import Shown, shown_data
+from tuning.explore.trials import Trial, trials_of
+from tuning.explore.view import View, view_of
+from tuning.problems.problem import Problem
+from tuning.search.objectives import LIKELIHOOD, SCORE
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, choice_of, has_search_space, neutral
+
+MOST_SEEDS = 64
+MOST_ACROSS = 128  # values of each number on a map
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A filter on a problem, with all numbers of both that one may change: a value, which can be pickled.
+
+    Everything is computed by what studies and evaluations use, on the training seeds of a study: what is chosen
+    by hand is evaluated on the held-out seeds afterwards, as the choice of a study is.
+
+    Args:
+        problem: a plant, or recorded logs.
+        filter: name of the filter.
+        tuned: a tuned filter, or own numbers, where one starts; the rule of thumb if None.
+        seed: of the study to which the seeds belong.
+        held_out: whether the runs are those of the held-out seeds, as `thruster evaluate` has them.
+
+    Raises:
+        ValueError: for an unknown filter, or one that the problem does not allow.
+    """
+
+    problem: Problem
+    filter: str = "ekf"
+    tuned: Choice | None = None
+    seed: int = 0
+    held_out: bool = False
+
+    def __post_init__(self):
+        """Check that there is such a filter of the problem."""
+        one_of("filter", self.filter, FILTERS)
+        if not has_search_space(self.filter):
+            raise ValueError(f"filter must be one that has a number to change, but got {shown(self.filter)}")
+        self._started.filter(self.problem)
+
+    @property
+    def title(self) -> str:
+        """What is seen, for a heading."""
+        return f"{self.filter} on {self.problem.name}"
+
+    @cached_property
+    def filters(self) -> tuple[str, ...]:
+        """Names of the filters that may be chosen on the problem."""
+        return tuple(name for name in FILTERS if has_search_space(name) and _fits(name, self.problem))
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true states are known, and so errors."""
+        return self.problem.scale is not None
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Names, symbols and units of the states."""
+        return self.problem.quantities.states
+
+    @property
+    def measurements(self) -> tuple[Quantity, ...]:
+        """Names, symbols and units of the channels."""
+        return self.problem.quantities.measurements
+
+    @cached_property
+    def knobs(self) -> tuple[Knob, ...]:
+        """All numbers that one may change."""
+        marks = marks_of(self.filter, self.problem, self.tuned, self.seed)
+        return knobs_of(self.filter, self.problem, marks)
+
+    @cached_property
+    def start(self) -> dict[str, float]:
+        """Where one starts: each knob's value in the tuned filter, or by rule of thumb."""
+        return start_of(self.knobs, self.problem, self._started)
+
+    @property
+    def _started(self) -> Choice:
+        own = self.tuned is not None and self.tuned.name == self.filter
+        return self.tuned if own and self.tuned is not None else rule_of_thumb(self.filter, self.problem)
+
+    def with_filter(self, name: str) -> Bench:
+        """The same bench with another filter."""
+        return replace(self, filter=name)
+
+    def on_held_out(self, held_out: bool = True) -> Bench:
+        """The same bench on the held-out seeds, or back on those of training."""
+        return replace(self, held_out=held_out)
+
+    def checked(self, values: Mapping[str, float]) -> dict[str, float]:
+        """A value of each knob, by default that of the start; ValueError for one that a knob cannot have."""
+        return checked_values(self.knobs, values, self.start)
+
+    def choice(self, values: Mapping[str, float]) -> Choice:
+        """The filter's numbers at some values of the knobs, as a study has them."""
+        return self._choice(self.checked(values))
+
+    def problem_at(self, values: Mapping[str, float]) -> Problem:
+        """The problem at some values of the knobs, with the disturbances that these say."""
+        return self._problem(self.checked(values))
+
+    def view(self, values: Mapping[str, float] | None = None, seeds: int = 8) -> View:
+        """What one sees at some values of the knobs.
+
+        Args:
+            values: by name; the others are those of the start.
+            seeds: number of runs; logs are shown whole.
+
+        Raises:
+            ValueError: for a value that a knob cannot have.
+        """
+        checked = self.checked(values or {})
+        problem = self._problem(checked)
+        return view_of(self._filter(checked), self._shown(problem, seeds), problem)
+
+    def map(self, values: Mapping[str, float], x: str, y: str, size: int = 32, seeds: int = 8) -> Map:
+        """Score and NIS over two knobs, size x size runs of all seeds.
+
+        Args:
+            values: of the other knobs.
+            x: name of the knob along the rows.
+            y: name of the other one.
+            size: number of values of each.
+            seeds: number of runs at each point; all training blocks of logs.
+
+        Raises:
+            ValueError: for a value that a knob cannot have, an unknown knob, or the same one twice.
+        """
+        checked, known = self.checked(values), {knob.name: knob for knob in self.knobs}
+        one_of("x", x, known), one_of("y", y, known)
+        if x == y:
+            raise ValueError(f"x and y must be different knobs, but got {x!r} for both")
+        size = at_least("size", size, 2, MOST_ACROSS)
+
+        def case(of_x: float, of_y: float):
+            at = {**checked, x: of_x, y: of_y}
+            return self._filter(at), self._shown(self._problem(at), seeds).counted
+
+        return map_of(known[x], known[y], size, case, self.problem.scale)
+
+    def plan(self, values: Mapping[str, float] | None = None) -> Plan:
+        """The study that starts here: of the same filter, on what is seen, within the ranges of the knobs."""
+        checked = self.checked(values or {})
+        problem, full = (
+            self._problem(checked),
+            [name for name in checked if "correlation_" in name and checked[name]],
+        )
+        plan = Plan(
+            self.filter,
+            (problem,),
+            self.seed,
+            (SCORE if self.has_truth else LIKELIHOOD,),
+            full_q=any(not name.startswith("R") for name in full),
+            full_r=any(name.startswith("R") for name in full),
+        )
+        known = {knob.name: knob for knob in self.knobs}
+        chosen = [name for name, one in plan.parameters().items() if one.first is not None]
+        return plan._replace(where=tuple(f"{one} = {known[one].low!r}..{known[one].high!r}" for one in chosen))
+
+    def study(self, values: Mapping[str, float], trials: int = 100) -> Iterator[Trial]:
+        """A study from some values on, trial by trial; close the iterator to stop it."""
+        return trials_of(self.plan(values), self.choice(values), at_least("trials", trials, 1))
+
+    def tuned_file(self, values: Mapping[str, float]) -> str:
+        """The tuned file of some values, evaluated on the held-out seeds as that of a study is."""
+        return file_of(self.choice(values), self.plan(values))
+
+    def python_lines(self, values: Mapping[str, float]) -> str:
+        """Lines that make the filter of some values."""
+        return lines_of(self.choice(values), self.problem, self.problem_at(values))
+
+    def command(self, values: Mapping[str, float], file: str = "tuned.json") -> str:
+        """The command that evaluates the tuned file of some values."""
+        self.checked(values)
+        return command_of(self.problem, file)
+
+    def _choice(self, checked: Mapping[str, float]) -> Choice:
+        plant = {one.name for one in disturbances_of(self.problem)}
+        own = {name: value for name, value in checked.items() if name not in plant and value != neutral(name)}
+        return choice_of(self.filter, own, self.problem)
+
+    def _filter(self, checked: Mapping[str, float]) -> Filter:
+        return self._choice(checked).filter(self.problem)
+
+    def _problem(self, checked: Mapping[str, float]) -> Problem:
+        return disturbed(self.problem, checked)
+
+    def _shown(self, problem: Problem, seeds: int) -> Shown:
+        return shown_data(problem, at_least("seeds", seeds, 1, MOST_SEEDS), self.seed, self.held_out)
+
+
+def _fits(name: str, problem: Problem) -> bool:
+    """Whether a filter can be made on a problem."""
+    try:
+        rule_of_thumb(name, problem).filter(problem)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,149 @@
+"""What one sees of a filter: estimates with their bands, innovations, consistency over time, and figures.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.consistency.nees import band_of_means
+from filters.consistency.whiteness import LAGS, whiteness
+from filters.engine.batch import Estimates
+from filters.filter import Filter
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, values_of
+from tuning.evaluation.runs import RunMetrics, metrics_by_run
+from tuning.explore.shown import Shown
+from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_on
+from tuning.problems.problem import Problem, score_label
+
+LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
+
+
+class Figure(NamedTuple):
+    """A figure that sums up what is seen."""
+
+    value: float
+    unit: str
+    better: str  # "lower", "higher", or "near" its target
+    target: float | None = None  # the expected value of NEES and NIS
+
+
+class View(NamedTuple):
+    """A filter on S runs of K rows: of a plant one a seed, of logs one a log; NaN where there is nothing."""
+
+    time: np.ndarray  # (K,), [s], or steps where there is no sample time
+    truth: np.ndarray | None  # (S, K, n), None where it is unknown
+    estimate: np.ndarray  # (S, K, n)
+    deviation: np.ndarray  # (S, K, n), standard deviations; half of the 95 % band is 1.96 of it
+    innovation: np.ndarray  # (S, K, m), NaN where nothing was measured
+    innovation_deviation: np.ndarray  # (S, K, m)
+    nees: np.ndarray | None  # (S, K), NaN where a step is not scored; None without truth
+    nis: np.ndarray  # (S, K), likewise
+    nees_band: tuple[np.ndarray, np.ndarray] | None  # (K,) each: where the mean over the runs lies with 95 %
+    nis_band: tuple[np.ndarray, np.ndarray]  # likewise
+    autocorrelation: np.ndarray  # (m, L), of each channel's whitened innovations with themselves, lags 1 to L
+    autocorrelation_band: float  # of white ones it lies within plus and minus this with 95 %
+    figures: Mapping[str, Figure]
+
+
+def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
+    """A filter on the data of a bench."""
+    data = shown.drawn
+    estimates = estimates_on(filter_, data)
+    runs = metrics_by_run(filter_, estimates, data, outputs=False, scale=problem.scale)
+    measured, n = ~np.isnan(data.seen.measurements), len(problem.quantities.states)
+    white = _whiteness(estimates, data)
+    truth = data.states is not None
+    dt = 1.0 if problem.dt is None else problem.dt
+    return View(
+        time=dt * np.arange(data.steps + 1),
+        truth=data.known_states if truth else None,
+        estimate=_there(data, estimates.means[..., :n]),
+        deviation=_there(data, _deviations(estimates.covs)[..., :n]),
+        innovation=np.where(measured, estimates.innovations, np.nan),
+        innovation_deviation=np.where(measured, _deviations(estimates.innovation_covs), np.nan),
+        nees=_whole(runs.nees, data) if truth and runs.nees is not None else None,
+        nis=_whole(runs.nis, data),
+        nees_band=_band(np.where(data.scored, float(n), 0.0)) if truth else None,
+        nis_band=_band(np.where(data.scored, measured.sum(axis=-1), 0).astype(np.float64)),
+        autocorrelation=white[0],
+        autocorrelation_band=white[1],
+        figures=_figures(filter_, shown, runs, problem),
+    )
+
+
+def _figures(filter_: Filter, shown: Shown, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:
+    """The figures of a bench: those of `tuning.evaluation`, without intervals."""
+    if shown.counted is shown.drawn:
+        found = compute_metrics(filter_, runs, shown.drawn, problem.scale, intervals=False, variances=False)
+    else:
+        found = values_of(filter_, shown.counted, problem.scale)
+    figures = {**_of_states(found, problem), **_of_innovations(found)}
+    if shown.held_out is not None:
+        held = values_of(filter_, shown.held_out, problem.scale)
+        told = {**_of_states(held, problem), **_of_innovations(held)}
+        figures |= {f"held-out {name}": one for name, one in told.items() if name != "restarts"}
+    return figures
+
+
+def _of_states(found: Evaluation, problem: Problem) -> dict[str, Figure]:
+    if not found.has_truth:
+        return {}
+    rmse = {
+        f"RMSE {state.symbol}": Figure(one.value, state.unit, LOWER)
+        for state, one in zip(found.states, found.rmse, strict=True)
+    }
+    score = {score_label([problem]).partition(" [")[0]: Figure(found.score.value, "-", LOWER)}
+    nees = Figure(found.nees.value, "-", NEAR, float(len(found.rmse)))
+    rest = {"NEES": nees, "log score": Figure(found.log_score.value, "nat", HIGHER)}
+    return {**rmse, **score, **{name: one for name, one in rest.items() if not np.isnan(one.value)}}
+
+
+def _of_innovations(found: Evaluation) -> dict[str, Figure]:
+    restarts = {"restarts": Figure(float(found.divergences), "-", LOWER)}
+    if np.isnan(found.log_likelihood):
+        return restarts
+    nis = Figure(found.nis.value, "-", NEAR, found.expected_nis)
+    return {"NIS": nis, "log-likelihood": Figure(found.log_likelihood, "nat", HIGHER), **restarts}
+
+
+def _whole(late: np.ndarray, data: Data) -> np.ndarray:
+    """Values (S, T) of late steps as those of all steps, NaN before."""
+    found = np.full(data.measurements.shape[:2], np.nan)
+    found[:, data.late] = late
+    return found
+
+
+def _there(data: Data, values: np.ndarray) -> np.ndarray:
+    """Values (S, K, n), NaN in the padding of shorter runs."""
+    if (data.rows == data.steps + 1).all():
+        return values
+    return np.where((np.arange(data.steps + 1) < data.rows[:, None])[..., None], values, np.nan)
+
+
+def _band(freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = band_of_means(freedom).T
+    return low, high
+
+
+def _deviations(covs: np.ndarray) -> np.ndarray:
+    """Standard deviations (S, K, d) of covariances (S, K, d, d); zero without a covariance."""
+    return np.sqrt(np.maximum(np.einsum("...ii->...i", covs), 0.0))
+
+
+def _whiteness(estimates: Estimates, data: Data) -> tuple[np.ndarray, float]:
+    """Autocorrelations (m, L) of the scored innovations, and the half-width of their band."""
+    late = data.late
+    present = ~np.isnan(data.late_scored(data.measurements))
+    found = whiteness(
+        estimates.innovations[:, late],
+        estimates.innovation_covs[:, late],
+        present,
+        min(LAGS, present.shape[1] - 1),
+    )
+    return np.einsum("lii->il", found.correlations).copy(), float(found.half_widths.max())
