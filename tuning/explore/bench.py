@@ -12,7 +12,7 @@ from thruster_env.numerics.checks import at_least, one_of, shown
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.explore.disturbed import disturbances_of, disturbed
-from tuning.explore.export import command_of, file_of, lines_of
+from tuning.explore.exported import command_of, file_of, lines_of
 from tuning.explore.knobs import Knob, checked_values, knobs_of, marks_of, start_of
 from tuning.explore.maps import Map, map_of
 from tuning.explore.shown import Shown, shown_data
