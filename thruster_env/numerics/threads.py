@@ -54,7 +54,7 @@ def spread(part: Callable[[int, int], None], count: int) -> None:
     loads code imports modules, and would wait for ever for one in whose import its caller is.
     """
     part(0, 0)
-    if getattr(_of_thread, "is_working", False):
+    if getattr(_of_thread, "is_working", False) or count < 2:  # a single part would only wait for its worker
         part(0, count)
         return
     edges = np.linspace(0, count, 1 + min(count, 4 * cores())).astype(int).tolist()

@@ -11,17 +11,18 @@ from filters.registry import FILTERS
 from thruster_env.numerics.checks import at_least, one_of, shown
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
-from tuning.explore.disturbed import disturbances_of, disturbed
+from tuning.explore.disturbed import disturbed
 from tuning.explore.exported import command_of, file_of, lines_of
 from tuning.explore.knobs import Knob, checked_values, knobs_of, marks_of, start_of
 from tuning.explore.maps import Map, map_of
 from tuning.explore.shown import Shown, shown_data
 from tuning.explore.trials import Trial, trials_of
 from tuning.explore.view import View, view_of
+from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, choice_of, has_search_space, neutral
+from tuning.search.space import Choice, everything_of, has_search_space, neutral, parameters, untuned_choice
 
 MOST_SEEDS = 64
 MOST_ACROSS = 128  # values of each number on a map
@@ -98,6 +99,11 @@ class Bench:
     def _started(self) -> Choice:
         own = self.tuned is not None and self.tuned.name == self.filter
         return self.tuned if own and self.tuned is not None else rule_of_thumb(self.filter, self.problem)
+
+    @cached_property
+    def _parameters(self) -> tuple[Parameter, ...]:
+        """All numbers that a study may choose."""
+        return tuple(parameters(self.filter, self.problem, **everything_of(self.problem)))
 
     def with_filter(self, name: str) -> Bench:
         """The same bench with another filter."""
@@ -195,9 +201,11 @@ class Bench:
         return command_of(self.problem, file)
 
     def _choice(self, checked: Mapping[str, float]) -> Choice:
-        plant = {one.name for one in disturbances_of(self.problem)}
-        own = {name: value for name, value in checked.items() if name not in plant and value != neutral(name)}
-        return choice_of(self.filter, own, self.problem)
+        choice = untuned_choice(self.filter, self.problem)
+        for one in self._parameters:
+            if checked[one.name] != neutral(one.name):
+                choice = one.set(choice, checked[one.name])
+        return choice
 
     def _filter(self, checked: Mapping[str, float]) -> Filter:
         return self._choice(checked).filter(self.problem)

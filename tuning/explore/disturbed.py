@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from tuning.problems.plain import plain
@@ -42,6 +43,7 @@ DISTURBANCES = (
 )
 
 
+@lru_cache(maxsize=32)
 def disturbances_of(problem: Problem) -> dict[Disturbance, float]:
     """The disturbances that a problem's plant may have, with their present values; none without a plant."""
     if not isinstance(problem, BaseScenario):

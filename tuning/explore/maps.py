@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.filter import Filter
-from thruster_env.numerics.threads import spread
 from tuning.evaluation.evaluate import values_of
 from tuning.explore.knobs import Knob
 from tuning.problems.data import Data
@@ -33,7 +32,7 @@ def values_along(knob: Knob, size: int) -> np.ndarray:
 
 
 def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Filter, Data]], scale) -> Map:
-    """Run a filter at each point of the map, on all cores.
+    """Run a filter at each point of the map.
 
     Args:
         x: the knob along the rows.
@@ -46,12 +45,7 @@ def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Fil
     found = np.empty((2, len(ys), len(xs)))
     objective = find_objective(LIKELIHOOD if scale is None else SCORE)
 
-    def part(first: int, last: int) -> None:
-        for place in range(first, last):
-            row, column = divmod(place, len(xs))
-            evaluation = values_of(*case(xs[column].item(), ys[row].item()), scale)
-            found[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
-
-    case(xs[0].item(), ys[0].item())  # what compiles, compiles here
-    spread(part, len(xs) * len(ys))
+    for row, column in np.ndindex(len(ys), len(xs)):
+        evaluation = values_of(*case(xs[column].item(), ys[row].item()), scale)
+        found[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
     return Map(x.name, y.name, xs, ys, *found)
