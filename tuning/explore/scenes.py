@@ -59,11 +59,11 @@ SCENES = {
         Scene(
             "ridge",
             "Only the ratio of Q to R moves the estimate",
-            "A Kalman filter weighs its model against the sensor, and only the ratio of Q to R enters the weights. "
-            "Multiply both by thirty and every estimate stays where it was; but the filter now claims errors five "
-            "times as large as they are. On a map of the error that is a ridge, or rather a valley: all along it the "
-            "RMSE is the same. What tells one end from the other are the innovations: their squares over the "
-            "variance that the filter expects, the NIS, should be about 1.",
+            "A Kalman filter weighs its model against the sensor, and only the ratio of Q to R enters the "
+            "weights. Multiply both by thirty and every estimate stays where it was; but the filter now claims "
+            "errors more than five times as large as they are. On a map of the error that is a ridge, or rather "
+            "a valley: all along it the RMSE is the same. What tells one end from the other are the "
+            "innovations: their squares over the variance that the filter expects, the NIS, should be about 1.",
             "Raise both Q and R by the same factor. The lines stay, the bands widen, the NIS falls.",
             "nominal",
             (
@@ -77,11 +77,12 @@ SCENES = {
         Scene(
             "lag",
             "With too small a Q the estimate lags",
-            "Q says how far the state may stray from the model in one step. Here the water flows past the thruster, "
-            "slowly changing, and the model knows nothing of it. With a small Q the filter trusts its model, takes "
-            "what the sensor says for noise, and follows the flow long after it has changed. The innovations give it "
-            "away: they stay on one side for many steps, and one tells the next.",
-            "Raise Q of the flow velocity until the estimate follows, and the autocorrelation falls into its band.",
+            "Q says how far the state may stray from the model in one step. Here the water flows past the "
+            "thruster, slowly changing, and the model knows nothing of it. With a small Q the filter trusts its "
+            "model, takes what the sensor says for noise, and follows the flow long after it has changed. The "
+            "innovations give it away: they stay on one side for many steps, and one tells the next.",
+            "Raise Q of the flow velocity until the estimate follows, and the autocorrelation falls into its "
+            "band.",
             "ambient",
             (
                 Step("a small Q of the flow", "ekf", {**OWN, "Q22": 4e-6}),
@@ -94,12 +95,14 @@ SCENES = {
         Scene(
             "outliers",
             "One outlier in twenty is enough",
-            "The sensor's data sheet says 0.5 N, and most of the time that is true; but one measurement in twenty is "
-            "off by some 10 N. Squares make few large errors count more than many small ones, and a Kalman filter "
-            "knows nothing but squares: with the R of the data sheet each outlier throws the estimate off. A larger R "
-            "buys peace at a price, for the good measurements count less, too. A filter that looks at the size of an "
-            "innovation before it believes it, ekf-robust, does better than any R.",
-            "Raise R until the jumps are gone: a hundred times the data sheet's leaves less than a quarter of the error.",
+            "The sensor's data sheet says 0.5 N, and most of the time that is true; but one measurement in "
+            "twenty is off by some 10 N. Squares make few large errors count more than many small ones, and a "
+            "Kalman filter knows nothing but squares: with the R of the data sheet each outlier throws the "
+            "estimate off. A larger R buys peace at a price, for the good measurements count less, too. A "
+            "filter that looks at the size of an innovation before it believes it, ekf-robust, does better than "
+            "any R.",
+            "Raise R until the jumps are gone: a hundred times the data sheet's leaves less than a quarter of "
+            "the error.",
             "outliers",
             (
                 Step("R from the data sheet", "ekf", {}),
@@ -112,11 +115,11 @@ SCENES = {
         Scene(
             "tangent",
             "An EKF believes in its tangent",
-            "This tachometer has no sign: it reads the magnitude of the speed. An extended Kalman filter replaces it "
-            "by its tangent at the estimate, and a tangent at either side of zero knows nothing of the other side. "
-            "Where the speed crosses zero the filter takes the wrong branch and is sure of it. The NIS stays close to "
-            "1, so the innovations do not tell; the NEES, errors against the truth, does. The unscented filter tries "
-            "several points on both sides and knows that it does not know.",
+            "This tachometer has no sign: it reads the magnitude of the speed. An extended Kalman filter "
+            "replaces it by its tangent at the estimate, and a tangent at either side of zero knows nothing of "
+            "the other side. Where the speed crosses zero the filter takes the wrong branch and is sure of it. "
+            "The NIS stays close to 1, so the innovations do not tell; the NEES, errors against the truth, "
+            "does. The unscented filter tries several points on both sides and knows that it does not know.",
             "Change the filter from ekf to ukf: the same Q and R, and the errors fit the band again.",
             "speed_magnitude",
             (
@@ -130,10 +133,10 @@ SCENES = {
         Scene(
             "ensemble",
             "Five members are too few",
-            "An ensemble filter measures its covariance from its members. Five of them see a covariance that is right "
-            "on average and wrong each time; the gain follows its errors, the mean takes over part of the noise, and "
-            "the spread comes out too small for the error that is left. The filter is overconfident, at the right Q "
-            "and R. Inflation hides it; more members cure it.",
+            "An ensemble filter measures its covariance from its members. Five of them see a covariance that is "
+            "right on average and wrong each time; the gain follows its errors, the mean takes over part of the "
+            "noise, and the spread comes out too small for the error that is left. The filter is overconfident, "
+            "at the right Q and R. Inflation hides it; more members cure it.",
             "Raise the number of members from 5 to 100 and see NEES fall to the number of states, 2.",
             "nominal",
             (
@@ -148,10 +151,11 @@ SCENES = {
             "constant",
             "No Q makes up for a wrong constant",
             "The filter's model has 15 % more lift and 5 % less voltage gain than the plant. The thrust that it "
-            "expects is that of another speed, so that the estimate of the speed is off by as much, always to the same "
-            "side. Noise is what changes sign; a wrong constant does not. A larger Q widens the band and leaves the "
-            "error where it is: the NIS of the innovations can be brought to 1, the error cannot be brought down. "
-            "What helps is the right constant, estimated with the states or identified from recorded runs.",
+            "expects is that of another speed, so that the estimate of the speed is off by as much, always to "
+            "the same side. Noise is what changes sign; a wrong constant does not. A larger Q widens the band "
+            "and leaves the error where it is: the NIS of the innovations can be brought to 1, the error cannot "
+            "be brought down. What helps is the right constant, estimated with the states or identified from "
+            "recorded runs.",
             "Raise Q as far as you like: the band grows, and the RMSE of the motor speed stays.",
             "mismatch",
             (
