@@ -23,40 +23,41 @@ SHOWN = ("NEES", "NIS")  # beside the RMSE
 
 
 def draw(scene: Scene, path: Path) -> Path:
-    """A scene: the state with its truth and band, the innovations and their autocorrelation, before and after."""
-    figure = new_figure((9.6, 5.4))
-    axes = figure.subplots(3, 2, sharex="row", sharey="row", height_ratios=(5, 3, 2))
+    """A scene on one seed: the state with its truth, its error and the innovations with their bands."""
+    figure = new_figure((9.6, 5.8))
+    axes = figure.subplots(3, 2, sharex=True, sharey="row", height_ratios=(4, 3, 3))
     bench = scene.bench()
     place = [state.symbol for state in bench.states].index(scene.state)
     state, channel = bench.states[place], bench.measurements[0]
     for number, (step, column) in enumerate(zip(scene.steps, axes.T, strict=True)):
         view = scene.view(number)
         assert view.truth is not None  # scenes are of plants
-        time = view.time[SPAN]
-        top, middle, bottom = column
-        top.plot(time, view.truth[0, SPAN, place], color=DARK, linewidth=1.0, label="truth")
-        _band(top, view, place)
-        top.set_title(f"{step.label}\n{_figures(view, scene.state)}", fontsize=9)
-        reach = BAND * view.innovation_deviation[0, SPAN, 0]
-        middle.fill_between(time, -reach, reach, color=BLUE, alpha=0.2, linewidth=0)
-        middle.plot(time, view.innovation[0, SPAN, 0], ".", color=RUST, markersize=2.5)
-        lags = np.arange(1, view.autocorrelation.shape[1] + 1)
-        bottom.axhspan(-view.autocorrelation_band, view.autocorrelation_band, color=BLUE, alpha=0.2, linewidth=0)
-        bottom.vlines(lags, 0.0, view.autocorrelation[0], color=RUST)
-        middle.set_xlabel("time [s]")
-        bottom.set_xlabel("lag [steps]")
-    axes[0, 0].set_ylabel(f"{state.name} [{state.unit}]")
-    axes[1, 0].set_ylabel(f"innovation [{channel.unit}]")
-    axes[2, 0].set_ylabel("correlation")
-    axes[0, 0].legend(fontsize=8, loc="best", frameon=False)
+        time, truth, estimate = view.time[SPAN], view.truth[0, SPAN, place], view.estimate[0, SPAN, place]
+        column[0].plot(time, truth, color=DARK, linewidth=1.0, label="truth")
+        column[0].plot(time, estimate, color=BLUE, linewidth=1.2, label="estimate")
+        column[0].set_title(f"{step.label}\n{_figures(view, scene.state)}", fontsize=9)
+        _band(column[1], time, view.deviation[0, SPAN, place])
+        column[1].plot(time, estimate - truth, color=BLUE, linewidth=1.0)
+        _band(column[2], time, view.innovation_deviation[0, SPAN, 0])
+        column[2].plot(time, view.innovation[0, SPAN, 0], ".", color=RUST, markersize=2.5)
+        column[2].set_xlabel("time [s]")
+    labels = (state.name, state.unit), ("its error", state.unit), ("innovation", channel.unit)
+    for axis, (label, unit) in zip(axes[:, 0], labels, strict=True):
+        axis.set_ylabel(f"{label} [{unit}]", fontsize=9)
+    figure.legend(*_handles(axes), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     tidy(axes.flat)
     return save_figure(figure, path)
 
 
-def _band(axis, view: View, place: int) -> None:
-    time, middle, reach = view.time[SPAN], view.estimate[0, SPAN, place], BAND * view.deviation[0, SPAN, place]
-    axis.fill_between(time, middle - reach, middle + reach, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
-    axis.plot(time, middle, color=BLUE, linewidth=1.2, label="estimate")
+def _band(axis, time: np.ndarray, deviation: np.ndarray) -> None:
+    reach = BAND * deviation
+    axis.fill_between(time, -reach, reach, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
+
+
+def _handles(axes) -> tuple[list, list]:
+    """Lines of the first panel and the band of the second, with their labels."""
+    found = [one.get_legend_handles_labels() for one in axes[:2, 0]]
+    return [*found[0][0], *found[1][0]], [*found[0][1], *found[1][1]]
 
 
 def _figures(view: View, symbol: str) -> str:
