@@ -151,11 +151,10 @@ SCENES = {
             "constant",
             "No Q makes up for a wrong constant",
             "The filter's model has 15 % more lift and 5 % less voltage gain than the plant. The thrust that it "
-            "expects is that of another speed, so that the estimate of the speed is off by as much, always to "
-            "the same side. Noise is what changes sign; a wrong constant does not. A larger Q widens the band "
-            "and leaves the error where it is: the NIS of the innovations can be brought to 1, the error cannot "
-            "be brought down. What helps is the right constant, estimated with the states or identified from "
-            "recorded runs.",
+            "expects is that of another speed, so that it takes the motor for too slow, ahead and astern alike. "
+            "Noise changes its sign; the error of a wrong constant does not. A larger Q widens the band and "
+            "leaves the error where it is: the NIS can be brought to 1, the error cannot be brought down. What "
+            "helps is the right constant, estimated with the states or identified from recorded runs.",
             "Raise Q as far as you like: the band grows, and the RMSE of the motor speed stays.",
             "mismatch",
             (

@@ -9,7 +9,7 @@ from optuna.trial import TrialState
 
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
-from tuning.search.study import finished_trials, open_study, quiet_optuna, run_trials
+from tuning.search.study import FINISHED, finished_trials, open_study, quiet_optuna, run_trials
 
 
 class Trial(NamedTuple):
@@ -30,10 +30,12 @@ def trials_of(plan: Plan, start: Choice, trials: int) -> Iterator[Trial]:
     """
     quiet_optuna()
     study, data = open_study("explore", plan, None, start), plan.training_data()
-    while (done := finished_trials(study)) < trials:
-        if run_trials(study, plan, data, done + 1):
+    finished: list[int] = []  # of the present round, which ends after one trial
+    while finished_trials(study) < trials:
+        finished.clear()
+        if run_trials(study, plan, data, trials, lambda _, count: finished.append(count), lambda: bool(finished)):
             return
-        last = study.get_trials(deepcopy=False)[-1]
+        last = study.get_trials(deepcopy=False, states=FINISHED)[-1]
         pruned = last.state == TrialState.PRUNED
         seen = list(last.intermediate_values.values())
         score = sum(seen) / len(seen) if pruned and seen else last.values[0]

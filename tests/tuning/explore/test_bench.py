@@ -1,0 +1,207 @@
+"""A bench shows what evaluations and studies compute, and refuses what a knob cannot have."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+import tuning
+from filters.consistency.nees import check_squares
+from filters.registry import make_filter
+from tuning.evaluation.evaluate import check_consistency, evaluate
+from tuning.evaluation.tuned import read_tuned
+from tuning.explore.bench import Bench
+from tuning.problems.find import find_problem
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, quiet_optuna, run_study
+
+OWN = {"Q11": 1.0, "Q22": 4e-4, "R": 0.25}
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench(find_problem("outliers"))
+
+
+def figure(view, name):
+    return next(one.value for known, one in view.figures.items() if known.startswith(name))
+
+
+def test_figures_are_those_of_evaluate_on_the_same_seeds(bench):
+    found = tuning.evaluate("ekf", "outliers", seeds=5).evaluation
+    view = bench.on_held_out().view(seeds=5)
+    assert figure(view, "score") == found.score.value
+    assert [figure(view, f"RMSE {one.symbol}") for one in bench.states] == [one.value for one in found.rmse]
+    names = {"NEES": found.nees.value, "NIS": found.nis.value, "log-likelihood": found.log_likelihood}
+    names |= {"log score": found.log_score.value, "restarts": found.divergences}
+    assert {name: figure(view, name) for name in names} == names
+
+
+def test_series_are_those_of_the_filter_on_the_training_seeds(bench):
+    problem, values = bench.problem, {**OWN, "correlation_12": 0.5, "P0": 2.0}
+    data, view = problem.data(problem.training_seeds(0, 3)), bench.view(values, 3)
+    cov = np.array([[1.0, 0.5 * 0.02], [0.5 * 0.02, 4e-4]])
+    filter_ = make_filter(
+        "ekf", problem.model(process_noise_cov=cov, measurement_noise_cov=0.25, prior_cov_factor=2.0)
+    )
+    belief = filter_.init()
+    for k in range(60):
+        belief, innovation = filter_.update(belief, data.measurements[1, k])
+        assert view.estimate[1, k] == pytest.approx(belief.mean, rel=1e-9, abs=1e-9)
+        assert view.deviation[1, k] == pytest.approx(np.sqrt(np.diag(belief.cov)), rel=1e-9)
+        assert view.innovation[1, k] == pytest.approx(innovation.value, rel=1e-9, abs=1e-9)
+        belief = filter_.predict(belief, data.inputs[1, k])
+    assert np.array_equal(view.truth, data.states)
+    assert view.time == pytest.approx(0.01 * np.arange(501))
+
+
+def test_consistency_over_time_is_that_of_the_report(bench):
+    view, problem = bench.view(OWN, 6), bench.problem
+    data = problem.data(problem.training_seeds(0, 6))
+    report = check_consistency(bench.choice(OWN).filter(problem), data)
+    for squares, band, check in ((view.nees, view.nees_band, report.nees), (view.nis, view.nis_band, report.nis)):
+        assert np.isnan(squares[:, :50]).all()
+        assert squares[:, 50:].mean(axis=0) == pytest.approx(check.step_means, rel=1e-9)
+        assert np.array_equal(np.transpose(band)[50:], check.band)
+    assert np.array_equal(view.autocorrelation[0], report.whiteness.correlations[:, 0, 0])
+    assert view.autocorrelation_band == report.whiteness.half_widths.max()
+
+
+def test_a_band_counts_the_measurements_that_there_are():
+    view = Bench(find_problem("dropout")).view(seeds=4)
+    low, high = view.nis_band
+    there = (~np.isnan(view.innovation[..., 0])).sum(axis=0)[50:]
+    assert np.array_equal(np.isnan(high[50:]), there == 0)
+    errors, covs = np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
+    for end, one in zip((low, high), check_squares("NIS", errors, covs).band[0], strict=True):
+        assert end[50:][there == 1] == pytest.approx(one)
+
+
+def test_a_map_has_what_views_have(bench):
+    found = bench.map(OWN, "Q22", "R", 3)
+    assert found.score.shape == found.nis.shape == (3, 3)
+    for row, column in ((0, 0), (2, 1), (1, 2)):
+        view = bench.view({**OWN, "Q22": found.xs[column], "R": found.ys[row]})
+        assert found.score[row, column] == pytest.approx(figure(view, "score"), rel=1e-12)
+        assert found.nis[row, column] == pytest.approx(figure(view, "NIS"), rel=1e-12)
+
+
+def test_a_map_of_whole_numbers_and_one_of_a_disturbance():
+    bench = Bench(find_problem("nominal"), "enkf")
+    assert bench.map(OWN, "N", "outliers", 4, seeds=2).xs.tolist() == [5.0, 17.0, 58.0, 200.0]
+    of_two = bench.map({**OWN, "N": 5}, "outliers", "inflation", 2, seeds=2)
+    other = figure(bench.view({**OWN, "N": 5, "outliers": 0.5, "inflation": 1.3}, 2), "score")
+    assert of_two.score[1, 1] == pytest.approx(other, rel=1e-12)
+
+
+def test_knobs_mark_the_baselines_within_their_ranges(bench):
+    knobs = {knob.name: knob for knob in bench.knobs}
+    assert {"rule of thumb", "scaled default", "oracle"} == set(knobs["Q11"].marks)
+    assert knobs["Q11"].marks["oracle"] == 1.0 and knobs["R"].unit == "N^2"
+    assert all(knob.low <= value <= knob.high for knob in bench.knobs for value in knob.marks.values())
+    assert all(knobs[name].checked(value) == value for name, value in bench.start.items())
+    choice = bench.choice({"Q11": 6000.0})
+    tuned = Bench(bench.problem, "ekf", choice._replace(model={**choice.model, "measurement_noise_cov": 1e4}))
+    assert tuned.start["R"] == 1e4 == {knob.name: knob for knob in tuned.knobs}["R"].marks["tuned"]
+    assert tuned.with_filter("ukf").start["R"] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"Q11": float("nan")}, "Q11 must be a finite number, but got nan"),
+        ({"R": float("inf")}, "R must be a finite number, but got inf"),
+        ({"R": -1.0}, "R must be from 0.0025 to 250 N"),
+        ({"R": "a"}, "R must be a finite number, but got 'a'"),
+        ({"S": 1.0}, "a knob must be one of Q11, Q22"),
+    ],
+)
+def test_a_value_that_a_knob_cannot_have_is_refused_in_one_line(bench, values, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")) as caught:
+        bench.view(values)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_arguments_are_refused():
+    bench = Bench(find_problem("nominal"), "enkf")
+    for call, rule in (
+        (lambda: bench.view({"N": 7.5}), "N must be a whole number"),
+        (lambda: bench.view(seeds=0), "seeds must be a whole number of at least 1"),
+        (lambda: bench.map({}, "R", "R"), "x and y must be different"),
+        (lambda: bench.map({}, "R", "S"), "y must be one of"),
+        (lambda: bench.map({}, "R", "N", 1000), "size must be at most 128"),
+        (lambda: bench.with_filter("nought"), "filter must be one of"),
+        (lambda: Bench(find_problem("nominal"), "open-loop"), "has a number to change"),
+    ):
+        with pytest.raises(ValueError, match=rule):
+            call()
+
+
+def test_a_study_is_that_of_tune_and_stops_where_it_is_closed(bench):
+    quiet_optuna()
+    trials = list(bench.study(OWN, 6))
+    plan = bench.plan(OWN)
+    study = open_study("again", plan, None, bench.choice(OWN))
+    run_study(study, plan, 6)
+    assert [trial.values for trial in trials] == [one.params for one in study.trials]
+    assert trials[0].values == OWN
+    assert [trial.score for trial in trials if not trial.pruned] == [
+        one.values[0] for one in study.trials if one.values
+    ]
+    knobs = {knob.name: knob for knob in bench.knobs}
+    assert all(knobs[name].checked(value) for trial in trials for name, value in trial.values.items())
+    running = bench.study({}, 10**6)
+    assert next(running).values == {name: bench.start[name] for name in OWN}
+    running.close()
+
+
+def test_a_study_minimises_what_it_says(bench):
+    first = next(iter(bench.study(OWN, 1)))
+    problem = bench.problem
+    data = problem.data(problem.training_seeds(0, 32))
+    assert first.score == evaluate(bench.choice(OWN).filter(problem), data, problem.scale).score.value
+    assert isinstance(bench.plan(), Plan) and not bench.plan().full_q
+    assert bench.plan({"correlation_12": 0.2}).full_q
+
+
+def test_the_tuned_file_has_what_is_seen(bench, tmp_path):
+    values = {**OWN, "R": 5.5, "outliers": 0.1}
+    file = tmp_path / "tuned.json"
+    file.write_text(bench.tuned_file(values))
+    choice, problem, seed = read_tuned(file)
+    assert (choice.name, seed) == ("ekf", 0)
+    assert choice.model == {"process_noise_cov": (1.0, 4e-4), "measurement_noise_cov": 5.5}
+    assert problem.digest == bench.problem_at(values).digest != bench.problem.digest
+    stored = json.loads(file.read_text())
+    assert stored["study"]["method"] == "by hand"
+    held_out = tuning.evaluate(file, seeds=4).evaluation
+    assert held_out.score.value == figure(bench.on_held_out().view(values, 4), "score")
+
+
+def test_python_lines_make_the_same_filter(bench):
+    values = {**OWN, "correlation_12": 0.3, "dropout": 0.2, "dead_band": 1.0}
+    names = {}
+    exec(compile(bench.python_lines(values), "lines", "exec"), names)
+    assert names["problem"].digest == bench.problem_at(values).digest
+    data = names["problem"].data(range(2))
+    ours, theirs = (
+        evaluate(one, data, bench.problem.scale).score.value
+        for one in (bench.choice(values).filter(bench.problem), names["filter_"])
+    )
+    assert ours == theirs
+    assert bench.command(values) == "thruster evaluate tuned.json"
+
+
+def test_a_bench_can_be_pickled(bench):
+    again = pickle.loads(pickle.dumps(bench))
+    assert figure(again.view(OWN, 2), "score") == figure(bench.view(OWN, 2), "score")
+
+
+def test_an_ekf_halves_the_rule_of_thumbs_error_on_outliers_within_the_knobs(bench):
+    rule = figure(bench.view(), "score")
+    by_r_alone = bench.map({}, "Q11", "R", 8, seeds=4).score
+    assert by_r_alone.min() < 0.5 * rule
+    assert figure(bench.view({"R": 5.5}), "score") < 0.5 * rule
+    both = bench.view({**OWN, "R": 5.5})
+    assert figure(both, "score") < 0.16 * rule and 0.8 < figure(both, "NIS") < 1.25
