@@ -51,28 +51,6 @@ def write_tuned(
 
     Args:
         path: path of the file.
-        plan: as `tuned_text` takes it.
-        result: likewise.
-        comparisons: likewise.
-        study_name: likewise.
-        method: likewise.
-
-    Raises:
-        ValueError: if the folder cannot be written, or the filter is an estimator, which is code.
-    """
-    write_whole(Path(path), tuned_text(plan, result, comparisons, study_name, method))
-
-
-def tuned_text(
-    plan: Plan,
-    result: StudyResult,
-    comparisons: Sequence[Comparison],
-    study_name: str,
-    method: str = "optuna",
-) -> str:
-    """The content of a tuned file.
-
-    Args:
         plan: the plan of the study.
         result: its result, with the choice.
         comparisons: held-out evaluations, one for each scenario.
@@ -80,7 +58,7 @@ def tuned_text(
         method: how the choice was made, "optuna", "gradient", "by hand", or the name of a way.
 
     Raises:
-        ValueError: if the filter is an estimator, which is code.
+        ValueError: if the folder cannot be written, or the filter is an estimator, which is code.
     """
     choice, problem = result.choice, plan.scenarios[0]
     check_keepable(choice.name)
@@ -115,7 +93,7 @@ def tuned_text(
         "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
     }
-    return json.dumps(sealed(content), indent=2) + "\n"
+    write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
 def _monitor_of(choice: Choice, plan: Plan) -> dict | None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from thruster_env.numerics.checks import shown
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import tuned_text
+from tuning.evaluation.tuned import write_tuned
 from tuning.explore.disturbed import AMPLIFIER, SENSORS
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.plain import plain
@@ -30,7 +32,10 @@ def file_of(choice: Choice, plan: Plan) -> str:
     """The tuned file of numbers that were chosen by hand, with their held-out evaluation."""
     result = StudyResult(choice, float("nan"), [], [], 0.0, False)
     comparisons = [evaluate_held_out(choice, problem, plan.seed) for problem in plan.scenarios]
-    return tuned_text(plan, result, comparisons, BY_HAND, BY_HAND)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "tuned.json"
+        write_tuned(path, plan, result, comparisons, BY_HAND, BY_HAND)
+        return path.read_text()
 
 
 def command_of(problem: Problem, file: str) -> str:

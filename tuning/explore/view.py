@@ -14,8 +14,8 @@ from filters.consistency.nees import band_of_means
 from filters.consistency.whiteness import LAGS, whiteness
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from tuning.evaluation.evaluate import Evaluation, compute_metrics, values_of
-from tuning.evaluation.runs import RunMetrics, metrics_by_run
+from tuning.evaluation.evaluate import Evaluation, compute_metrics
+from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
 from tuning.explore.shown import Shown
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_on
@@ -79,16 +79,20 @@ def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
 
 def _figures(filter_: Filter, shown: Shown, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:
     """The figures of a bench: those of `tuning.evaluation`, without intervals."""
-    if shown.counted is shown.drawn:
-        found = compute_metrics(filter_, runs, shown.drawn, problem.scale, intervals=False, variances=False)
-    else:
-        found = values_of(filter_, shown.counted, problem.scale)
+    data, scale = shown.counted, problem.scale
+    found = _summed(filter_, data, scale, runs if data is shown.drawn else None)
     figures = {**_of_states(found, problem), **_of_innovations(found)}
     if shown.held_out is not None:
-        held = values_of(filter_, shown.held_out, problem.scale)
+        held = _summed(filter_, shown.held_out, scale)
         told = {**_of_states(held, problem), **_of_innovations(held)}
         figures |= {f"held-out {name}": one for name, one in told.items() if name != "restarts"}
     return figures
+
+
+def _summed(filter_: Filter, data: Data, scale, runs: RunMetrics | None = None) -> Evaluation:
+    """An evaluation without intervals and derived outputs, of metrics that are there or to be found."""
+    found = metrics_of_all(filter_, data, outputs=False, scale=scale) if runs is None else runs
+    return compute_metrics(filter_, found, data, scale, intervals=False, variances=False)
 
 
 def _of_states(found: Evaluation, problem: Problem) -> dict[str, Figure]:
