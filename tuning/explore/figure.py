@@ -1,0 +1,86 @@
+"""What the page shows as one figure of matplotlib, for PNG and SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tuning.explore.bench import Bench, View
+
+WITHIN_95 = 1.959963984540054  # standard normal deviates
+MOST_STATES, MOST_INNOVATIONS = 4, 2
+INK, ESTIMATE = "#1b1f24", "#0b6bb8"
+
+
+def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) -> Figure:
+    """One run's states in their bands and its innovations; NIS, NEES and autocorrelation of all runs."""
+    run = min(run, len(view.estimate) - 1)
+    panels: list[Callable[[Axes], None]] = []
+    for place, named in enumerate(bench.states[:MOST_STATES]):
+        panels.append(lambda ax, place=place, named=named: _state(ax, view, run, place, named))
+    for place, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
+        panels.append(lambda ax, place=place, named=named: _innovation(ax, view, run, place, named))
+    panels.append(lambda ax: _level(ax, view.time, view.nis, view.nis_band, "NIS"))
+    if view.nees is not None:
+        panels.append(lambda ax: _level(ax, view.time, view.nees, view.nees_band, "NEES"))
+    panels.append(lambda ax: _lags(ax, view))
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
+    numbers = ",  ".join(f"{name} {one.value:.3g} {one.unit}".rstrip() for name, one in view.figures.items())
+    figure.suptitle(title or f"{bench.title}, {bench.filter}\n{numbers}", fontsize=8)
+    axes = figure.subplots(rows, 2, squeeze=False).ravel()
+    for ax, draw in zip(axes, panels, strict=False):
+        draw(ax)
+        ax.tick_params(labelsize=7)
+        ax.xaxis.label.set_size(7)
+        ax.yaxis.label.set_size(7)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.margins(x=0.01)
+    for ax in axes[len(panels) :]:
+        ax.set_visible(False)
+    return figure
+
+
+def _state(ax: Axes, view: View, run: int, place: int, named: tuple[str, str]) -> None:
+    mean, half = view.estimate[run, :, place], WITHIN_95 * view.deviation[run, :, place]
+    ax.fill_between(view.time, mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    if view.truth is not None:
+        ax.plot(view.time, view.truth[run, :, place], color=INK, linewidth=0.8)
+    ax.plot(view.time, mean, color=ESTIMATE, linewidth=1.0)
+    ax.set_ylabel(_labelled(named))
+
+
+def _innovation(ax: Axes, view: View, run: int, place: int, named: tuple[str, str]) -> None:
+    half = WITHIN_95 * view.innovation_deviation[run, :, place]
+    ax.fill_between(view.time, -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.plot(view.time, view.innovation[run, :, place], color=ESTIMATE, linewidth=0.7)
+    ax.set_ylabel(f"innovation {_labelled(named)}")
+
+
+def _level(ax: Axes, time: np.ndarray, values: np.ndarray, band: tuple[float, float], label: str) -> None:
+    ax.axhspan(*band, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.semilogy(time, mean_of_runs(values), color=ESTIMATE, linewidth=0.7)
+    ax.set_ylabel(label)
+
+
+def _lags(ax: Axes, view: View) -> None:
+    ax.axhspan(-view.autocorrelation_band, view.autocorrelation_band, color=ESTIMATE, alpha=0.2, linewidth=0)
+    for channel in np.asarray(view.autocorrelation):
+        ax.vlines(np.arange(1, len(channel) + 1), 0.0, channel, color=ESTIMATE)
+    ax.set_ylim(-1.0, 1.0)
+    ax.set_xlabel("lag [steps]")
+    ax.set_ylabel("autocorrelation")
+
+
+def _labelled(named: tuple[str, str]) -> str:
+    return f"{named[0]} [{named[1]}]" if named[1] else named[0]
+
+
+def mean_of_runs(values: np.ndarray) -> np.ndarray:
+    """The mean over runs (S, K) -> (K,) of what is finite; NaN where nothing is."""
+    there = np.isfinite(values)
+    total = np.where(there, values, 0.0).sum(axis=0)
+    return np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)

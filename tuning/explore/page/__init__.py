@@ -1,0 +1,1 @@
+"""The page of `thruster explore`: it shows and asks, and computes nothing."""

@@ -1,0 +1,118 @@
+"""The picture of a `Map`: score or NIS over two knobs, the study's trials on it, and the point where one is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from bokeh.events import Tap
+from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, CustomJSTickFormatter, LogColorMapper
+from bokeh.palettes import Cividis256, RdBu11
+
+from tuning.explore.bench import Knob, Map
+from tuning.explore.page.colours import Colours, paint
+from tuning.explore.page.pictures import as_sent, new_figure
+
+HEIGHT = 330  # [px]
+BAD = 5.0  # times the least score, where the scale of colours ends
+TICKS = "const size = log ? 10**tick : tick; return size < 1e-2 || size >= 1e4 ? size.toExponential(log ? 0 : 1)"
+TICKS += " : String(+size.toPrecision(3))"
+
+
+class MapPicture:
+    """Score or NIS over two knobs; a click takes their values."""
+
+    def __init__(self, knobs: Sequence[Knob], taken: Callable[[dict[str, float]], None]):
+        """Make it empty.
+
+        Args:
+            knobs: all that may be an axis.
+            taken: called with the two values of a click.
+        """
+        self.set_knobs(knobs)
+        self._taken = taken
+        self.map: Map | None = None
+        self.figure = new_figure("map", "", "", HEIGHT, tools="tap")
+        self.image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
+        self.trials = ColumnDataSource({"x": [], "y": [], "alpha": []})
+        self.here = ColumnDataSource({"x": [], "y": []})
+        self.mapper = LogColorMapper(palette=Cividis256[::-1], low=1.0, high=BAD)
+        draw = self.figure
+        draw.image("image", "x", "y", "dw", "dh", source=self.image, color_mapper=self.mapper)
+        draw.line("x", "y", source=self.trials, line_alpha=0.35, name="trials")
+        draw.scatter("x", "y", source=self.trials, size=7, fill_color="white", line_width=1.2, name="trials")
+        draw.scatter("x", "y", source=self.here, size=18, marker="cross", line_width=3, name="here")
+        self.bar = ColorBar(color_mapper=self.mapper, width=12, padding=4, background_fill_color=None)
+        self.bar.major_label_text_font_size = "12px"
+        draw.add_layout(self.bar, "right")
+        draw.on_event(Tap, self._click)
+        for axis in (draw.xaxis[0], draw.yaxis[0]):
+            axis.ticker = BasicTicker(desired_num_ticks=5, mantissas=[1, 2, 5])
+            axis.formatter = CustomJSTickFormatter(args={"log": True}, code=TICKS)
+
+    def set_knobs(self, knobs: Sequence[Knob]) -> None:
+        """Begin anew with another filter's knobs."""
+        self._knobs = {knob.name: knob for knob in knobs}
+        self.map = None
+
+    def paint(self, colours: Colours) -> None:
+        """Colour it."""
+        paint(self.figure, colours)
+        self.bar.major_label_text_color = colours.axis
+
+    def show(self, found: Map, what: str) -> None:
+        """Draw a map: its "score", or its "nis"."""
+        self.map = found
+        values = np.array(found.nis if what == "nis" else found.score, dtype=float)
+        values[~np.isfinite(values) | (values <= 0.0)] = np.nan
+        if what == "nis":
+            self.mapper.update(palette=RdBu11, low=0.1, high=10.0)
+        else:
+            least = float(np.nanmin(values)) if np.isfinite(values).any() else 1.0
+            self.mapper.update(palette=Cividis256[::-1], low=least, high=BAD * least)
+        (left, width), (bottom, height) = (
+            self._extent(name, along) for name, along in ((found.x, found.xs), (found.y, found.ys))
+        )
+        self.image.data = {"image": [as_sent(values)], "x": [left], "y": [bottom], "dw": [width], "dh": [height]}
+        for axis, name in ((self.figure.xaxis[0], found.x), (self.figure.yaxis[0], found.y)):
+            knob = self._knobs[name]
+            axis.axis_label = f"{knob.label} [{knob.unit}]" if knob.unit else knob.label
+            axis.formatter.args = {"log": knob.log}
+        self.figure.x_range.update(start=left, end=left + width)
+        self.figure.y_range.update(start=bottom, end=bottom + height)
+
+    def mark(self, values: Mapping[str, float]) -> None:
+        """Draw where one is."""
+        if self.map is not None:
+            self.here.data = {"x": [self._place(self.map.x, values)], "y": [self._place(self.map.y, values)]}
+
+    def points(self, trials: Sequence[Mapping[str, float]]) -> None:
+        """Draw a study's trials, in their order."""
+        if self.map is None:
+            return
+        pairs = [(self._place(self.map.x, one), self._place(self.map.y, one)) for one in trials]
+        x, y = np.array(pairs, dtype=float).reshape(-1, 2).T
+        self.trials.data = {"x": x, "y": y, "alpha": np.ones(len(x))}
+
+    def _place(self, name: str, values: Mapping[str, float]) -> float:
+        value = values.get(name, np.nan)
+        if not self._knobs[name].log:
+            return value
+        return float(np.log10(value)) if value > 0.0 else np.nan
+
+    def _extent(self, name: str, along: np.ndarray) -> tuple[float, float]:
+        """The beginning and the length of an axis, whose outermost points are the middles of their cells."""
+        at = np.log10(along) if self._knobs[name].log else np.asarray(along, dtype=float)
+        step = (at[-1] - at[0]) / (len(at) - 1)
+        return float(at[0] - step / 2), float(at[-1] - at[0] + step)
+
+    def _click(self, event: Tap) -> None:
+        if self.map is None:
+            return
+        values = {}
+        for name, at in ((self.map.x, event.x), (self.map.y, event.y)):
+            knob = self._knobs[name]
+            value = 10.0**at if knob.log else at
+            value = min(max(value, knob.low), knob.high)
+            values[name] = float(round(value)) if knob.integer else value
+        self._taken(values)

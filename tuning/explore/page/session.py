@@ -1,0 +1,272 @@
+"""One tab of the page: answers what it asks, and keeps what it shows."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from bokeh.core.properties import String
+from bokeh.document import Document
+from bokeh.model import DataModel
+
+from tuning.explore.bench import Bench, View
+from tuning.explore.export import exported
+from tuning.explore.page.colours import HELD, ground
+from tuning.explore.page.map_picture import MapPicture
+from tuning.explore.page.pictures import Pictures
+
+WIDTHS = (200, 4000)  # of a picture, in points
+MOST_TRIALS = 10_000
+log = logging.getLogger(__name__)
+
+
+class Wire(DataModel):
+    """What the page and the server say to each other, as JSON."""
+
+    asked = String(default="")
+    told = String(default="")
+
+
+class Session:
+    """The state of one tab."""
+
+    def __init__(self, document: Document, bench: Bench, seeds: int):
+        """Fill a document with empty pictures; the page asks for the rest."""
+        self.document, self.bench, self.seeds = document, bench, seeds
+        self.values, self.dark, self.width = dict(bench.start), False, 800
+        self.run, self.errors, self.what = 0, False, "score"
+        self.view: View | None = None
+        self.before: View | None = None  # what arrows compare with
+        self.held: dict[int, tuple[Bench, dict[str, float]]] = {}
+        self.trials: list[Any] = []
+        self._stopped = threading.Event()
+        self.pictures = Pictures(bench, seeds)
+        self.map = MapPicture(bench.knobs, self._clicked)
+        self.wire = Wire(name="wire")
+        self.map.figure.tags = [self.wire]
+        self.wire.on_change("asked", self._asked)
+        document.on_session_destroyed(lambda _: self._stopped.set())
+        for one in (*self.pictures.figures, self.map.figure):
+            document.add_root(one)
+        self._paint()
+
+    def _asked(self, _: str, __: str, text: str) -> None:
+        """Answer a question; what goes wrong is said on the page in one line, and the page lives on."""
+        number = None
+        try:
+            question = json.loads(text)
+            number = question.get("number")
+            answer = getattr(self, f"do_{question['do']}")(question) or {}
+        except (ValueError, ArithmeticError) as error:
+            answer = {"error": str(error)}
+        except Exception as error:
+            log.debug("a question that failed", exc_info=True)
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        self.tell({**answer, "answers": number})
+
+    def tell(self, message: Mapping[str, Any]) -> None:
+        """Say something to the page."""
+        self.wire.told = json.dumps(_plain(message), allow_nan=False)
+
+    def do_hello(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """The beginning: what there is to set."""
+        self._seen(question)
+        self._paint()
+        self._look()
+        return {"spec": self._spec(), **self._numbers()}
+
+    def do_ground(self, question: Mapping[str, Any]) -> None:
+        """Dark or light."""
+        self._seen(question)
+        self._paint()
+
+    def do_view(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """New values."""
+        self._seen(question)
+        self.values = self._checked(question["values"])
+        self._look()
+        return self._numbers()
+
+    def do_filter(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """Another filter: values of knobs that both have stay."""
+        if question["filter"] not in self.bench.filters:
+            raise ValueError(
+                f"filter must be one of {', '.join(self.bench.filters)}, but got {question['filter']}"
+            )
+        self._stopped.set()
+        bench = self.bench.with_filter(question["filter"])
+        known = {knob.name for knob in bench.knobs}
+        values = dict(bench.start) | {name: value for name, value in self.values.items() if name in known}
+        self.bench, self.values, self.trials = bench, values, []
+        self.map.set_knobs(bench.knobs)
+        self._look()
+        return {"spec": self._spec(), **self._numbers()}
+
+    def do_shown(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """Which states are drawn, of which run, and whether as errors."""
+        self.pictures.choose([int(place) for place in question["states"]])
+        self.run, self.errors = max(0, int(question["run"])), bool(question["errors"])
+        self._look()
+        for slot in self.held:
+            self._draw_held(slot)
+        return self._numbers()
+
+    def do_map(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """Draw the map over two knobs, beside the loop, so that sliders go on; the page is told when it is there."""
+        x, y = question["x"], question["y"]
+        known = [knob.name for knob in self.bench.knobs]
+        if x not in known or y not in known or x == y:
+            raise ValueError(f"a map must have two of {', '.join(known)}, but got {x} and {y}")
+        self.what = "nis" if question.get("what") == "nis" else "score"
+        bench, values = self.bench, dict(self.values)
+        self._beside(lambda: bench.map(values, x, y), self._mapped)
+        return {}
+
+    def do_study(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """Run a study from here; its trials appear as they end."""
+        trials = int(question["trials"])
+        if not 1 <= trials <= MOST_TRIALS:
+            raise ValueError(f"trials must be from 1 to {MOST_TRIALS}, but got {trials}")
+        self._stopped.set()
+        self._stopped = stopped = threading.Event()
+        self.trials = []
+        bench, values = self.bench, dict(self.values)
+
+        def work() -> None:
+            for trial in bench.study(values, trials):
+                if stopped.is_set():
+                    return
+                self._later(lambda trial=trial: self._tried(trial, trials, stopped))
+
+        self._beside(work, lambda _: self.tell({"study": {"done": True}}))
+        return {}
+
+    def do_stop(self, _: Mapping[str, Any]) -> None:
+        """End the study after the trial that runs."""
+        self._stopped.set()
+
+    def do_hold(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep what is seen, in a colour."""
+        free = [slot for slot in range(len(HELD)) if slot not in self.held]
+        if not free:
+            raise ValueError(f"at most {len(HELD)} configurations are held: drop one first")
+        self.held[free[0]] = (self.bench, dict(self.values))
+        self._draw_held(free[0])
+        assert self.view is not None
+        held = {"slot": free[0], "colour": HELD[free[0]], "filter": self.bench.filter, "values": self.values}
+        return {"held": {**held, "figures": {name: one.value for name, one in self.view.figures.items()}}}
+
+    def do_drop(self, question: Mapping[str, Any]) -> None:
+        """Forget a held configuration."""
+        if self.held.pop(int(question["slot"]), None):
+            self.pictures.hold(int(question["slot"]), None, self.width, self.run, self.errors)
+
+    def do_export(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """What is seen, as a file or text."""
+        assert self.view is not None
+        return {"file": exported(self.bench, self.values, self.view, self.run, question["kind"])._asdict()}
+
+    def _seen(self, question: Mapping[str, Any]) -> None:
+        width, least, most = float(question.get("width", self.width)), *WIDTHS
+        self.width = int(min(max(width, least), most)) if math.isfinite(width) else least
+        self.dark = bool(question.get("dark", self.dark))
+
+    def _checked(self, asked: Mapping[str, Any]) -> dict[str, float]:
+        """Values of all knobs within their ranges; ValueError for what is no number."""
+        values = {}
+        for knob in self.bench.knobs:
+            value = float(asked.get(knob.name, self.values[knob.name]))
+            if not math.isfinite(value):
+                raise ValueError(f"{knob.label} must be from {knob.low:g} to {knob.high:g}, but got {value}")
+            value = min(max(value, knob.low), knob.high)
+            values[knob.name] = float(round(value)) if knob.integer else value
+        return values
+
+    def _look(self) -> None:
+        self.view = self.bench.view(self.values, self.seeds)
+        if self.before is None:
+            self.before = self.view
+        self.pictures.show(self.view, self.width, self.run, self.errors)
+        self.map.mark(self.values)
+
+    def _numbers(self) -> dict[str, Any]:
+        assert self.view is not None and self.before is not None
+        start = {name: one.value for name, one in self.before.figures.items()}
+        shown = {name: [*one, start.get(name)] for name, one in self.view.figures.items()}
+        return {"figures": shown, "values": self.values}
+
+    def _spec(self) -> dict[str, Any]:
+        bench = self.bench
+        return {
+            "knobs": [{**knob._asdict(), "marks": dict(knob.marks)} for knob in bench.knobs],
+            "start": dict(bench.start),
+            "filter": bench.filter,
+            "filters": list(bench.filters),
+            "states": [name for name, _ in bench.states],
+            "shown": list(self.pictures.chosen),
+            "truth": bench.has_truth,
+            "seeds": 0 if self.view is None else len(self.view.estimate),
+        }
+
+    def _paint(self) -> None:
+        colours = ground(self.dark)
+        self.pictures.paint(colours)
+        self.map.paint(colours)
+
+    def _draw_held(self, slot: int) -> None:
+        bench, values = self.held[slot]
+        self.pictures.hold(slot, bench.view(values, self.seeds), self.width, self.run, self.errors)
+
+    def _clicked(self, values: dict[str, float]) -> None:
+        self.values = self._checked({**self.values, **values})
+        self._look()
+        self.tell(self._numbers())
+
+    def _mapped(self, found: Any) -> None:
+        self.map.show(found, self.what)
+        self.map.mark(self.values)
+        self.map.points([one.values for one in self.trials])
+        self.tell({"map": True})
+
+    def _tried(self, trial: Any, trials: int, stopped: threading.Event) -> None:
+        if stopped.is_set():
+            return
+        self.trials.append(trial)
+        self.map.points([one.values for one in self.trials])
+        best = min(self.trials, key=lambda one: one.score if math.isfinite(one.score) else math.inf)
+        self.tell({"study": {"done": False, "trial": len(self.trials), "trials": trials, "best": best._asdict()}})
+
+    def _beside(self, work: Any, then: Any) -> None:
+        """Do work in a thread, then go on with its result in the document's; an error is told."""
+
+        def run() -> None:
+            try:
+                found = work()
+            except Exception as error:
+                text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+                self._later(lambda: self.tell({"error": text, "study": {"done": True}}))
+                return
+            self._later(lambda: then(found))
+
+        threading.Thread(target=run, daemon=True).start()
+
+    def _later(self, call: Any) -> None:
+        self.document.add_next_tick_callback(call)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON holds: None for NaN and infinities."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if value is None or isinstance(value, str | bool):
+        return value
+    number = float(value)
+    if not math.isfinite(number):
+        return None
+    return int(number) if number.is_integer() and abs(number) < 2**53 else number
