@@ -8,7 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tuning.explore.bench import Bench, View
+from thruster_env.plants.quantities import Quantity
+from tuning.explore.bench import Bench
+from tuning.explore.view import View
 
 WITHIN_95 = 1.959963984540054  # standard normal deviates
 MOST_STATES, MOST_INNOVATIONS = 4, 2
@@ -24,13 +26,13 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     for place, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
         panels.append(lambda ax, place=place, named=named: _innovation(ax, view, run, place, named))
     panels.append(lambda ax: _level(ax, view.time, view.nis, view.nis_band, "NIS"))
-    if view.nees is not None:
+    if view.nees is not None and view.nees_band is not None:
         panels.append(lambda ax: _level(ax, view.time, view.nees, view.nees_band, "NEES"))
     panels.append(lambda ax: _lags(ax, view))
     rows = -(-len(panels) // 2)
     figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
     numbers = ",  ".join(f"{name} {one.value:.3g} {one.unit}".rstrip() for name, one in view.figures.items())
-    figure.suptitle(title or f"{bench.title}, {bench.filter}\n{numbers}", fontsize=8)
+    figure.suptitle(f"{title or bench.title}\n{numbers}", fontsize=8)
     axes = figure.subplots(rows, 2, squeeze=False).ravel()
     for ax, draw in zip(axes, panels, strict=False):
         draw(ax)
@@ -44,7 +46,7 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     return figure
 
 
-def _state(ax: Axes, view: View, run: int, place: int, named: tuple[str, str]) -> None:
+def _state(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
     mean, half = view.estimate[run, :, place], WITHIN_95 * view.deviation[run, :, place]
     ax.fill_between(view.time, mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
     if view.truth is not None:
@@ -53,15 +55,17 @@ def _state(ax: Axes, view: View, run: int, place: int, named: tuple[str, str]) -
     ax.set_ylabel(_labelled(named))
 
 
-def _innovation(ax: Axes, view: View, run: int, place: int, named: tuple[str, str]) -> None:
+def _innovation(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
     half = WITHIN_95 * view.innovation_deviation[run, :, place]
     ax.fill_between(view.time, -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
     ax.plot(view.time, view.innovation[run, :, place], color=ESTIMATE, linewidth=0.7)
     ax.set_ylabel(f"innovation {_labelled(named)}")
 
 
-def _level(ax: Axes, time: np.ndarray, values: np.ndarray, band: tuple[float, float], label: str) -> None:
-    ax.axhspan(*band, color=ESTIMATE, alpha=0.2, linewidth=0)
+def _level(
+    ax: Axes, time: np.ndarray, values: np.ndarray, band: tuple[np.ndarray, np.ndarray], label: str
+) -> None:
+    ax.fill_between(time, *band, color=ESTIMATE, alpha=0.2, linewidth=0)
     ax.semilogy(time, mean_of_runs(values), color=ESTIMATE, linewidth=0.7)
     ax.set_ylabel(label)
 
@@ -75,8 +79,8 @@ def _lags(ax: Axes, view: View) -> None:
     ax.set_ylabel("autocorrelation")
 
 
-def _labelled(named: tuple[str, str]) -> str:
-    return f"{named[0]} [{named[1]}]" if named[1] else named[0]
+def _labelled(named: Quantity) -> str:
+    return f"{named.name} [{named.unit}]" if named.unit else named.name
 
 
 def mean_of_runs(values: np.ndarray) -> np.ndarray:

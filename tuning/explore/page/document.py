@@ -10,8 +10,9 @@ from bokeh.document import Document
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
+from thruster_env.plants.quantities import Quantity
 from tuning.explore.bench import Bench
-from tuning.explore.export import KINDS
+from tuning.explore.page.export import KINDS
 from tuning.explore.page.session import Session
 
 HERE = Path(__file__).parent
@@ -33,35 +34,23 @@ def own(name: str) -> Markup:
 def signals(bench: Bench) -> list[tuple[str, str, str]]:
     """Name, title and description of each picture over time."""
     found = []
-    for place, (name, unit) in enumerate(bench.states):
-        found.append(
-            (
-                f"state{place}",
-                f"State: {name}",
-                f"{name} in {unit or 'its unit'} over time, estimate in its 95 % band",
-            )
-        )
-    for place, (name, _) in enumerate(bench.measurements):
-        found.append(
-            (f"innovation{place}", f"Innovation: {name}", f"innovation of {name} over time, in its 95 % band")
-        )
-    found.append(("nis", "NIS, mean of all runs, in its 95 % interval", "normalised innovation squared over time"))
-    if bench.has_truth:
-        found.append(
-            (
-                "nees",
-                "NEES, mean of all runs, in its 95 % interval",
-                "normalised estimation error squared over time",
-            )
-        )
+    for place, one in enumerate(bench.states):
+        named = _named(one)
+        found.append((f"state{place}", named, f"{named} over time, with the 95 % band of its estimate"))
+    for place, one in enumerate(bench.measurements):
+        named = f"Innovation of {_named(one)}"
+        found.append((f"innovation{place}", named, f"{named} over time, with its 95 % band"))
     found.append(
-        (
-            "autocorrelation",
-            "Autocorrelation of the innovations, white within the band",
-            "autocorrelation over lags",
-        )
+        ("nis", "NIS", "Normalised innovation squared over time, with the interval of its mean over runs")
     )
+    if bench.has_truth:
+        found.append(("nees", "NEES", "Normalised estimation error squared over time, with its interval"))
+    found.append(("autocorrelation", "Autocorrelation of innovations", "Autocorrelation over lags, with its band"))
     return found
+
+
+def _named(one: Quantity) -> str:
+    return f"{one.name} [{one.unit}]" if one.unit else one.name
 
 
 def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:

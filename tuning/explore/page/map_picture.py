@@ -9,9 +9,10 @@ from bokeh.events import Tap
 from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, CustomJSTickFormatter, LogColorMapper
 from bokeh.palettes import Cividis256, RdBu11
 
-from tuning.explore.bench import Knob, Map
+from tuning.explore.knobs import Knob
+from tuning.explore.maps import Map
 from tuning.explore.page.colours import Colours, paint
-from tuning.explore.page.pictures import as_sent, new_figure
+from tuning.explore.page.signal import as_sent, new_figure
 
 HEIGHT = 330  # [px]
 BAD = 5.0  # times the least score, where the scale of colours ends
@@ -32,7 +33,7 @@ class MapPicture:
         self.set_knobs(knobs)
         self._taken = taken
         self.map: Map | None = None
-        self.figure = new_figure("map", "", "", HEIGHT, tools="tap")
+        self.figure = new_figure("map", HEIGHT, tools="tap")
         self.image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self.trials = ColumnDataSource({"x": [], "y": [], "alpha": []})
         self.here = ColumnDataSource({"x": [], "y": []})

@@ -38,7 +38,7 @@ function heard(told) {
     complain(told.error ?? "")
     if (answered.began !== null) after_painting(() => performance.measure("move to picture", {start: answered.began}))
   } else if (told.error) complain(told.error)
-  if (told.spec) { spec = told.spec; values = {...told.values}; build(); draw_map() }
+  if (told.spec) { spec = told.spec; values = {...told.values}; get("title").textContent = spec.title; build(); draw_map() }
   else if (told.values && !nextView) { values = {...told.values}; place_knobs() }
   if (told.figures) show_figures(told.figures)
   if (told.held) add_held(told.held)
@@ -169,18 +169,18 @@ function tell_shown() {
 }
 function show_figures(figures) {
   const parts = []
-  for (const [name, [value, unit, better, start]] of Object.entries(figures)) {
-    const [arrow, judgement] = against(value, start, better)
+  for (const [name, {value, unit: measured, better, target, start}] of Object.entries(figures)) {
+    const unit = measured === "-" ? "" : measured
+    const [arrow, judgement] = against(value, start, better, target)
     const number = make("dd", {className: judgement}, `${number_text(value)} ${unit} ${arrow}`)
     if (judgement) number.title = `${judgement} than at the start: ${number_text(start)} ${unit}`
     parts.push(make("div", {}, make("dt", {textContent: name}), number))
   }
   get("figures").replaceChildren(...parts)
 }
-function against(value, start, better) {
+function against(value, start, better, target) {
   if (value === null || start === null || Math.abs(value - start) <= 1e-3 * Math.abs(start)) return ["", ""]
-  const target = Number(better)
-  const gain = better === "less" ? start - value : better === "more" ? value - start : distance(start, target) - distance(value, target)
+  const gain = better === "lower" ? start - value : better === "higher" ? value - start : distance(start, target) - distance(value, target)
   return [value > start ? "\u2191" : "\u2193", Number.isFinite(gain) ? (gain > 0 ? "better" : "worse") : ""]
 }
 const distance = (value, target) => value > 0 && target > 0 ? Math.abs(Math.log(value / target)) : Math.abs(value - target)

@@ -6,18 +6,20 @@ import json
 import logging
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from bokeh.core.properties import String
 from bokeh.document import Document
 from bokeh.model import DataModel
 
-from tuning.explore.bench import Bench, View
+from tuning.explore.bench import Bench
 from tuning.explore.export import exported
 from tuning.explore.page.colours import HELD, ground
 from tuning.explore.page.map_picture import MapPicture
-from tuning.explore.page.pictures import Pictures
+from tuning.explore.page.pictures import Look, Pictures
+from tuning.explore.view import View
 
 WIDTHS = (200, 4000)  # of a picture, in points
 MOST_TRIALS = 10_000
@@ -44,7 +46,7 @@ class Session:
         self.held: dict[int, tuple[Bench, dict[str, float]]] = {}
         self.trials: list[Any] = []
         self._stopped = threading.Event()
-        self.pictures = Pictures(bench, seeds)
+        self.pictures = Pictures(bench)
         self.map = MapPicture(bench.knobs, self._clicked)
         self.wire = Wire(name="wire")
         self.map.figure.tags = [self.wire]
@@ -87,7 +89,7 @@ class Session:
     def do_view(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """New values."""
         self._seen(question)
-        self.values = self._checked(question["values"])
+        self.values = self.bench.checked(self.values | dict(question["values"]))
         self._look()
         return self._numbers()
 
@@ -115,8 +117,8 @@ class Session:
             self._draw_held(slot)
         return self._numbers()
 
-    def do_map(self, question: Mapping[str, Any]) -> dict[str, Any]:
-        """Draw the map over two knobs, beside the loop, so that sliders go on; the page is told when it is there."""
+    def do_map(self, question: Mapping[str, Any]) -> None:
+        """Draw the map over two knobs, beside the loop, so that sliders go on; the page is told."""
         x, y = question["x"], question["y"]
         known = [knob.name for knob in self.bench.knobs]
         if x not in known or y not in known or x == y:
@@ -124,9 +126,8 @@ class Session:
         self.what = "nis" if question.get("what") == "nis" else "score"
         bench, values = self.bench, dict(self.values)
         self._beside(lambda: bench.map(values, x, y), self._mapped)
-        return {}
 
-    def do_study(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def do_study(self, question: Mapping[str, Any]) -> None:
         """Run a study from here; its trials appear as they end."""
         trials = int(question["trials"])
         if not 1 <= trials <= MOST_TRIALS:
@@ -138,12 +139,11 @@ class Session:
 
         def work() -> None:
             for trial in bench.study(values, trials):
+                self._later(partial(self._tried, trial, trials, stopped))
                 if stopped.is_set():
                     return
-                self._later(lambda trial=trial: self._tried(trial, trials, stopped))
 
         self._beside(work, lambda _: self.tell({"study": {"done": True}}))
-        return {}
 
     def do_stop(self, _: Mapping[str, Any]) -> None:
         """End the study after the trial that runs."""
@@ -163,50 +163,45 @@ class Session:
     def do_drop(self, question: Mapping[str, Any]) -> None:
         """Forget a held configuration."""
         if self.held.pop(int(question["slot"]), None):
-            self.pictures.hold(int(question["slot"]), None, self.width, self.run, self.errors)
+            self.pictures.drop(int(question["slot"]))
 
-    def do_export(self, question: Mapping[str, Any]) -> dict[str, Any]:
-        """What is seen, as a file or text."""
+    def do_export(self, question: Mapping[str, Any]) -> None:
+        """What is seen, as a file or text; a tuned file is evaluated first, which takes seconds."""
         assert self.view is not None
-        return {"file": exported(self.bench, self.values, self.view, self.run, question["kind"])._asdict()}
+        seen = self.bench, dict(self.values), self.view, self.run, str(question["kind"])
+        self._beside(lambda: exported(*seen), lambda file: self.tell({"file": file._asdict()}))
 
     def _seen(self, question: Mapping[str, Any]) -> None:
         width, least, most = float(question.get("width", self.width)), *WIDTHS
         self.width = int(min(max(width, least), most)) if math.isfinite(width) else least
         self.dark = bool(question.get("dark", self.dark))
 
-    def _checked(self, asked: Mapping[str, Any]) -> dict[str, float]:
-        """Values of all knobs within their ranges; ValueError for what is no number."""
-        values = {}
-        for knob in self.bench.knobs:
-            value = float(asked.get(knob.name, self.values[knob.name]))
-            if not math.isfinite(value):
-                raise ValueError(f"{knob.label} must be from {knob.low:g} to {knob.high:g}, but got {value}")
-            value = min(max(value, knob.low), knob.high)
-            values[knob.name] = float(round(value)) if knob.integer else value
-        return values
+    @property
+    def _look_at(self) -> Look:
+        return self.width, self.run, self.errors
 
     def _look(self) -> None:
         self.view = self.bench.view(self.values, self.seeds)
         if self.before is None:
             self.before = self.view
-        self.pictures.show(self.view, self.width, self.run, self.errors)
+        self.pictures.show(self.view, self._look_at)
         self.map.mark(self.values)
 
     def _numbers(self) -> dict[str, Any]:
         assert self.view is not None and self.before is not None
         start = {name: one.value for name, one in self.before.figures.items()}
-        shown = {name: [*one, start.get(name)] for name, one in self.view.figures.items()}
+        shown = {name: {**one._asdict(), "start": start.get(name)} for name, one in self.view.figures.items()}
         return {"figures": shown, "values": self.values}
 
     def _spec(self) -> dict[str, Any]:
         bench = self.bench
         return {
             "knobs": [{**knob._asdict(), "marks": dict(knob.marks)} for knob in bench.knobs],
+            "title": bench.title,
             "start": dict(bench.start),
             "filter": bench.filter,
             "filters": list(bench.filters),
-            "states": [name for name, _ in bench.states],
+            "states": [one.name for one in bench.states],
             "shown": list(self.pictures.chosen),
             "truth": bench.has_truth,
             "seeds": 0 if self.view is None else len(self.view.estimate),
@@ -219,10 +214,10 @@ class Session:
 
     def _draw_held(self, slot: int) -> None:
         bench, values = self.held[slot]
-        self.pictures.hold(slot, bench.view(values, self.seeds), self.width, self.run, self.errors)
+        self.pictures.hold(slot, bench.view(values, self.seeds), self._look_at)
 
     def _clicked(self, values: dict[str, float]) -> None:
-        self.values = self._checked({**self.values, **values})
+        self.values = self.bench.checked(self.values | values)
         self._look()
         self.tell(self._numbers())
 
@@ -240,7 +235,7 @@ class Session:
         best = min(self.trials, key=lambda one: one.score if math.isfinite(one.score) else math.inf)
         self.tell({"study": {"done": False, "trial": len(self.trials), "trials": trials, "best": best._asdict()}})
 
-    def _beside(self, work: Any, then: Any) -> None:
+    def _beside(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
         """Do work in a thread, then go on with its result in the document's; an error is told."""
 
         def run() -> None:
@@ -254,7 +249,7 @@ class Session:
 
         threading.Thread(target=run, daemon=True).start()
 
-    def _later(self, call: Any) -> None:
+    def _later(self, call: Callable[[], None]) -> None:
         self.document.add_next_tick_callback(call)
 
 

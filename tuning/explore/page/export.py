@@ -7,8 +7,9 @@ import io
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from tuning.explore.bench import Bench, View
+from tuning.explore.bench import Bench
 from tuning.explore.figure import figure_of
+from tuning.explore.view import View
 
 KINDS = {
     "tuned": "tuned file",
