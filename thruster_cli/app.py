@@ -16,7 +16,7 @@ from typer.main import get_command
 
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
-    "Tune and evaluate a filter": ("tune", "ways", "evaluate", "report", "verify", "export", "compare"),
+    "Tune and evaluate a filter": ("tune", "explore", "ways", "evaluate", "report", "verify", "export", "compare"),
     "Recorded logs": ("log", "identify", "estimate"),
     "Policies": ("train", "score", "play"),
     "Published results and long studies": ("reproduce", "study"),

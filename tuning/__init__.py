@@ -5,6 +5,7 @@
     compare     several filters on the same seeds, with paired intervals
     estimate    a filter or a smoother over a recorded log
     identify    a model's parameters from recorded runs, and which of them the runs determine
+    explore     a page on which one tunes by hand, and sees at once what comes of it
     report      a page on a tuned filter that any browser shows
 
 Each does what the command of its name does, in one call. A problem is a name, such as "mismatch" or "auv:motion",
@@ -20,11 +21,12 @@ if TYPE_CHECKING:
     from tuning.api.compare import compare
     from tuning.api.estimate import estimate
     from tuning.api.evaluate import evaluate
+    from tuning.api.explore import explore
     from tuning.api.identify import identify
     from tuning.api.report import report
     from tuning.api.tune import tune
 
-__all__ = ["compare", "estimate", "evaluate", "identify", "report", "tune"]
+__all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "tune"]
 
 
 def __getattr__(name: str) -> Any:

@@ -84,8 +84,11 @@ class MapPicture:
 
     def mark(self, values: Mapping[str, float]) -> None:
         """Draw where one is."""
-        if self.map is not None:
-            self.here.data = {"x": [self._place(self.map.x, values)], "y": [self._place(self.map.y, values)]}
+        if self.map is None:
+            return
+        now = {"x": [self._place(self.map.x, values)], "y": [self._place(self.map.y, values)]}
+        if dict(self.here.data) != now:  # a map takes a while to be drawn
+            self.here.data = now
 
     def points(self, trials: Sequence[Mapping[str, float]]) -> None:
         """Draw a study's trials, in their order."""

@@ -174,7 +174,7 @@ function show_figures(figures) {
     const [arrow, judgement] = against(value, start, better, target)
     const number = make("dd", {className: judgement}, `${number_text(value)} ${unit} ${arrow}`)
     if (judgement) number.title = `${judgement} than at the start: ${number_text(start)} ${unit}`
-    parts.push(make("div", {}, make("dt", {textContent: name}), number))
+    parts.push(make("div", {}, make("dt", {textContent: name.replace(/:.*/, ""), title: name}), number))
   }
   get("figures").replaceChildren(...parts)
 }

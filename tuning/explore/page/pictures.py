@@ -117,7 +117,7 @@ def band_of(view: View, place: int, run: int, at: np.ndarray, errors: bool) -> t
 
 
 def lines_of(view: View, place: int, run: int, at: np.ndarray, errors: bool) -> tuple:
-    """Of one state a run's estimate, the truth and no other runs; or if `errors` x_hat - x of this run and of all."""
+    """A run's estimate of a state, and the truth; or if `errors` x_hat - x of this run, and of the others."""
     mean = view.estimate[run, at, place]
     if view.truth is None:
         return mean, None, ()

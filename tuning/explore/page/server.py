@@ -25,9 +25,9 @@ from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
-from tornado.httputil import HTTPServerRequest
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
-from tornado.web import ErrorHandler
+from tornado.web import ErrorHandler, OutputTransform
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
@@ -38,7 +38,18 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-site",
+    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; form-action 'none'",
 }
+
+
+class Careful(OutputTransform):
+    """Each answer with the headers above; the page loads nothing from elsewhere, and tells nobody its address."""
+
+    def transform_first_chunk(self, status: int, headers: HTTPHeaders, chunk: bytes, finishing: bool):
+        """Add them."""
+        for name, value in HEADERS.items():
+            headers[name] = value
+        return status, headers, chunk
 
 
 class Guarded(BokehTornado):
@@ -109,6 +120,7 @@ class Server:
         self._loop = IOLoop.current()
         hosts = frozenset(f"{name}:{self.port}" for name in NAMES)
         app = Guarded(self._page, self._token, hosts)
+        app.add_transform(Careful)
         app.settings["default_handler_class"] = ErrorHandler
         app.settings["default_handler_args"] = {"status_code": 404}
         http = HTTPServer(app)

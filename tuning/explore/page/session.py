@@ -15,8 +15,8 @@ from bokeh.document import Document
 from bokeh.model import DataModel
 
 from tuning.explore.bench import Bench
-from tuning.explore.export import exported
 from tuning.explore.page.colours import HELD, ground
+from tuning.explore.page.export import exported
 from tuning.explore.page.map_picture import MapPicture
 from tuning.explore.page.pictures import Look, Pictures
 from tuning.explore.view import View

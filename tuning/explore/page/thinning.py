@@ -6,7 +6,7 @@ import numpy as np
 
 
 def places(steps: int, width: int) -> np.ndarray:
-    """Which of so many steps are drawn on so many pixels: all, or evenly spaced ones from the first to the last."""
+    """Which steps are drawn on so many pixels: all, or evenly spaced ones from the first to the last."""
     if steps <= width:
         return np.arange(steps)
     return np.linspace(0, steps - 1, width).round().astype(int)

@@ -1,0 +1,157 @@
+"""Who gets an answer from the server of the page, asked by plain requests and websockets."""
+
+import asyncio
+import http.client
+import socket
+from threading import Thread
+
+import pytest
+
+pytest.importorskip("bokeh")
+
+from bokeh.models import ColumnDataSource, Div
+from bokeh.util.token import generate_jwt_token
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
+
+from tuning.explore.page import server as module
+from tuning.explore.page.server import LOOPBACK, Server
+
+SCRIPT = "static/js/bokeh.min.js"
+
+
+def page(document):
+    """A page, which need not be that of a bench."""
+    document.add_root(Div(text="hello"))
+    document.add_root(ColumnDataSource())
+
+
+@pytest.fixture(scope="module")
+def server():
+    made = Server(page, ends_when_left=False).start()
+    yield made
+    made.stop()
+
+
+def token_of(server):
+    return server.url.rstrip("/").rpartition("/")[2]
+
+
+def asked(server, path, **headers):
+    """Status, headers and body of an answer."""
+    connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=30)
+    given = {"Host": f"{LOOPBACK}:{server.port}"} | {name.replace("_", "-"): one for name, one in headers.items()}
+    connection.putrequest("GET", path, skip_host=True)
+    for name, value in given.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, dict(answer.getheaders()), body
+
+
+def socket_status(server, path, **headers):
+    """The status with which a websocket is opened, 101, or refused."""
+
+    async def opened():
+        url = f"ws://{LOOPBACK}:{server.port}{path}"
+        request = HTTPRequest(url, headers={name.replace("_", "-"): one for name, one in headers.items()})
+        try:
+            found = await websocket_connect(request, subprotocols=["bokeh", generate_jwt_token("x")])
+        except HTTPClientError as error:
+            return error.code
+        found.close()
+        return 101
+
+    return asyncio.run(opened())
+
+
+def test_whoever_has_the_token_gets_the_page_and_its_scripts(server):
+    token = token_of(server)
+    status, headers, body = asked(server, f"/{token}/")
+    assert status == 200 and b"bokeh" in body and headers["Referrer-Policy"] == "no-referrer"
+    assert asked(server, f"/{token}/{SCRIPT}")[0] == 200
+    assert asked(server, f"/{token}/", Host=f"localhost:{server.port}")[0] == 200
+
+
+def test_without_the_token_nothing_is_answered_and_all_refusals_are_the_same(server):
+    token = token_of(server)
+    wrong = token[:-1] + ("A" if token[-1] != "A" else "B")
+    paths = [
+        "/",
+        f"/{SCRIPT}",
+        "/ws",
+        "/autoload.js",
+        "/metadata",
+        "/favicon.ico",
+        f"/{wrong}/",
+        f"/{wrong}/{SCRIPT}",
+    ]
+    paths += [f"/{token[:-1]}/", f"/{token}x/", f"/{token.lower()}/", f"/x/{token}/", f"/?token={token}", "//"]
+    found = [asked(server, path) for path in paths]
+    assert {status for status, _, _ in found} == {404}
+    assert len({body for _, _, body in found}) == 1 and token.encode() not in found[0][2]
+
+
+def test_a_path_out_of_the_folder_of_scripts_is_not_answered(server):
+    for path in ("static/../../../../../../etc/passwd", "static/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd"):
+        assert asked(server, f"/{token_of(server)}/{path}")[0] in (403, 404)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", "[::1]:80", ""])
+def test_another_name_that_leads_here_is_refused(server, host):
+    assert asked(server, f"/{token_of(server)}/", Host=host)[0] == 404
+
+
+def test_pages_of_others_are_refused_even_with_the_token(server):
+    path = f"/{token_of(server)}/"
+    assert asked(server, path, Origin="http://evil.example")[0] == 404
+    assert asked(server, path, Origin="null")[0] == 404
+    assert asked(server, path, Origin=f"https://{LOOPBACK}:{server.port}")[0] == 404
+    assert asked(server, path, Origin=f"http://{LOOPBACK}:{server.port}")[0] == 200
+
+
+def test_a_websocket_needs_token_and_origin(server):
+    token, ours = token_of(server), f"http://{LOOPBACK}:{server.port}"
+    assert socket_status(server, f"/{token}/ws", Origin=ours) == 101
+    assert socket_status(server, f"/{token}/ws") == 404
+    assert socket_status(server, f"/{token}/ws", Origin="http://evil.example") == 404
+    assert socket_status(server, f"/{token[:-1]}/ws", Origin=ours) == 404
+    assert socket_status(server, "/ws", Origin=ours) == 404
+
+
+def test_it_listens_on_the_loopback_address_alone_and_tokens_are_long_and_new():
+    one, other = Server(page), Server(page)
+    assert {each.getsockname()[0] for each in one._sockets} == {LOOPBACK}
+    assert token_of(one) != token_of(other) and len(token_of(one)) >= 43  # 256 bits
+    for each in (*one._sockets, *other._sockets):
+        each.close()
+
+
+def test_it_ends_when_the_last_page_was_left(monkeypatch):
+    monkeypatch.setattr(module, "LEFT_FOR", 0.2)
+    made = Server(page)
+    thread = Thread(target=made.run, daemon=True)
+    thread.start()
+    assert made._started.wait(30)
+
+    async def visit():
+        import json
+        import re
+
+        text = (await asyncio.to_thread(asked, made, f"/{token_of(made)}/"))[2].decode()
+        token = json.loads(re.search(r'"token":("[^"]+")', text)[1])
+        origin = {"Origin": f"http://{LOOPBACK}:{made.port}"}
+        url = f"ws://{LOOPBACK}:{made.port}/{token_of(made)}/ws"
+        found = await websocket_connect(HTTPRequest(url, headers=origin), subprotocols=["bokeh", token])
+        await found.read_message()  # its ACK: now the page is open
+        await asyncio.sleep(1.5)
+        assert thread.is_alive()
+        found.close()
+
+    asyncio.run(visit())
+    thread.join(60)
+    assert not thread.is_alive()
+    with pytest.raises(OSError):
+        socket.create_connection((LOOPBACK, made.port), timeout=5)

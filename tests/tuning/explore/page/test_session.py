@@ -1,0 +1,216 @@
+"""What a tab asks and is told, without a browser: the document, its numbers, and wrong questions."""
+
+import json
+import math
+import pickle
+import queue
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bokeh")
+
+from bokeh.document import Document
+
+from tests.linear_problem import LinearProblem
+from tuning.explore.bench import Bench
+from tuning.explore.page.colours import DARK, HELD
+from tuning.explore.page.document import page_of
+from tuning.explore.page.session import Session, _plain
+
+SEEDS = 3
+WITHIN = 1.959963984540054
+
+
+class Tab:
+    """A session whose other threads' calls wait until somebody asks for them."""
+
+    def __init__(self, bench, monkeypatch):
+        self.calls = queue.Queue()
+        monkeypatch.setattr(Session, "_later", lambda _, call: self.calls.put(call))
+        self.session = Session(Document(), bench, SEEDS)
+        self.number = 0
+
+    def ask(self, what, **more):
+        self.number += 1
+        self.session.wire.asked = json.dumps({"do": what, "number": self.number, **more})
+        return self.told()
+
+    def told(self):
+        return json.loads(self.session.wire.told)
+
+    def wait_for(self, key):
+        """Whatever is told until a key is in it."""
+        while True:
+            self.calls.get(timeout=60)()
+            if key in self.told():
+                return self.told()[key]
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench(LinearProblem(n=2, m=1), "kf")
+
+
+@pytest.fixture
+def tab(bench, monkeypatch, as_python):
+    return Tab(bench, monkeypatch)
+
+
+def test_a_tab_begins_with_every_knob_and_the_figures(tab, bench):
+    told = tab.ask("hello", width=600, dark=True)
+    assert told["answers"] == 1 and [knob["name"] for knob in told["spec"]["knobs"]] == [
+        one.name for one in bench.knobs
+    ]
+    assert told["values"] == pytest.approx(bench.start) and "NIS" in told["figures"]
+    assert tab.session.pictures.nis.figure.yaxis[0].major_label_text_color == DARK.axis
+
+
+def test_pictures_show_the_numbers_of_the_view(tab, bench):
+    tab.ask("hello")
+    q = bench.knobs[0].name
+    told = tab.ask("view", values={q: bench.start[q] * 3.0})
+    view = bench.view(bench.start | {q: bench.start[q] * 3.0}, SEEDS)
+    shown = tab.session.pictures.states[1].source.data
+    np.testing.assert_allclose(shown["line"], view.estimate[0, :, 1], rtol=1e-6)
+    np.testing.assert_allclose(shown["truth"], view.truth[0, :, 1], rtol=1e-6)
+    np.testing.assert_allclose(shown["high"] - shown["low"], 2 * WITHIN * view.deviation[0, :, 1], rtol=1e-4)
+    innovation = tab.session.pictures.innovations[0].source.data
+    np.testing.assert_allclose(innovation["line"], view.innovation[0, :, 0], rtol=1e-6)
+    np.testing.assert_allclose(innovation["high"], WITHIN * view.innovation_deviation[0, :, 0], rtol=1e-6)
+    scored = np.isfinite(view.nees).any(axis=0)
+    nees = tab.session.pictures.nees[0].source.data["line"]
+    np.testing.assert_allclose(nees[scored], np.nanmean(view.nees[:, scored], axis=0), rtol=1e-6)
+    for name, one in view.figures.items():
+        assert told["figures"][name]["value"] == pytest.approx(one.value, nan_ok=True)
+        assert told["figures"][name]["start"] == pytest.approx(bench.view(bench.start, SEEDS).figures[name].value)
+
+
+def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
+    tab.ask("hello")
+    tab.ask("shown", states=[0], run=1, errors=True)
+    view = tab.session.view
+    signal = tab.session.pictures.states[0]
+    np.testing.assert_allclose(signal.source.data["line"], view.estimate[1, :, 0] - view.truth[1, :, 0], rtol=1e-4)
+    assert len(signal.runs.data["ys"]) == SEEDS - 1
+    np.testing.assert_allclose(signal.runs.data["ys"][1], view.estimate[2, :, 0] - view.truth[2, :, 0], rtol=1e-4)
+    assert not tab.session.pictures.states[1].figure.visible
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0, "many", None, [1.0]], ids=str)
+def test_what_is_no_value_is_said_and_nothing_changes(tab, bench, value):
+    tab.ask("hello")
+    before = dict(tab.session.values)
+    told = tab.ask("view", values={bench.knobs[0].name: value})
+    assert told["error"] and told["answers"] == 2 and tab.session.values == before
+    assert "error" not in tab.ask("view", values={})
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        {"do": "__class__"},
+        {"do": "nothing"},
+        {"do": "filter", "filter": "no"},
+        {"do": "map", "x": "no", "y": "Q11"},
+        {"do": "map", "x": "Q11", "y": "Q11"},
+        {"do": "study", "trials": 0},
+        {"do": "study", "trials": "many"},
+        {"do": "drop", "slot": 7},
+        {"do": "export"},
+        {"do": "shown", "states": ["a"], "run": 0, "errors": False},
+        {"do": "view", "values": {"os": 1}},
+        {},
+    ],
+    ids=str,
+)
+def test_a_wrong_question_is_answered_and_the_tab_lives_on(tab, question):
+    tab.ask("hello")
+    tab.session.wire.asked = json.dumps({"number": 2, **question})
+    told = tab.told()
+    assert told["answers"] == 2 and ("error" in told or question["do"] == "drop")
+    assert "figures" in tab.ask("view", values={})
+
+
+def test_text_that_is_no_question_is_answered(tab):
+    for text in ("", "[]", "7", '{"do": "view"', "nul"):
+        tab.session.wire.asked = text + " "
+        assert tab.told()["error"]
+
+
+def test_four_configurations_are_held_in_colours_and_dropped(tab, bench):
+    tab.ask("hello")
+    assert [tab.ask("hold")["held"]["colour"] for _ in HELD] == list(HELD)
+    assert "at most 4" in tab.ask("hold")["error"]
+    held = tab.session.pictures.states[0]
+    np.testing.assert_allclose(held.held[3].data["line"], tab.session.view.estimate[0, :, 0], rtol=1e-6)
+    assert held._others[2].visible
+    tab.ask("drop", slot=2)
+    assert not held._others[2].visible and tab.ask("hold")["held"]["slot"] == 2
+
+
+def test_a_map_is_drawn_with_its_rows_upwards_and_a_click_takes_values(tab, bench):
+    tab.ask("hello")
+    x, y = bench.knobs[0], next(knob for knob in bench.knobs if knob.group == "R")
+    tab.session.bench.map  # noqa: B018 - it is there
+    tab.session._mapped(bench.map(bench.start, x.name, y.name, size=3, seeds=2))
+    found, data = tab.session.map.map, tab.session.map.image.data
+    np.testing.assert_allclose(data["image"][0], found.score, rtol=1e-6)
+    step = (np.log10(x.high) - np.log10(x.low)) / 2
+    assert data["x"][0] == pytest.approx(np.log10(x.low) - step / 2) and data["dw"][0] == pytest.approx(3 * step)
+
+    class Click:
+        x, y = np.log10(bench.knobs[0].low) - 5.0, 0.5 * np.log10(y.low * y.high)
+
+    tab.session.map._click(Click)
+    assert tab.told()["values"][x.name] == x.low
+    assert tab.told()["values"][y.name] == pytest.approx(np.sqrt(y.low * y.high))
+    assert tab.session.map.here.data["y"] == [pytest.approx(Click.y)]
+
+
+def test_a_study_tells_its_trials_and_stops(tab):
+    tab.ask("hello")
+    tab.ask("study", trials=500)
+    first = tab.wait_for("study")
+    assert first["trial"] == 1 and first["trials"] == 500 and not first["done"]
+    assert set(first["best"]["values"]) <= set(tab.session.values)
+    tab.ask("stop")
+    while not tab.wait_for("study")["done"]:
+        pass
+    assert len(tab.session.trials) < 500
+
+
+@pytest.mark.parametrize(
+    ("kind", "begins"), [("python", "from filters"), ("command", "thruster"), ("svg", "<?xml")]
+)
+def test_what_is_seen_is_exported(tab, kind, begins):
+    tab.ask("hello")
+    tab.ask("export", kind=kind)
+    assert tab.wait_for("file")["text"].startswith(begins)
+
+
+def test_numbers_that_json_has_not_become_nothing():
+    assert _plain({"a": [math.nan, math.inf, 1, True, None, "x", np.float64(0.5)]}) == {
+        "a": [None, None, 1, True, None, "x", 0.5]
+    }
+
+
+def test_names_of_a_problem_are_text_on_the_page(as_python):
+    from bokeh.embed import server_html_page_for_session  # noqa: F401 - the template is rendered below
+
+    bench = Bench(LinearProblem(n=2, m=1), "kf")
+    hostile = "<script>alert(1)</script>"
+    bench.problem.name = hostile
+    document = Document()
+    page_of(bench, SEEDS)(document)
+    variables = document.template_variables | {
+        "base": document.template.environment.from_string("{% block contents %}{% endblock %}")
+    }
+    text = document.template.render(
+        **variables, roots=dict.fromkeys([name for name, *_ in variables["signals"]] + ["map"]), embed=str
+    )
+    assert hostile not in text and "&lt;script&gt;alert" in text
+
+
+def test_a_bench_can_be_pickled(bench, as_python):
+    assert pickle.loads(pickle.dumps(bench)).filter == "kf"
