@@ -7,6 +7,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -45,13 +46,13 @@ class Session:
         self.before: View | None = None  # what arrows compare with
         self.held: dict[int, tuple[Bench, dict[str, float]]] = {}
         self.trials: list[Any] = []
-        self._stopped = threading.Event()
+        self._stopped, self._gone = threading.Event(), False
         self.pictures = Pictures(bench)
         self.map = MapPicture(bench.knobs, self._clicked)
         self.wire = Wire(name="wire")
         self.map.figure.tags = [self.wire]
         self.wire.on_change("asked", self._asked)
-        document.on_session_destroyed(lambda _: self._stopped.set())
+        document.on_session_destroyed(self._left)
         for one in (*self.pictures.figures, self.map.figure):
             document.add_root(one)
         self._paint()
@@ -249,8 +250,14 @@ class Session:
 
         threading.Thread(target=run, daemon=True).start()
 
+    def _left(self, _: Any) -> None:
+        self._gone = True
+        self._stopped.set()
+
     def _later(self, call: Callable[[], None]) -> None:
-        self.document.add_next_tick_callback(call)
+        with suppress(AttributeError):  # the tab was closed meanwhile: Bokeh has taken its document to pieces
+            if not self._gone:
+                self.document.add_next_tick_callback(call)
 
 
 def _plain(value: Any) -> Any:
