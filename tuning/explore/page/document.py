@@ -14,6 +14,7 @@ from thruster_env.plants.quantities import Quantity
 from tuning.explore.bench import Bench
 from tuning.explore.page.export import KINDS
 from tuning.explore.page.session import Session
+from tuning.explore.scenes import SCENES
 
 HERE = Path(__file__).parent
 SEEDS = 8
@@ -54,18 +55,29 @@ def _named(one: Quantity) -> str:
 
 
 def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
-    """What fills the document of each new tab with a bench."""
+    """What fills the document of each new tab: with a bench, or with the scene that the address names."""
 
     def fill(document: Document) -> None:
-        document.title = f"{bench.title}: explore"
+        scene = SCENES.get(_asked(document))
+        here = bench if scene is None else scene.bench()
+        document.title = f"{here.title}: explore"
         document.template = template()
         document.template_variables.update(
-            heading=bench.title,
+            heading=here.title,
             css=own("page.css"),
             js=own("page.js"),
             kinds=list(KINDS.items()),
-            signals=signals(bench),
+            signals=signals(here),
+            scenes=[(one.name, one.title) for one in SCENES.values()],
+            scene=scene,
         )
-        Session(document, bench, seeds)
+        Session(document, here, seeds, scene)
 
     return fill
+
+
+def _asked(document: Document) -> str:
+    """The scene that the address asks for; empty if none."""
+    context = document.session_context
+    given = getattr(context.request, "arguments", {}) if context is not None else {}
+    return b"".join(given.get("scene", [])[:1]).decode(errors="replace")

@@ -13,6 +13,7 @@ from tuning.explore.knobs import Knob
 from tuning.explore.maps import Map
 from tuning.explore.page.colours import Colours, paint
 from tuning.explore.page.signal import as_sent, new_figure
+from tuning.explore.trials import Trial
 
 HEIGHT = 330  # [px]
 BAD = 5.0  # times the least score, where the scale of colours ends
@@ -35,12 +36,12 @@ class MapPicture:
         self.map: Map | None = None
         self.figure = new_figure("map", HEIGHT, tools="tap")
         self.image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
-        self.trials = ColumnDataSource({"x": [], "y": [], "alpha": []})
+        self.trials, self.path = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
         self.here = ColumnDataSource({"x": [], "y": []})
         self.mapper = LogColorMapper(palette=Cividis256[::-1], low=1.0, high=BAD)
         draw = self.figure
         draw.image("image", "x", "y", "dw", "dh", source=self.image, color_mapper=self.mapper)
-        draw.line("x", "y", source=self.trials, line_alpha=0.35, name="trials")
+        draw.line("x", "y", source=self.path, line_width=2, name="trials")
         draw.scatter("x", "y", source=self.trials, size=7, fill_color="white", line_width=1.2, name="trials")
         draw.scatter("x", "y", source=self.here, size=18, marker="cross", line_width=3, name="here")
         self.bar = ColorBar(color_mapper=self.mapper, width=12, padding=4, background_fill_color=None)
@@ -90,13 +91,20 @@ class MapPicture:
         if dict(self.here.data) != now:  # a map takes a while to be drawn
             self.here.data = now
 
-    def points(self, trials: Sequence[Mapping[str, float]]) -> None:
-        """Draw a study's trials, in their order."""
+    def points(self, trials: Sequence[Trial]) -> None:
+        """Draw a study's trials, and the path of the best one so far."""
         if self.map is None:
             return
-        pairs = [(self._place(self.map.x, one), self._place(self.map.y, one)) for one in trials]
-        x, y = np.array(pairs, dtype=float).reshape(-1, 2).T
-        self.trials.data = {"x": x, "y": y, "alpha": np.ones(len(x))}
+        least, path = np.inf, []
+        for one in trials:
+            if one.score < least and not one.pruned:
+                least = one.score
+                path.append(one)
+        for source, some in ((self.trials, trials), (self.path, path)):
+            source.data = {
+                axis: np.array([self._place(name, one.values) for one in some], dtype=float)
+                for axis, name in (("x", self.map.x), ("y", self.map.y))
+            }
 
     def _place(self, name: str, values: Mapping[str, float]) -> float:
         value = values.get(name, np.nan)

@@ -63,6 +63,7 @@ function build() {
   const filter = get("filter")
   filter.replaceChildren(...spec.filters.map(name => make("option", {value: name, textContent: name, selected: name === spec.filter})))
   build_presets()
+  get("steps")?.replaceChildren(...spec.steps.map((label, step) => make("button", {type: "button", textContent: label, onclick: () => ask("step", {step})})))
   const were = new Map([...get("groups").children].map(one => [one.dataset.group, one.open]))
   knobs.clear()
   const groups = new Map()
@@ -73,7 +74,7 @@ function build() {
   }
   get("groups").replaceChildren(...groups.values())
   for (const [id, at] of [["x", 0], ["y", 1]]) {
-    const was = get(id).value
+    const was = get(id).value || spec.axes[at]
     get(id).replaceChildren(...spec.knobs.map((knob, place) => make("option", {value: knob.name, textContent: knob.label, selected: was ? knob.name === was : place === at})))
   }
   build_shown()

@@ -20,6 +20,7 @@ from tuning.explore.page.colours import HELD, ground
 from tuning.explore.page.export import exported
 from tuning.explore.page.map_picture import MapPicture
 from tuning.explore.page.pictures import Look, Pictures
+from tuning.explore.scenes import Scene
 from tuning.explore.view import View
 
 WIDTHS = (200, 4000)  # of a picture, in points
@@ -37,10 +38,11 @@ class Wire(DataModel):
 class Session:
     """The state of one tab."""
 
-    def __init__(self, document: Document, bench: Bench, seeds: int):
+    def __init__(self, document: Document, bench: Bench, seeds: int, scene: Scene | None = None):
         """Fill a document with empty pictures; the page asks for the rest."""
         self.document, self.bench, self.seeds = document, bench, seeds
-        self.values, self.dark, self.width = dict(bench.start), False, 800
+        self.scene, self.dark, self.width = scene, False, 800
+        self.values = bench.checked({} if scene is None else scene.steps[0].values)
         self.run, self.errors, self.what = 0, False, "score"
         self.view: View | None = None
         self.before: View | None = None  # what arrows compare with
@@ -100,11 +102,23 @@ class Session:
             raise ValueError(
                 f"filter must be one of {', '.join(self.bench.filters)}, but got {question['filter']}"
             )
+        return self._changed(question["filter"], self.values)
+
+    def do_step(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """A setting of the scene."""
+        steps = () if self.scene is None else self.scene.steps
+        place = int(question["step"])
+        if not 0 <= place < len(steps):
+            raise ValueError(f"step must be one of {len(steps)}, but got {place}")
+        return self._changed(steps[place].filter, steps[place].values)
+
+    def _changed(self, name: str, values: Mapping[str, float]) -> dict[str, Any]:
+        """Go on with another filter, or the same one, at what it knows of some values."""
         self._stopped.set()
-        bench = self.bench.with_filter(question["filter"])
-        known = {knob.name for knob in bench.knobs}
-        values = dict(bench.start) | {name: value for name, value in self.values.items() if name in known}
-        self.bench, self.values, self.trials = bench, values, []
+        bench = self.bench if name == self.bench.filter else self.bench.with_filter(name)
+        known = {knob.name: knob for knob in bench.knobs}
+        kept = {one: min(max(at, known[one].low), known[one].high) for one, at in values.items() if one in known}
+        self.bench, self.values, self.trials = bench, bench.checked(kept), []
         self.map.set_knobs(bench.knobs)
         self._look()
         return {"spec": self._spec(), **self._numbers()}
@@ -204,6 +218,8 @@ class Session:
             "filters": list(bench.filters),
             "states": [one.name for one in bench.states],
             "shown": list(self.pictures.chosen),
+            "steps": [one.label for one in self.scene.steps] if self.scene else [],
+            "axes": list(self.scene.knobs[:2]) if self.scene else [],
             "truth": bench.has_truth,
             "seeds": 0 if self.view is None else len(self.view.estimate),
         }
@@ -225,14 +241,14 @@ class Session:
     def _mapped(self, found: Any) -> None:
         self.map.show(found, self.what)
         self.map.mark(self.values)
-        self.map.points([one.values for one in self.trials])
+        self.map.points(self.trials)
         self.tell({"map": True})
 
     def _tried(self, trial: Any, trials: int, stopped: threading.Event) -> None:
         if stopped.is_set():
             return
         self.trials.append(trial)
-        self.map.points([one.values for one in self.trials])
+        self.map.points(self.trials)
         best = min(self.trials, key=lambda one: one.score if math.isfinite(one.score) else math.inf)
         self.tell({"study": {"done": False, "trial": len(self.trials), "trials": trials, "best": best._asdict()}})
 
