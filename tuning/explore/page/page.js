@@ -186,10 +186,10 @@ function against(value, start, better, target) {
 }
 const distance = (value, target) => value > 0 && target > 0 ? Math.abs(Math.log(value / target)) : Math.abs(value - target)
 function add_held({slot, colour, filter, figures}) {
-  const [name, value] = Object.entries(figures)[0]
+  const name = Object.keys(figures).find(one => one.startsWith("score")) ?? Object.keys(figures)[0], value = figures[name]
   const line = make("i")
   line.style.color = colour
-  const item = make("li", {}, line, make("span", {textContent: `${filter}: ${name} ${number_text(value)}`}))
+  const item = make("li", {}, line, make("span", {textContent: `${filter}: ${name.replace(/:.*/, "")} ${number_text(value)}`}))
   item.append(make("button", {type: "button", textContent: "Drop", ariaLabel: `Drop held configuration ${slot + 1}`, onclick: () => { item.remove(); ask("drop", {slot}) }}))
   get("held").append(item)
 }
