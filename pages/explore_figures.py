@@ -13,9 +13,9 @@ import numpy as np
 
 from pages.page import digits, make_page, table
 from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from tuning.explore.bench import Bench
-from tuning.explore.scenes import SCENES, Scene
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.scenes import SCENES, Scene
+from tuning.exploring.view import View
 
 BAND = 1.96  # half of a 95 % interval, in standard deviations
 SPAN = slice(100, 351)  # steps that are drawn

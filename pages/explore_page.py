@@ -13,9 +13,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from tuning.explore.bench import Bench
-from tuning.explore.page.document import page_of
-from tuning.explore.page.server import Server
+from tuning.exploring.bench import Bench
+from tuning.exploring.page.document import page_of
+from tuning.exploring.page.server import Server
 from tuning.problems.find import find_problem
 
 WIDE = {"width": 1360, "height": 900}

@@ -34,7 +34,7 @@ from thruster_cli.output import announce_compilation, working
 from thruster_cli.problems import PROBLEMS
 from tuning.api.evaluate import subject_of
 from tuning.api.explore import NEEDS
-from tuning.explore.bench import Bench
+from tuning.exploring.bench import Bench
 
 FORWARD = '<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
 FORWARD += '<meta http-equiv="refresh" content="0; url={url}"><title>thruster explore</title>'
@@ -101,8 +101,8 @@ def command(
     of_logs |= {"hold_gaps": hold_gaps or None, "start": start}
     bench = _bench(file, filter_name, scenario, log, of_logs, seed)
     try:
-        from tuning.explore.page.document import page_of
-        from tuning.explore.page.server import Server
+        from tuning.exploring.page.document import page_of
+        from tuning.exploring.page.server import Server
     except ModuleNotFoundError as error:
         raise ValueError(NEEDS.replace("tuning.explore", "thruster explore")) from error
     announce_compilation()

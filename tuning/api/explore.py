@@ -11,10 +11,10 @@ from tuning.api.evaluate import subject_of
 from tuning.api.own_numbers import is_own
 from tuning.api.problems import problem_of
 from tuning.api.study import Study
-from tuning.explore.bench import Bench
+from tuning.exploring.bench import Bench
 
 if TYPE_CHECKING:
-    from tuning.explore.page.server import Server
+    from tuning.exploring.page.server import Server
 
 HEIGHT = 900  # [px] in a notebook
 NEEDS = "tuning.explore must have Bokeh: pip install 'thruster-env[explore]'"
@@ -94,8 +94,8 @@ class Explorer:
 
     def _made(self, port: int, *, ends_when_left: bool) -> Server:
         try:
-            from tuning.explore.page.document import page_of
-            from tuning.explore.page.server import Server
+            from tuning.exploring.page.document import page_of
+            from tuning.exploring.page.server import Server
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(NEEDS, name=error.name) from error
         return Server(page_of(self.bench, self.seeds), port=port, ends_when_left=ends_when_left)

@@ -15,11 +15,11 @@ pytest.importorskip("bokeh")
 from bokeh.document import Document
 
 from tests.linear_problem import LinearProblem
-from tuning.explore.bench import Bench
-from tuning.explore.page.colours import DARK, HELD
-from tuning.explore.page.document import page_of
-from tuning.explore.page.server import Server
-from tuning.explore.page.session import Session, _plain
+from tuning.exploring.bench import Bench
+from tuning.exploring.page.colours import DARK, HELD
+from tuning.exploring.page.document import page_of
+from tuning.exploring.page.server import Server
+from tuning.exploring.page.session import Session, _plain
 
 SEEDS = 3
 WITHIN = 1.959963984540054

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tuning.explore.bench import Bench
-from tuning.explore.disturbed import disturbances_of, disturbed
+from tuning.exploring.bench import Bench
+from tuning.exploring.disturbed import disturbances_of, disturbed
 from tuning.problems.find import find_problem
 from tuning.problems.plain import plain
 

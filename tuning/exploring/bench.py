@@ -11,13 +11,13 @@ from filters.registry import FILTERS
 from thruster_env.numerics.checks import at_least, one_of, shown
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
-from tuning.explore.disturbed import disturbed
-from tuning.explore.exported import command_of, file_of, lines_of
-from tuning.explore.knobs import Knob, checked_values, knobs_of, marks_of, start_of
-from tuning.explore.maps import Map, map_of
-from tuning.explore.shown import Shown, shown_data
-from tuning.explore.trials import Trial, trials_of
-from tuning.explore.view import View, view_of
+from tuning.exploring.disturbed import disturbed
+from tuning.exploring.exported import command_of, file_of, lines_of
+from tuning.exploring.knobs import Knob, checked_values, knobs_of, marks_of, start_of
+from tuning.exploring.maps import Map, map_of
+from tuning.exploring.shown import Shown, shown_data
+from tuning.exploring.trials import Trial, trials_of
+from tuning.exploring.view import View, view_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, SCORE

@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.filter import Filter
 from tuning.evaluation.evaluate import values_of
-from tuning.explore.knobs import Knob
+from tuning.exploring.knobs import Knob
 from tuning.problems.data import Data
 from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tuning.explore.bench import Bench
-from tuning.explore.scenes import OWN, SCENES
+from tuning.exploring.bench import Bench
+from tuning.exploring.scenes import OWN, SCENES
 from tuning.problems.find import find_problem
 
 every_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thruster_env.plants.quantities import Quantity
-from tuning.explore.bench import Bench
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.view import View
 
 WITHIN_95 = 1.959963984540054  # standard normal deviates
 MOST_STATES, MOST_INNOVATIONS = 4, 2

@@ -10,7 +10,7 @@ from typing import Any
 from thruster_env.numerics.checks import shown
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.explore.disturbed import AMPLIFIER, SENSORS
+from tuning.exploring.disturbed import AMPLIFIER, SENSORS
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.plain import plain
 from tuning.problems.problem import Problem

@@ -5,7 +5,7 @@ import pytest
 
 import tuning
 from tuning.evaluation.evaluate import evaluate
-from tuning.explore.bench import Bench
+from tuning.exploring.bench import Bench
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
 

@@ -7,9 +7,9 @@ import io
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from tuning.explore.bench import Bench
-from tuning.explore.figure import figure_of
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.figure import figure_of
+from tuning.exploring.view import View
 
 KINDS = {
     "tuned": "tuned file",

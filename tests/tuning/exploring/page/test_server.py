@@ -14,8 +14,8 @@ from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from tuning.explore.page import server as module
-from tuning.explore.page.server import LOOPBACK, Server
+from tuning.exploring.page import server as module
+from tuning.exploring.page.server import LOOPBACK, Server
 
 SCRIPT = "static/js/bokeh.min.js"
 

@@ -15,13 +15,13 @@ from bokeh.core.properties import String
 from bokeh.document import Document
 from bokeh.model import DataModel
 
-from tuning.explore.bench import Bench
-from tuning.explore.page.colours import HELD, ground
-from tuning.explore.page.export import exported
-from tuning.explore.page.map_picture import MapPicture
-from tuning.explore.page.pictures import Look, Pictures
-from tuning.explore.scenes import Scene
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.page.colours import HELD, ground
+from tuning.exploring.page.export import exported
+from tuning.exploring.page.map_picture import MapPicture
+from tuning.exploring.page.pictures import Look, Pictures
+from tuning.exploring.scenes import Scene
+from tuning.exploring.view import View
 
 WIDTHS = (200, 4000)  # of a picture, in points
 MOST_TRIALS = 10_000

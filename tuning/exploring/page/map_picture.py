@@ -9,11 +9,11 @@ from bokeh.events import Tap
 from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, CustomJSTickFormatter, LogColorMapper
 from bokeh.palettes import Cividis256, RdBu11
 
-from tuning.explore.knobs import Knob
-from tuning.explore.maps import Map
-from tuning.explore.page.colours import Colours, paint
-from tuning.explore.page.signal import as_sent, new_figure
-from tuning.explore.trials import Trial
+from tuning.exploring.knobs import Knob
+from tuning.exploring.maps import Map
+from tuning.exploring.page.colours import Colours, paint
+from tuning.exploring.page.signal import as_sent, new_figure
+from tuning.exploring.trials import Trial
 
 HEIGHT = 330  # [px]
 BAD = 5.0  # times the least score, where the scale of colours ends

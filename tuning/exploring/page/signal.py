@@ -9,7 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
-from tuning.explore.page.colours import HELD
+from tuning.exploring.page.colours import HELD
 
 HEIGHT = 132  # [px]
 ROOM = 0.06  # of a range, left free at its ends

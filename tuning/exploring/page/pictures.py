@@ -8,12 +8,12 @@ import numpy as np
 from bokeh.models import BoxAnnotation, ColumnDataSource
 from bokeh.plotting import figure
 
-from tuning.explore.bench import Bench
-from tuning.explore.figure import WITHIN_95, mean_of_runs
-from tuning.explore.page.colours import Colours, paint
-from tuning.explore.page.signal import Signal, as_sent, new_figure
-from tuning.explore.page.thinning import extremes, places
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.figure import WITHIN_95, mean_of_runs
+from tuning.exploring.page.colours import Colours, paint
+from tuning.exploring.page.signal import Signal, as_sent, new_figure
+from tuning.exploring.page.thinning import extremes, places
+from tuning.exploring.view import View
 
 SHOWN = 3  # states at first
 Look = tuple[int, int, bool]  # points across, which run, and whether errors are drawn in place of states

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tuning.explore.page.thinning import extremes, places
+from tuning.exploring.page.thinning import extremes, places
 
 
 def test_a_short_run_is_drawn_whole():

@@ -12,7 +12,7 @@ from filters.consistency.nees import check_squares
 from filters.registry import make_filter
 from tuning.evaluation.evaluate import check_consistency, evaluate
 from tuning.evaluation.tuned import read_tuned
-from tuning.explore.bench import Bench
+from tuning.exploring.bench import Bench
 from tuning.problems.find import find_problem
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study

@@ -11,10 +11,10 @@ from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
 from thruster_env.plants.quantities import Quantity
-from tuning.explore.bench import Bench
-from tuning.explore.page.export import KINDS
-from tuning.explore.page.session import Session
-from tuning.explore.scenes import SCENES
+from tuning.exploring.bench import Bench
+from tuning.exploring.page.export import KINDS
+from tuning.exploring.page.session import Session
+from tuning.exploring.scenes import SCENES
 
 HERE = Path(__file__).parent
 SEEDS = 8

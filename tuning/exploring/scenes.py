@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from tuning.explore.bench import Bench
-from tuning.explore.view import View
+from tuning.exploring.bench import Bench
+from tuning.exploring.view import View
 from tuning.problems.find import find_problem
 
 

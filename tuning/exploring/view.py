@@ -16,7 +16,7 @@ from filters.engine.batch import Estimates
 from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
-from tuning.explore.shown import Shown
+from tuning.exploring.shown import Shown
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_on
 from tuning.problems.problem import Problem, score_label

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from thruster_env.numerics.checks import at_least, between, one_of
 from tuning.evaluation.baselines import TUNED, baselines
-from tuning.explore.disturbed import disturbances_of
+from tuning.exploring.disturbed import disturbances_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.filter_parameters import FilterParameter
