@@ -44,6 +44,8 @@ TUNING_OF_PLANTS = {
     "tuning/auv": {"auv_env"},
 }  # the rooms of tuning that know a plant
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
+OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
+PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
 OF_TENSORS = "filters/tensors"  # filters for models with a network in them
 
 
@@ -119,6 +121,12 @@ def test_imports_of_training_go_in_no_circle_not_even_within_functions():
 
 def test_only_tuning_imports_optuna():
     assert not those(lambda path: "optuna" in packages_of(path) and room_of(path) != "tuning")
+
+
+def test_the_page_alone_imports_bokeh_and_computes_nothing():
+    knowing = those(lambda path: packages_of(path) & OF_PAGES)
+    assert knowing and all(name.startswith(PAGE) for name in knowing)
+    assert not those(lambda path: path.is_relative_to(ROOT / PAGE) and packages_of(path) & {"filters", "optuna"})
 
 
 def test_only_training_imports_packages_that_learn_policies():
