@@ -70,7 +70,7 @@ def disturbed(problem: Problem, values: Mapping[str, float]) -> Problem:
             for (channel, effects), deviation in zip(_sensors(problem).items(), deviations, strict=True)
         }
     if any(not _same(wanted[one], present[one]) for one in present if one.place == AMPLIFIER):
-        changes[AMPLIFIER] = _with(plain(problem.amplifier), wanted, present, AMPLIFIER, 1.0)
+        changes[AMPLIFIER] = _with(_amplifier(problem), wanted, present, AMPLIFIER, 1.0)
     return problem.replace(name=f"{problem.name} (changed)", **changes)
 
 
@@ -99,9 +99,9 @@ def _with(effects: list[dict], wanted: Mapping, present: Mapping, place: str, de
 
 def _present(one: Disturbance, problem: BaseScenario) -> float:
     """The number as the scenario has it, of the first channel that has the effect."""
-    chains = zip(_sensors(problem).values(), _deviations(problem), strict=True)
-    if one.place == AMPLIFIER:
-        chains = [(plain(problem.amplifier), 1.0)]
+    chains = [(_amplifier(problem), 1.0)]
+    if one.place == SENSORS:
+        chains = list(zip(_sensors(problem).values(), _deviations(problem), strict=True))
     for effects, deviation in chains:
         for effect in effects:
             if effect["name"] == one.effect:
@@ -110,14 +110,19 @@ def _present(one: Disturbance, problem: BaseScenario) -> float:
     return one.start
 
 
-def _sensors(problem: BaseScenario) -> dict[str, list[dict]]:
-    """The chain of effects of each channel."""
+def _sensors(problem: Any) -> dict[str, list[dict]]:
+    """The chain of effects of each channel of a scenario."""
     given = plain(problem.sensors)
     own = given if isinstance(given, Mapping) else {}
     return {channel: list(own.get(channel, [])) for channel in problem.plant.channels}
 
 
-def _deviations(problem: BaseScenario) -> list[float]:
+def _amplifier(problem: Any) -> list[dict]:
+    """The chain of effects of a scenario's amplifier."""
+    return list(plain(problem.amplifier))
+
+
+def _deviations(problem: Any) -> list[float]:
     """Standard deviation of each channel's noise."""
     given = problem.measurement_noise_cov
     variances = given if isinstance(given, list | tuple) else [given]

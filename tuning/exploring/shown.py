@@ -54,6 +54,6 @@ def _whole(problem: LogProblem) -> Data:
     )
     if problem.scale is None:
         return data.read_only()
-    states = padded([log.true_states(model) for log in logs], rows)
+    states = padded([found for log in logs if (found := log.true_states(model)) is not None], rows)
     known = only(data.counted, ~np.isnan(states).any(axis=-1))
     return data._replace(states=states, counted=known).read_only()
