@@ -99,8 +99,9 @@ def _with(effects: list[dict], wanted: Mapping, present: Mapping, place: str, de
 
 def _present(one: Disturbance, problem: BaseScenario) -> float:
     """The number as the scenario has it, of the first channel that has the effect."""
-    chains = [(_amplifier(problem), 1.0)]
-    if one.place == SENSORS:
+    if one.place == AMPLIFIER:
+        chains = [(_amplifier(problem), 1.0)]
+    else:
         chains = list(zip(_sensors(problem).values(), _deviations(problem), strict=True))
     for effects, deviation in chains:
         for effect in effects:
