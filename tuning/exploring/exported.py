@@ -35,7 +35,7 @@ def file_of(choice: Choice, plan: Plan) -> str:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "tuned.json"
         write_tuned(path, plan, result, comparisons, BY_HAND, BY_HAND)
-        return path.read_text()
+        return path.read_text(encoding="utf-8")
 
 
 def command_of(problem: Problem, file: str) -> str:
