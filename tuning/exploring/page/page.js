@@ -106,6 +106,7 @@ function build_knob(knob) {
     }
     values[knob.name] = Math.min(knob.high, Math.max(knob.low, knob.integer ? Math.round(value) : value))
     place_knobs()
+    text.value = number_text(values[knob.name])  // what is used: the end of the range for what lies beyond
     ask("view")
   }
   const marks = make("div", {className: "marks"})
