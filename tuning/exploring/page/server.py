@@ -111,6 +111,7 @@ class Server:
         self._token = secrets.token_urlsafe(32)
         self.url = f"http://{LOOPBACK}:{self.port}/{self._token}/"
         self._loop: IOLoop | None = None
+        self._thread: threading.Thread | None = None
         self._started = threading.Event()
 
     def run(self) -> None:
@@ -139,14 +140,17 @@ class Server:
 
     def start(self) -> Server:
         """Serve in a thread of its own."""
-        threading.Thread(target=self.run, daemon=True).start()
+        self._thread = threading.Thread(target=self.run, daemon=True)
+        self._thread.start()
         self._started.wait(30.0)
         return self
 
     def stop(self) -> None:
-        """End; a thread other than the server's may call it."""
+        """End what `start` began, and wait until the port is closed."""
         if self._loop is not None:
             self._loop.add_callback(self._loop.stop)
+        if self._thread is not None:
+            self._thread.join(30.0)
 
     def _watch(self, app: BokehTornado) -> Callable[[], None]:
         """What looks whether the last page was left a while ago."""
