@@ -24,6 +24,7 @@ from thruster_cli.options import (
     JsonOption,
     LogPresetOption,
     ModelOption,
+    NoGridOption,
     SeedOption,
     SensorOption,
     filter_option,
@@ -56,6 +57,7 @@ def command(
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
+    no_grid: NoGridOption = False,
     range_: Annotated[
         list[str] | None,
         typer.Option(
@@ -174,7 +176,7 @@ def command(
     if step is not None:
         raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor}
-    options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
+    options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt, "grid": not no_grid}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
     out = out or DEFAULT_OUT

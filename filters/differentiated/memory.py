@@ -56,6 +56,7 @@ class Memory(NumbersMemory):
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
         r, c, size, self.prior, own_slopes = starts_of(n * n, m * m, shape.constants, 1, self.begun)[1:]
         self.u, self.z = self.beside("rows", self.input, shape.inputs), self.beside("rows", self.measured, m)
+        self.ratio = self.ratio_in("rows", self.input)
         self.tails = [self.beside("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
         self.truth = self.beside("rows", self.true, n)
         self.weights = self.beside("numbers", own + page.own_size, n, n, symmetric=True)

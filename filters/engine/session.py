@@ -17,6 +17,7 @@ from filters.engine.layout import memory_places, own_place
 from thruster_env.numerics.checks import as_floats, covariance, finite, positive
 from thruster_env.numerics.direct import direct
 from thruster_env.plants.layout import number_places, with_root
+from thruster_env.plants.steps import sample_time_place
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -149,14 +150,8 @@ class Session:
         """Where the constant lies, and how many of it are a step."""
         self._check_one_model("set_dt")
         model = self._filter.kernel_model
-        names = getattr(model.constants, "_fields", ())
-        if "of_one_dt" in names:
-            rule = "set_dt must be called on a model whose other constants do not follow from dt"
-            raise ValueError(f"{rule}, but got those of lagging sensors")
-        for name, parts in (("dt", 1), ("substep", model.substeps)):
-            if name in names:
-                return self._noise_places.constants + names.index(name), parts
-        raise ValueError(f"set_dt needs a model with a constant dt, but got {', '.join(names) or 'none'}")
+        place, parts = sample_time_place(model, "set_dt")
+        return self._noise_places.constants + place, parts
 
     def set_parameter(self, name: str, value: float) -> None:
         """Use another value of one of the filter's numbers from here on; ValueError for one that it lacks."""

@@ -19,6 +19,7 @@ from filters.pages.differences import called_parts
 from filters.pages.memory import NumbersMemory
 from filters.pages.traced import not_known, traced_model
 from thruster_env.numerics.algebra.matrices import Matrix, Operation, never, plus, through
+from thruster_env.numerics.algebra.points import root
 from thruster_env.plants.shape import Functions
 
 
@@ -26,7 +27,7 @@ class PagedModel:
     """What pages find in a model besides its equations f, F, h and H.
 
     Attributes:
-        Q, R: its covariances.
+        Q, R: its covariances; Q of a model with a step ratio is that of the step's length.
         Q_root, R_root, prior_root: lower triangular roots of Q, R and the prior covariance.
         prior_mean: of the state.
         own: the filter's parameters.
@@ -39,6 +40,9 @@ class PagedModel:
         shape, self._constants = memory.shape, memory.constants
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
+        if shape.step_ratio and memory.ratio is not None:
+            self.Q = memory.Q * memory.ratio
+            self.Q_root = root(self.Q)
         self.prior_mean, self.prior_root = memory.prior_mean, memory.prior_root
         self.own, self.kept = memory.own, memory.kept
 

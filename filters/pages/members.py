@@ -46,6 +46,7 @@ class MembersMemory(NumbersMemory):
         p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.ratio = self.ratio_in("given", 0)
         self.w, self.e = (given(Place("draws", 0), (size,), member=True, beside=x) for size in (shape.n, shape.m))
         self.mean = self.beside("rows", row.mean, shape.n)
 

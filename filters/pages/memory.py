@@ -21,6 +21,7 @@ class NumbersMemory:
         own: parameters, as pages find them.
         kept: what the filter keeps besides mean and covariance, by name.
         constants_slope, size: along a parameter that moves constants, if there are such.
+        ratio: the last input as a number, if it is the step ratio.
         belief: where mean and covariance lie.
         told: where the innovation, its covariance and its log density lie.
     """
@@ -45,7 +46,12 @@ class NumbersMemory:
         self.own = page.parameters(lambda place, size: self.beside("numbers", own + place, *size))
         self.kept: Mapping[str, Matrix] = {}
         self.constants_slope: Matrix | None = None
+        self.ratio: Matrix | None = None
         self.size: Matrix | None = None
+
+    def ratio_in(self, array: str, inputs: int) -> Matrix | None:
+        """The last of the inputs, which lie in an array from a place on, of a model with a step ratio."""
+        return self.beside(array, inputs + self.shape.inputs - 1) if self.shape.step_ratio else None
 
     def beside(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
         """A matrix that lies in an array from a place on."""
@@ -67,6 +73,7 @@ class RowMemory(NumbersMemory):
         p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.ratio = self.ratio_in("given", 0)
         self.end = row.extras
 
     def keep(self, started: Mapping[str, Any]) -> None:

@@ -21,6 +21,7 @@ class Shape(NamedTuple):
     form: type | int  # of the constants: their NamedTuple class, or how many
     state_angles: tuple[bool, ...]  # (n,), which states wrap at 2 pi
     measurement_angles: tuple[bool, ...]  # (m,), which measurements do
+    step_ratio: bool = False  # whether the last input is one, by which pages multiply Q: `steps.in_any_steps`
 
     @property
     def constants(self) -> int:

@@ -16,7 +16,7 @@ from tuning.api.showing import drawn, frame, html
 from tuning.identification.profiles import profile_figure, profiles
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation
-from tuning.logs.identify import remarks, write_found
+from tuning.logs.identify import AnyStepFamily, remarks, write_found
 
 if TYPE_CHECKING:
     import pandas
@@ -68,7 +68,9 @@ class Identified:
 
     @property
     def model(self) -> StateSpaceModel:
-        """The model with the identified values, as the filter used it."""
+        """The model with the identified values, as the filter used it; on own stamps that of a step of dt."""
+        if isinstance(self.family, AnyStepFamily):
+            return self.family.plain.model(**self.values)
         return self.found.objective.model_at(self.found.at)
 
     def sentences(self) -> list[str]:

@@ -41,6 +41,7 @@ def identify(
     held_out: Any = None,
     use_all: bool = False,
     hold_gaps: bool = False,
+    grid: bool = True,
     filter: str = "ekf",
     predicted: Sequence[str] = (),
     degrees: float = math.inf,
@@ -77,6 +78,8 @@ def identify(
         held_out: runs used only for validation, as objects or paths; by default every third of three or more.
         use_all: hold no run out.
         hold_gaps: hold the last input over gaps of a log; by default runs are split there.
+        grid: whether logs are put on a grid; else on their own stamps, for a model whose sample time is a constant: Q
+            of a step is then in proportion to its length, and the values are those of `dt`.
         filter: "ekf", or "kf" for affine models.
         predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
         degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
@@ -95,7 +98,7 @@ def identify(
     names = names_of(free)
     logs, model, preset = whose_logs(logs, model, preset)
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
-    read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt}
+    read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
     runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **read)
     family = family_of(runs, names, **whose, noise=noise, filter=filter)
     search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}

@@ -10,6 +10,7 @@ import numpy as np
 from thruster_env.numerics.checks import shown
 from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.logs.log import Log
+from thruster_env.plants.steps import in_steps
 from tuning.problems.data import Data, mask_of, padded
 from tuning.problems.log_checks import check_times
 
@@ -17,9 +18,10 @@ from tuning.problems.log_checks import check_times
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
+    Logs on their own stamps have step ratios as their last input (`thruster_env.plants.steps`).
+
     Raises:
-        ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times,
-            and for a log on its own stamps.
+        ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.
     """
     given = _listed(data)
     if not given or not all(isinstance(one, Data | Log) for one in given):
@@ -30,9 +32,13 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     inputs: list[np.ndarray] = []
     measurements: list[np.ndarray] = []
     for one in given:
-        for part in [one] if isinstance(one, Log) else map(one.one, range(len(one.seeds))):
-            inputs += [part.inputs] if isinstance(part, Log) else list(part.inputs)
-            measurements += [part.measurements] if isinstance(part, Log) else list(part.measurements)
+        if isinstance(one, Log):
+            u, z = (one.inputs, one.measurements) if one.stamps is None else in_steps(one)
+            inputs, measurements = [*inputs, u], [*measurements, z]
+            continue
+        for part in map(one.one, range(len(one.seeds))):
+            inputs += list(part.inputs)
+            measurements += list(part.measurements)
     lengths = list(map(len, measurements))
     widths = {(u.shape[1], z.shape[1]) for u, z in zip(inputs, measurements, strict=True)}
     if len(widths) > 1:

@@ -12,6 +12,8 @@ from thruster_env.numerics.modules import object_named
 from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.findings import has_outliers, remarks_on
 from thruster_env.plants.logs.log import Log, cut_at_gaps
+from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.plants.steps import in_any_steps
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
 from tuning.identification.values import write_values
@@ -35,7 +37,7 @@ def split_runs(
         logs: recorded runs, as `tuning.logs.read.read_named` takes them.
         held_out: the held-out runs, or their paths or names.
         use_all: whether no run is held out.
-        hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
+        hold_gaps: whether runs are not cut at gaps, and their inputs are held there; on their own stamps they are.
         **options: options of `read_named`.
 
     Raises:
@@ -57,7 +59,7 @@ def split_runs(
     read = without_twins(read, validating)
     parts = [log for log in read if log.name not in validating], [log for log in read if log.name in validating]
     check_apart(*parts)
-    if hold_gaps:
+    if hold_gaps or any(log.stamps is not None for log in read):
         return parts
     found = [[piece for log in some for piece in cut_at_gaps(log, SHORTEST_PIECE)] for some in parts]
     if not found[0]:
@@ -87,20 +89,25 @@ def family_of(
         model: instead of a thruster: a model, a function that makes one, or "module:object".
         sensors: measured channels of a thruster.
         noise: whether the variances of Q and R are free, too.
-        filter: the filter whose innovations are used; for a thruster always the ekf.
+        filter: the filter whose innovations are used; for a thruster, and on own stamps, always the ekf.
 
     Raises:
         ValueError: for an unknown name; the message has the known ones.
     """
+    stamped = logs[0].stamps is not None
+    if stamped and filter != "ekf":
+        raise ValueError(f"logs on their own stamps must be identified with the ekf, but got filter {filter}")
     if model is None:
         if filter != "ekf":
             raise ValueError(f"a thruster must be identified with the ekf, but got filter {filter} (--filter)")
         whose = None if preset is None else str(preset)
-        return room_of_logs().family_of_preset(logs, whose, sensors, list(free), noise=noise)
+        of_preset = room_of_logs().family_of_preset(logs, whose, sensors, list(free), noise=noise)
+        return AnyStepFamily(of_preset, logs) if stamped else of_preset
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
     found = object_named(model, "model") if isinstance(model, str) else model
-    return LoggedFamily(logs, in_discrete_time(found), list(free), noise=noise, dt=logs[0].dt)
+    family = LoggedFamily(logs, in_discrete_time(found), list(free), noise=noise, dt=logs[0].dt)
+    return AnyStepFamily(family, logs) if stamped else family
 
 
 class LoggedFamily(ModelFamily):
@@ -110,6 +117,35 @@ class LoggedFamily(ModelFamily):
         """Keep the logs."""
         super().__init__(make, free, **options)
         self.data, self.dt = tuple(logs), logs[0].dt
+
+    def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
+        """Other logs for this family, unchanged."""
+        return tuple(logs)
+
+
+class AnyStepFamily:
+    """A family of a plant, whose models take the step ratios of logs on their own stamps.
+
+    Attributes:
+        plain: the family itself, whose values are written.
+        free: its free parameters.
+        data: the logs.
+
+    Raises:
+        ValueError: for free clock offsets, which move the stamps, or a model of one sample time.
+    """
+
+    def __init__(self, plain: Any, logs: Sequence[Log]):
+        """Check the model."""
+        self.plain, self.free, self.data, self.dt = plain, plain.free, tuple(logs), logs[0].dt
+        moving = next((one.name for one in self.free if one.name.startswith("clock_offset_")), None)
+        if moving is not None:
+            raise ValueError(f"parameters on a log's own stamps must not move these, but got {moving}")
+        self.model()
+
+    def model(self, **values: float) -> StateSpaceModel:
+        """The model for values, with one input more."""
+        return in_any_steps(self.plain.model(**values), self.dt)
 
     def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
         """Other logs for this family, unchanged."""
@@ -171,6 +207,7 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
     """
     if not str(path).endswith(".toml"):
         raise ValueError(f"a file of identified parameters must end in .toml, but got {shown(str(path))}")
+    family = family.plain if isinstance(family, AnyStepFamily) else family
     if isinstance(family, ModelFamily):
         write_values(path, found, logs, getattr(family, "dt", None))  # of a family of logs
     else:

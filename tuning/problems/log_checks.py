@@ -16,6 +16,9 @@ def checked_logs(given: Any) -> tuple[Log, ...]:
     logs = (given,) if isinstance(given, Log) else tuple(given) if isinstance(given, Sequence) else ()
     if not logs or not all(isinstance(log, Log) for log in logs):
         raise ValueError(f"logs must be some thruster_env.plants.logs.log.Log, but got {shown(given)}")
+    own = next((log.name for log in logs if log.stamps is not None), None)
+    if own is not None:
+        raise ValueError(f"logs of a study must lie on a grid, but {own} has its own stamps")
     check_times(logs)
     names = [log.name for log in logs]
     if len(set(names)) < len(names):
@@ -24,16 +27,16 @@ def checked_logs(given: Any) -> tuple[Log, ...]:
 
 
 def check_times(logs: Sequence[Log]) -> None:
-    """Raise ValueError unless all logs lie on grids of the same sample time."""
-    for log in logs:
-        if log.stamps is not None:
-            raise ValueError(f"logs to learn from must lie on a grid, but {log.name} has its own stamps")
+    """Raise ValueError unless all logs have the same sample time, all on grids or all on their own stamps."""
     for log in logs[1:]:
+        if (log.stamps is None) != (logs[0].stamps is None):
+            own, other = (logs[0], log) if log.stamps is None else (log, logs[0])
+            raise ValueError(f"logs must all lie on grids or none, but {own.name} does not and {other.name} does")
         if not same_dt(log.dt, logs[0].dt):
             first, dt = logs[0].name, f"{logs[0].dt:g}"
             raise ValueError(
                 f"logs of one problem must have the same sample time, but {first} has {dt} s and {log.name} "
-                f"{log.dt:g} s: put them on one grid with --dt {dt}, in Python dt={dt}"
+                f"{log.dt:g} s: give both the same with --dt {dt}, in Python dt={dt}"
             )
 
 

@@ -1,0 +1,108 @@
+"""Models of steps of any length: how long a step is, is one more input.
+
+    x_{k+1} = f(x_k, u_k, r_k dt) + w_k,  w_k ~ N(0, r_k Q);   r_k dt is the length of step k
+
+The Q of a model is that of a step of dt; that of another one is in proportion (`diffusion.noise_for_dt`). A log on
+its own stamps is then rows of numbers, and what takes such rows takes the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.derivatives import by_complex_step
+from thruster_env.numerics.pickling import makes_functions
+from thruster_env.numerics.sources import tuple_of, written_out
+from thruster_env.plants.diffusion import same_dt
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.shape import Shape
+from thruster_env.plants.state_space import StateSpaceModel
+
+RATIO = Quantity("length of a step over dt", "step_ratio")
+ROUNDING = 1e-6  # of a step: so much longer than dt it is still one
+
+
+class AnyStepModel(StateSpaceModel):
+    """A model whose last input is the step ratio; see `in_any_steps`."""
+
+    @property
+    def shape(self) -> Shape:
+        """Sizes, and that pages multiply Q by the last input."""
+        return super().shape._replace(step_ratio=True)
+
+
+def in_any_steps(model: StateSpaceModel, dt: float) -> AnyStepModel:
+    """The model with the step ratio r as one more input, for the extended Kalman filter and its likelihood.
+
+    Args:
+        model: whose sample time is one of its constants, `dt`, or `substep` for a part of it.
+        dt: that of the logs [s], which must be the model's.
+
+    Raises:
+        ValueError: for a model of one sample time, or of another one than the logs.
+    """
+    place, parts = sample_time_place(model, "a filter on a log's own stamps")
+    own = float(model.constants[place]) * parts
+    if not same_dt(own, dt):
+        raise ValueError(f"the dt of logs on their own stamps must be the model's {own:g} s, but is {dt:g} s")
+    given: dict[str, Any] = {name: getattr(model, name) for name in StateSpaceModel.__dataclass_fields__}
+    form, count, inputs = type(model.constants), len(model.constants), model.inputs
+    given["transition"] = with_ratio(model.transition, form, count, place, inputs)
+    slopes = model.transition_jacobian
+    if slopes is not None:
+        exact = by_complex_step(slopes)  # which is found anew
+        given["transition_jacobian"] = None if exact else with_ratio(slopes, form, count, place, inputs)
+    if model.operating_input is not None:
+        given["operating_input"] = np.append(model.operating_input, 1.0)
+    given |= {"inputs": inputs + 1, "input_quantities": (*model.input_quantities, RATIO), "operating_points": None}
+    return AnyStepModel(**given)
+
+
+@makes_functions
+def with_ratio(function: Callable, form: type, count: int, place: int, inputs: int) -> Callable:
+    """`function(x, u, c)` with the constant at a place times u[inputs], of the other inputs."""
+    constants = (f"c[{i}] * u[{inputs}]" if i == place else f"c[{i}]" for i in range(count))
+    names: dict[str, Any] = {"function": inlined(function), "form": form}
+    return written_out(
+        "stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names
+    )
+
+
+def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs (K', p + 1) with step ratios, and measurements (K' + 1, m), of a log on its own stamps.
+
+    A longer step than dt is divided into equal ones that are at most as long, as `filters.live` does it; nothing is
+    measured between them.
+    """
+    lengths = np.diff(log.times)
+    counts = np.maximum(1, np.ceil(lengths / log.dt - ROUNDING)).astype(int)
+    ratios = np.repeat(lengths / counts / log.dt, counts)
+    measurements = np.full((len(ratios) + 1, log.measurements.shape[1]), np.nan)
+    measurements[np.concatenate([[0], np.cumsum(counts)])] = log.measurements
+    return np.column_stack([np.repeat(log.inputs, counts, axis=0), ratios]), measurements
+
+
+def sample_time_place(model: StateSpaceModel, what: str) -> tuple[int, int]:
+    """Where the constant lies that says the sample time, and how many of it are a step.
+
+    Args:
+        model: any.
+        what: needs it, for the message.
+
+    Raises:
+        ValueError: for a model without one, or whose other constants follow from it.
+    """
+    names = getattr(model.constants, "_fields", ())
+    called = "must be called on" if what == "set_dt" else "must be of"
+    if "of_one_dt" in names:
+        rule = f"{what} {called} a model whose other constants do not follow from dt"
+        raise ValueError(f"{rule}, but got those of lagging sensors")
+    for name, parts in (("dt", 1), ("substep", model.substeps)):
+        if name in names:
+            return names.index(name), parts
+    raise ValueError(f"{what} {called} a model with a constant dt, but got {', '.join(names) or 'none'}")
