@@ -169,7 +169,13 @@ def command(
             "--range": range_,
             "--start": start,
         }
-        for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
+        for_logs |= {
+            "--hold-noise": hold_noise,
+            "--no-grid": no_grid,
+            "--held-out": held_out,
+            "--use-all": use_all,
+            "--plot": plot,
+        }
         check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)

@@ -18,7 +18,6 @@ from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.replay import ReplayEnv
 from tuning.identification.family import ModelFamily
-from tuning.identification.runs import runs_of
 from tuning.problems.log_problem import LogProblem
 
 
@@ -131,11 +130,7 @@ def test_alarms_and_isolation_work_on_own_stamps():
         (lambda data: ReplayEnv(data, thruster_model, grid=False).reset(), "must lie on a grid to be replayed"),
         (
             lambda data: LogProblem(read_log(data, thruster_model(), grid=False), thruster_model()),
-            "logs to learn from must lie on a grid, but a table has its own stamps",
-        ),
-        (
-            lambda data: runs_of([read_log(data, thruster_model(), grid=False)]),
-            "logs to learn from must lie on a grid",
+            "logs of a study must lie on a grid, but a table has its own stamps",
         ),
     ],
 )

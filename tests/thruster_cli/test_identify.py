@@ -208,6 +208,58 @@ def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_pat
         assert files() == before, line
 
 
+MOTOR = """
+from typing import NamedTuple
+
+from thruster_env.plants.continuous import ContinuousModel
+
+
+class Constants(NamedTuple):
+    substep: float
+    gain: float = 60.0
+    friction: float = 3.0
+
+
+def rates(x, u, c):
+    return (c.gain * u[0] - c.friction * x[0],)
+
+
+def speed(x, c):
+    return (x[0],)
+
+
+motor = ContinuousModel(
+    rates=rates,
+    observe=speed,
+    densities=[4.0],
+    constants=Constants(0.05),
+    arguments={"prior_mean": [0.0], "prior_cov": [1.0], "measurement_noise_cov": [0.01], "inputs": 1,
+               "measurements": ["speed"]},
+)
+"""
+
+
+def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
+    rng, speed, rows = np.random.default_rng(1), 0.0, []
+    (tmp_path / "plant.py").write_text(MOTOR)
+    stamps, volts = np.cumsum(rng.uniform(0.01, 0.09, size=400)), 0.0
+    for k, length in enumerate(np.diff(stamps, append=stamps[-1] + 0.05)):
+        volts = rng.choice([-1.0, 1.0]) if k % 10 == 0 else volts
+        rows.append(f"{stamps[k]:.6f},{volts:g},{speed + 0.1 * rng.normal():.6f}")
+        decay = np.exp(-2.0 * length)  # exact from stamp to stamp: gain 40, friction 2
+        speed = decay * speed + 20.0 * volts * (1 - decay) + np.sqrt((1 - decay**2) / 4) * rng.normal()
+    (tmp_path / "run.csv").write_text("\n".join(["time_s,u_1,speed", *rows]))
+    given = ("run.csv", "--model", "plant:motor", "--no-grid", "--dt", "0.05")
+    found = as_json("identify", *given, "--free", "gain,friction", "--starts", "1", "--out", "found.toml")
+    for name, truth in {"gain": 40.0, "friction": 2.0, "R": 0.01}.items():
+        assert abs(found["values"][name] - truth) < 4 * found["standard_errors"][name], name
+    again = as_json("estimate", *given, "--preset", "found.toml", "--skip", "0")
+    assert again["grid"] is False
+    assert again["log_likelihood"] == pytest.approx(found["validation"]["identified"]["log_likelihood"], rel=1e-9)
+    done = thruster("identify", *given, "--free", "gain", "--filter", "kf")
+    assert done.returncode == 2 and "must be identified with the ekf, but got filter kf" in done.stderr
+
+
 def test_values_of_a_model_belong_to_a_sample_time(tmp_path):
     (tmp_path / "mine.toml").write_text("[values]\nQ11 = 0.5\nR = 2.0\n[identified]\ndt = 0.01\n")
     alone = with_values(scalar_model, tmp_path / "mine.toml")

@@ -68,16 +68,14 @@ def with_ratio(function: Callable, form: type, count: int, place: int, inputs: i
     """`function(x, u, c)` with the constant at a place times u[inputs], of the other inputs."""
     constants = (f"c[{i}] * u[{inputs}]" if i == place else f"c[{i}]" for i in range(count))
     names: dict[str, Any] = {"function": inlined(function), "form": form}
-    return written_out(
-        "stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names
-    )
+    return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
 
 
 def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Inputs (K', p + 1) with step ratios, and measurements (K' + 1, m), of a log on its own stamps.
 
-    A longer step than dt is divided into equal ones that are at most as long, as `filters.live` does it; nothing is
-    measured between them.
+    A longer step than dt is divided into equal ones that are at most as long, as `filters.live` does it; there
+    is no measurement between them.
     """
     lengths = np.diff(log.times)
     counts = np.maximum(1, np.ceil(lengths / log.dt - ROUNDING)).astype(int)

@@ -78,8 +78,8 @@ def identify(
         held_out: runs used only for validation, as objects or paths; by default every third of three or more.
         use_all: hold no run out.
         hold_gaps: hold the last input over gaps of a log; by default runs are split there.
-        grid: whether logs are put on a grid; else on their own stamps, for a model whose sample time is a constant: Q
-            of a step is then in proportion to its length, and the values are those of `dt`.
+        grid: whether logs are put on one; else on their own stamps, for a model whose sample time is a constant:
+            Q of a step is then in proportion to its length, and the values are those of `dt`.
         filter: "ekf", or "kf" for affine models.
         predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
         degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
