@@ -82,7 +82,7 @@ int main(int count, char **words)
     }
     for (int i = 0; i < COLUMNS; i++) {
         if (column_of[i] < 0) {
-            fprintf(stderr, "a log must have a column %s\\n", headers[i]);
+            fprintf(stderr, "a log must have a column %s, or its headers be given\\n", headers[i]);
             return 2;
         }
     }

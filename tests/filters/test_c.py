@@ -421,8 +421,8 @@ def test_a_log_without_a_column_is_refused(tmp_path):
     command = ["gcc", *WARNINGS, "one.c", "main.c", "-lm", "-o", "one_log"]
     assert subprocess.run(command, cwd=tmp_path).returncode == 0
     for words, log, told in [
-        ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N\n"),
-        (["u", "z"], "u,thrust\n", "a log must have a column z\n"),
+        ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
+        (["u", "z"], "u,thrust\n", "a log must have a column z, or its headers be given\n"),
         (["u"], "u,z\n", "give no header, or 2, inputs first\n"),
         (["u", "z"], "u,z\n1,2\n,3\n4,5\n", "row 2 has no u\n"),
         ([], "", "a log must have a line of headers\n"),

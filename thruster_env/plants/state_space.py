@@ -171,8 +171,8 @@ class StateSpaceModel:
     @property
     def shape(self) -> Shape:
         """Sizes of the model, and other data needed to compile its code."""
-        angles = (tuple(one.angle for one in part) for part in (self.states, self.measurements))
-        return Shape(self.n, self.m, self.inputs, constants_form(self.constants), *angles)
+        states, channels = (tuple(one.angle for one in part) for part in (self.states, self.measurements))
+        return Shape(self.n, self.m, self.inputs, constants_form(self.constants), states, channels)
 
     @property
     def functions(self) -> Functions:
