@@ -38,7 +38,7 @@ README = """\
 
 or `cmake -B build && cmake --build build`. Do not compile with -ffast-math, which takes NaN for a number.
 `{name}.h` says what each function does; there is no heap and no recursion, and of libraries math.h alone.
-`{name}.hpp` is a class of C++11 around it. `main.c` lists the columns that a log must have; headers of others are given,
+`{name}.hpp` is a class of C++11 around it. `main.c` lists the columns of a log; other headers are given,
 inputs first: `./{name}_log HEADER ...`.
 
 | bytes with -Os | {compilers} |
