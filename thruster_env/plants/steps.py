@@ -96,7 +96,7 @@ def sample_time_place(model: StateSpaceModel, what: str) -> tuple[int, int]:
         ValueError: for a model without one, or whose other constants follow from it.
     """
     names = getattr(model.constants, "_fields", ())
-    called = "must be called on" if what == "set_dt" else "must be of"
+    called = "needs" if what == "set_dt" else "must be of"
     if "of_one_dt" in names:
         rule = f"{what} {called} a model whose other constants do not follow from dt"
         raise ValueError(f"{rule}, but got those of lagging sensors")
