@@ -34,9 +34,10 @@ def check_times(logs: Sequence[Log]) -> None:
             raise ValueError(f"logs must all lie on grids or none, but {own.name} does not and {other.name} does")
         if not same_dt(log.dt, logs[0].dt):
             first, dt = logs[0].name, f"{logs[0].dt:g}"
+            how = "put them on one grid" if log.stamps is None else "give both the same"
             raise ValueError(
                 f"logs of one problem must have the same sample time, but {first} has {dt} s and {log.name} "
-                f"{log.dt:g} s: give both the same with --dt {dt}, in Python dt={dt}"
+                f"{log.dt:g} s: {how} with --dt {dt}, in Python dt={dt}"
             )
 
 
