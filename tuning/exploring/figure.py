@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,12 +23,13 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     run = min(run, len(view.estimate) - 1)
     panels: list[Callable[[Axes], None]] = []
     for place, named in enumerate(bench.states[:MOST_STATES]):
-        panels.append(lambda ax, place=place, named=named: _state(ax, view, run, place, named))
+        panels.append(partial(_state, view=view, run=run, place=place, named=named))
     for place, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
-        panels.append(lambda ax, place=place, named=named: _innovation(ax, view, run, place, named))
+        panels.append(partial(_innovation, view=view, run=run, place=place, named=named))
     panels.append(lambda ax: _level(ax, view.time, view.nis, view.nis_band, "NIS"))
     if view.nees is not None and view.nees_band is not None:
-        panels.append(lambda ax: _level(ax, view.time, view.nees, view.nees_band, "NEES"))
+        nees, band = view.nees, view.nees_band
+        panels.append(lambda ax: _level(ax, view.time, nees, band, "NEES"))
     panels.append(lambda ax: _lags(ax, view))
     rows = -(-len(panels) // 2)
     figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
