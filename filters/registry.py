@@ -34,6 +34,7 @@ from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from thruster_env.numerics.checks import one_of
 from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.plants.steps import AnyStepModel
 
 LISTED = "thruster filters"  # the command that lists all
 FILTERS: dict[str, type[Filter]] = {
@@ -107,4 +108,6 @@ def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
     known = tunable_numbers(name)
     for number in numbers:
         one_of(f"a number of filter {name!r}", number, known)
+    if isinstance(model, AnyStepModel) and not filter_class(name).any_step:
+        raise ValueError(f"a filter on a log's own stamps must know steps of any length, but {name!r} does not")
     return filter_class(name)(model=model, **numbers)

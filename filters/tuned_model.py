@@ -14,7 +14,8 @@ KEYS = ("digest", "dt", *VECTORS)
 
 
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
-    """A model's digest, sample time [s] and quantities, as JSON can hold them."""
+    """A model's digest, sample time [s] and quantities, as JSON can hold them; of any steps, of one of dt."""
+    model = getattr(model, "plain", model)
     named = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
     return {"digest": model.digest, "dt": dt, **named}
 
@@ -28,6 +29,7 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         dt: its sample time [s]; None if unknown, which is not compared.
         file: its path.
     """
+    model = getattr(model, "plain", model)
     here = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
     differing = [
         f"{key} {_listed(tuned_for[key])} (here {_listed(here[key])})"
@@ -49,6 +51,7 @@ def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | Non
     Arguments are those of `check_same_quantities`; the model has the file's Q and R.
     """
     check_same_quantities(tuned_for, model, dt, file)
+    model = getattr(model, "plain", model)
     if model.digest != tuned_for["digest"]:
         raise ValueError(
             f"a tuned file must be for the model it is used with, but {file} was tuned for a model of digest "

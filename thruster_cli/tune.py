@@ -27,6 +27,7 @@ from thruster_cli.options import (
     LogOption,
     LogPresetOption,
     ModelOption,
+    NoGridOption,
     SeedOption,
     SensorOption,
     StartOption,
@@ -167,6 +168,7 @@ def command(
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
+    no_grid: NoGridOption = False,
     study: Annotated[
         str | None,
         typer.Option(help="Name of the study; by default from the options above.", rich_help_panel=OUTPUT),
@@ -220,7 +222,7 @@ def command(
     check_keepable(filter_name)
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
-    of_logs |= {"hold_gaps": hold_gaps or None, "start": start}
+    of_logs |= {"hold_gaps": hold_gaps or None, "start": start, "grid": False if no_grid else None}
     unknown = unknowns_of(augment or ())
     scenarios = tuple(augmented(one, unknown) for one in problems_of(scenario, log, of_logs, "mismatch"))
     check_targets((out,), json, read=(*(log or []), *(held_out or []), *(scenario or []), preset))

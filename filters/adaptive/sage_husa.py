@@ -86,6 +86,7 @@ class SageHusaFilter(PageFilter):
     name: ClassVar[str] = "sage-husa"
     page: ClassVar[Page] = Page(advance, settle, update, start=start)
     varying_noise: ClassVar[bool] = False
+    any_step: ClassVar[bool] = False  # it estimates the Q of a step
     forgetting_factor: float = 0.995
     process_forgetting_factor: float = 1.0
 

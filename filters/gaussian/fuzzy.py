@@ -197,6 +197,7 @@ class FuzzyKalmanFilter(Filter):
 
     name: ClassVar[str] = "fuzzy"
     one_model: ClassVar[bool] = False
+    any_step: ClassVar[bool] = False
     low: Any = None
     high: Any = None
     blending: str = "weights"

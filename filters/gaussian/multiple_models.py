@@ -34,6 +34,7 @@ class MultipleModelFilter(Filter):
     """
 
     one_model: ClassVar[bool] = False
+    any_step: ClassVar[bool] = False
     gaussian_likelihood: ClassVar[bool] = False
     varying_noise: ClassVar[bool] = False  # each mode has Q and R of its own
     modes: Any = None

@@ -148,6 +148,7 @@ class WeightedFilter(Filter):
     """
 
     gaussian_likelihood: ClassVar[bool] = False
+    any_step: ClassVar[bool] = False
     ensemble_size: int = 1000
     regularisation: float = 0.0
 

@@ -129,8 +129,10 @@ def test_alarms_and_isolation_work_on_own_stamps():
         ),
         (lambda data: ReplayEnv(data, thruster_model, grid=False).reset(), "must lie on a grid to be replayed"),
         (
-            lambda data: LogProblem(read_log(data, thruster_model(), grid=False), thruster_model()),
-            "logs of a study must lie on a grid, but a table has its own stamps",
+            lambda data: LogProblem(
+                read_log(data, thruster_model(), grid=False), logged_model(lag={"thrust": 0.02})
+            ),
+            "a model whose other constants do not follow from dt",
         ),
     ],
 )

@@ -390,7 +390,7 @@ def test_a_filter_that_is_made_is_run_as_it_is():
         ),
         (
             {"process_noise_cov": [1.0, 1.0]},
-            "goes into model_arguments.*but got 'process_noise_cov'",
+            "go into model_arguments.*but got 'process_noise_cov'",
         ),
         ({"model_arguments": [1]}, "model_arguments must be a mapping"),
         (

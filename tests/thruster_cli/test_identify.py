@@ -256,6 +256,10 @@ def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
     again = as_json("estimate", *given, "--preset", "found.toml", "--skip", "0")
     assert again["grid"] is False
     assert again["log_likelihood"] == pytest.approx(found["validation"]["identified"]["log_likelihood"], rel=1e-9)
+    tuned = as_json("tune", "--filter", "ekf", "--log", *given, "--trials", "4", "--out", "tuned.json")
+    assert tuned["held_out"] and as_json("verify", "tuned.json", "--model", "plant:motor")
+    on_stamps = as_json("estimate", *given, "--tuned", "tuned.json")
+    assert on_stamps["grid"] is False and np.isfinite(on_stamps["log_likelihood"])
     done = thruster("identify", *given, "--free", "gain", "--filter", "kf")
     assert done.returncode == 2 and "must be identified with the ekf, but got filter kf" in done.stderr
 

@@ -105,7 +105,6 @@ WRONG = [
         "either a tuned file or a filter, but got both",
     ),
     (lambda log: tuning.estimate(log, 5, **WHOSE), "tuned must be a tuned file or a Study, but got 5"),
-    (lambda log: tuning.estimate(log, lag=3, **WHOSE), "a lag must be that of a smoother, but got lag 3"),
     (lambda log: tuning.identify(log, lambda dt: None), "free must be names of parameters, but got .*model=..."),
     (
         lambda log: tuning.identify(log, FREE, model="motor"),

@@ -1,6 +1,8 @@
 """Identification on logs' own stamps: the grid's numbers where stamps lie on it, the plant's where they do not."""
 
 import dataclasses
+import json
+import pickle
 
 import numpy as np
 import pytest
@@ -17,10 +19,13 @@ from thruster_env.plants.diffusion import noise_of_densities
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.steps import in_any_steps, in_steps
+from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.validation import validate
 from tuning.logs.identify import family_of
 from tuning.problems.coordinates import Coordinates
+from tuning.problems.log_problem import LogProblem
+from tuning.search.space import untuned_choice
 
 DT = 0.1
 Q = np.array([[1e-3, 4e-4], [4e-4, 2e-3]])
@@ -80,8 +85,10 @@ def switched():
     [
         ("ekf", smooth),
         pytest.param("ekf", switched, marks=pytest.mark.slow),
-        ("ekf-robust", smooth),
-        ("ukf", smooth),
+        *(
+            (name, smooth)
+            for name in ("ekf-robust", "iekf", "ukf", "ckf", "fading", "vb", "enkf", "etkf", "ensrf")
+        ),
     ],
 )
 def test_rows_with_step_ratios_have_the_numbers_of_live(name, make):
@@ -189,3 +196,37 @@ def test_logs_are_all_on_grids_or_none():
     assert all(isinstance(log, Log) for log in logs)
     with pytest.raises(ValueError, match="logs must all lie on grids or none, but own does not and even does"):
         tuning.identify(logs, FREE, model=plant(), progress=False)
+
+
+def test_a_filter_that_knows_one_step_only_is_refused():
+    with pytest.raises(ValueError, match="a filter on a log's own stamps must know .*, but 'pf' does not"):
+        make_filter("pf", in_any_steps(smooth(), DT))
+
+
+def test_a_study_on_stamps_of_a_grid_has_the_numbers_of_the_grid():
+    model, logs = smooth(), [recorded(np.arange(200) * DT, seed) for seed in range(3)]
+    by_grid = [
+        LogProblem([read_log(log, model, dt=DT, name=f"{k}", **how) for k, log in enumerate(logs)], model)
+        for how in ({}, {"grid": False})
+    ]
+    choice = untuned_choice("ekf", by_grid[0])
+    found = [evaluate(choice.filter(one), one.data(one.parts.held_out), None) for one in by_grid]
+    assert found[1].log_likelihood == pytest.approx(found[0].log_likelihood, rel=1e-9)
+    assert found[1].nis.value == pytest.approx(found[0].nis.value, rel=1e-9)
+
+
+def test_a_tuned_file_from_own_stamps_is_for_the_model_of_a_step(tmp_path):
+    model = smooth().replace(process_noise_cov=[1e-2, 1e-2])
+    logs = [read_log(recorded(stamps_of(300, s), s), model, grid=False, dt=DT, name=f"{s}") for s in range(3)]
+    problem = pickle.loads(pickle.dumps(LogProblem(logs, model)))
+    assert any("on their own stamps" in said for said in problem.remarks)
+    study = tuning.tune(problem, filter="ekf", trials=6)
+    study.save(tmp_path / "tuned.json")
+    content = json.loads((tmp_path / "tuned.json").read_text())
+    assert [one[1] for one in content["model"]["inputs"]] == ["u_1"] and content["model"]["digest"] == model.digest
+    again = tuning.estimate(logs[2], tuned=tmp_path / "tuned.json", model=model)
+    q = np.diag(content["filter"]["model"]["process_noise_cov"])
+    assert np.allclose(again.filter.model.process_noise_cov, q) and np.isfinite(again.log_likelihood)
+    assert study.held_out.evaluations["tuned"].log_likelihood > 0.0
+    with pytest.raises(ValueError, match="a filter on a log's own stamps must know .*, but 'pf' does not"):
+        tuning.tune(problem, filter="pf", trials=2)

@@ -8,6 +8,7 @@ its own stamps is then rows of numbers, and what takes such rows takes the log.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +19,7 @@ from thruster_env.numerics.derivatives import by_complex_step
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.sources import tuple_of, written_out
 from thruster_env.plants.diffusion import same_dt
+from thruster_env.plants.logs.findings import Recording
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.shape import Shape
@@ -28,7 +30,17 @@ ROUNDING = 1e-6  # of a step: so much longer than dt it is still one
 
 
 class AnyStepModel(StateSpaceModel):
-    """A model whose last input is the step ratio; see `in_any_steps`."""
+    """A model whose last input is the step ratio; see `in_any_steps`.
+
+    Attributes:
+        plain: the model of a step of dt, which is what tuned files are for.
+    """
+
+    plain: StateSpaceModel
+
+    def replace(self, **changes) -> AnyStepModel:
+        """A copy with some fields of the plain model changed; ValueError as for a new model."""
+        return in_any_steps(self.plain.replace(**changes))
 
     @property
     def shape(self) -> Shape:
@@ -36,19 +48,19 @@ class AnyStepModel(StateSpaceModel):
         return super().shape._replace(step_ratio=True)
 
 
-def in_any_steps(model: StateSpaceModel, dt: float) -> AnyStepModel:
-    """The model with the step ratio r as one more input, for the extended Kalman filter and its likelihood.
+def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepModel:
+    """The model with the step ratio r as one more input, for filters with a page and their likelihood.
 
     Args:
         model: whose sample time is one of its constants, `dt`, or `substep` for a part of it.
-        dt: that of the logs [s], which must be the model's.
+        dt: that of the logs [s], which must be the model's; None if it is known to be.
 
     Raises:
         ValueError: for a model of one sample time, or of another one than the logs.
     """
     place, parts = sample_time_place(model, "a filter on a log's own stamps")
     own = float(model.constants[place]) * parts
-    if not same_dt(own, dt):
+    if dt is not None and not same_dt(own, dt):
         raise ValueError(f"the dt of logs on their own stamps must be the model's {own:g} s, but is {dt:g} s")
     given: dict[str, Any] = {name: getattr(model, name) for name in StateSpaceModel.__dataclass_fields__}
     form, count, inputs = type(model.constants), len(model.constants), model.inputs
@@ -60,7 +72,9 @@ def in_any_steps(model: StateSpaceModel, dt: float) -> AnyStepModel:
     if model.operating_input is not None:
         given["operating_input"] = np.append(model.operating_input, 1.0)
     given |= {"inputs": inputs + 1, "input_quantities": (*model.input_quantities, RATIO), "operating_points": None}
-    return AnyStepModel(**given)
+    found = AnyStepModel(**given)
+    object.__setattr__(found, "plain", model)
+    return found
 
 
 @makes_functions
@@ -69,6 +83,15 @@ def with_ratio(function: Callable, form: type, count: int, place: int, inputs: i
     constants = (f"c[{i}] * u[{inputs}]" if i == place else f"c[{i}]" for i in range(count))
     names: dict[str, Any] = {"function": inlined(function), "form": form}
     return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
+
+
+def as_rows(log: Log) -> Log:
+    """A log on its own stamps as one of rows with step ratios; true states and other references are left out."""
+    inputs, measurements = in_steps(log)
+    quantities = (*log.input_quantities, RATIO)
+    given: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
+    given |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
+    return dataclasses.replace(log, **given)
 
 
 def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:

@@ -43,6 +43,7 @@ def tune(
     columns: Any = None,
     clock_offset: Any = None,
     dt: float | None = None,
+    grid: bool = True,
     held_out: Any = None,
     blocks: int | None = None,
     lead: int | None = None,
@@ -100,6 +101,7 @@ def tune(
         columns: for recorded runs, headers by quantity.
         clock_offset: for recorded runs, seconds by quantity that a channel's clock is ahead.
         dt: for recorded runs, the sample time [s].
+        grid: for recorded runs, whether they are put on a grid; else on their own stamps, as in `estimate`.
         held_out: recorded runs used only for the held-out evaluation; by default every third.
         blocks: number of blocks per recorded run.
         lead: rows at the beginning of a block that are not scored.
@@ -120,6 +122,7 @@ def tune(
             f"filter must be a name or 'module:object', by which trials keep it, but got {shown(filter)}"
         )
     of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
+    of_logs["grid"] = None if grid else False
     of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
     unknown = unknowns_of(augment)
     problems = tuple(augmented(one, unknown) for one in problems_of(problem, preset, **of_logs))

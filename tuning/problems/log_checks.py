@@ -16,9 +16,6 @@ def checked_logs(given: Any) -> tuple[Log, ...]:
     logs = (given,) if isinstance(given, Log) else tuple(given) if isinstance(given, Sequence) else ()
     if not logs or not all(isinstance(log, Log) for log in logs):
         raise ValueError(f"logs must be some thruster_env.plants.logs.log.Log, but got {shown(given)}")
-    own = next((log.name for log in logs if log.stamps is not None), None)
-    if own is not None:
-        raise ValueError(f"logs of a study must lie on a grid, but {own} has its own stamps")
     check_times(logs)
     names = [log.name for log in logs]
     if len(set(names)) < len(names):

@@ -15,6 +15,7 @@ from thruster_env.plants.logs.findings import remarks_on
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import ReplayEnv
 from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.plants.steps import as_rows, in_any_steps
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
@@ -26,6 +27,10 @@ from tuning.problems.parameter import Parameter
 AT_GAPS = (
     "Runs are cut at gaps: no block has rows from both sides (--hold-gaps, hold_gaps=True, does not cut)",
     "At gaps the last input is held (--hold-gaps, in Python hold_gaps=True)",
+)
+
+ON_STAMPS = (
+    "Logs are on their own stamps: Q of a step is in proportion to its length, and true states are not used."
 )
 
 MEASURED = (
@@ -41,6 +46,9 @@ class LogProblem(AssumedProblem):
     `tuning.problems.log_parts`. A block has a lead-in that filters run through and that is not scored, and no gap:
     runs are cut there, and blocks with too few measurements are left out; `remarks` says so. Blocks may differ in
     length, and each counts in full; where true states are known at some steps only, these are scored.
+
+    Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.plants.steps`), without
+    true states, and a tuned file is for the model of a step of dt.
 
     Without true states there is no scale, and the negative log-likelihood of the innovations is minimised. The
     rule of thumb has the R of the model.
@@ -89,7 +97,10 @@ class LogProblem(AssumedProblem):
         about: str = "",
     ):
         """Cut the logs into blocks; see the class for the arguments."""
-        self.logs = checked_logs(logs)
+        self.recorded = self.logs = checked_logs(logs)
+        self._in_steps = self.logs[0].stamps is not None
+        if self._in_steps:
+            self.logs = tuple(map(as_rows, self.recorded))
         self._start, self._first = one_of("start", start, STARTS), None
         cut = partial(
             parts_of, self.logs, lead, blocks, held_out, hold_gaps=hold_gaps, sizes=True, shortest=shortest
@@ -144,7 +155,9 @@ class LogProblem(AssumedProblem):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Findings in the logs, and their rows that are in no block."""
-        found = remarks_on(self.logs)
+        found = remarks_on(self.recorded)
+        if self._in_steps:
+            found.append(ON_STAMPS)
         if any(len(log.pieces) > 1 for log in self.logs):
             found.append(f"{AT_GAPS[self._holds]}.")
         if self._start == MEASUREMENT:
@@ -153,6 +166,11 @@ class LogProblem(AssumedProblem):
 
     def model(self, **changes) -> StateSpaceModel:
         """The assumed model with some changes, and with the prior covariance of the start."""
+        found = self._of_dt(**changes)
+        return in_any_steps(found, self.logs[0].dt) if self._in_steps else found
+
+    def _of_dt(self, **changes) -> StateSpaceModel:
+        """The same for a step of the sample time."""
         found = super().model(**changes)
         if self._first is None:
             return found
@@ -219,7 +237,7 @@ class LogProblem(AssumedProblem):
         """
         if arguments:
             raise ValueError(f"an env of recorded runs must come with run alone, but got {', '.join(arguments)}")
-        return ReplayEnv(self.logs[at_least("run", run, 0, len(self.logs) - 1)], self.model)
+        return ReplayEnv(self.recorded[at_least("run", run, 0, len(self.logs) - 1)], self._of_dt)
 
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of the training blocks."""
