@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 import tuning
-from filters import make_filter
+from filters import Unknown, augmented_model, make_filter
 from filters.engine.batch import run
 from filters.likelihood import likelihood
 from filters.logs.clock import by_the_clock
@@ -196,6 +196,14 @@ def test_logs_are_all_on_grids_or_none():
     assert all(isinstance(log, Log) for log in logs)
     with pytest.raises(ValueError, match="logs must all lie on grids or none, but own does not and even does"):
         tuning.identify(logs, FREE, model=plant(), progress=False)
+
+
+def test_models_made_of_rates_can_be_sent_to_another_process():
+    model, x, u = smooth(), (0.3, 0.1), (1.0,)
+    for one in (model, in_any_steps(model, DT), augmented_model(model, {"stiffness": Unknown(std=0.5)})):
+        again, more = pickle.loads(pickle.dumps(one)), one.inputs - 1
+        given = (*x, 4.0)[: one.n], (*u, 0.5)[: 1 + more]
+        assert again.transition(*given, one.constants) == one.transition(*given, one.constants)
 
 
 def test_a_filter_that_knows_one_step_only_is_refused():

@@ -32,7 +32,7 @@ def makes_functions(maker: Callable) -> Callable:
         else:
             entries = dict(enumerate(result)) if isinstance(result, tuple) else {None: result}
         for key, function in entries.items():
-            if made_here(function) or "<locals>" in function.__qualname__:  # others are found by their names
+            if made_here(function) or "<locals>" in getattr(function, "__qualname__", ""):  # others: by names
                 _MADE.setdefault(function, Made(make, arguments, key))
         return result
 
