@@ -32,7 +32,8 @@ def makes_functions(maker: Callable) -> Callable:
         else:
             entries = dict(enumerate(result)) if isinstance(result, tuple) else {None: result}
         for key, function in entries.items():
-            if made_here(function) or "<locals>" in getattr(function, "__qualname__", ""):  # others: by names
+            nested = "<locals>" in getattr(function, "__qualname__", "")  # others are found by their names
+            if made_here(function) or (nested and all(function is not one for one in arguments)):
                 _MADE.setdefault(function, Made(make, arguments, key))
         return result
 
