@@ -8,6 +8,7 @@ from pathlib import Path
 from thruster_env.numerics.checks import shown
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.plants.steps import of_one_step
 
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)
@@ -15,7 +16,7 @@ KEYS = ("digest", "dt", *VECTORS)
 
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
     """A model's digest, sample time [s] and quantities, as JSON can hold them; of any steps, of one of dt."""
-    model = getattr(model, "plain", model)
+    model = of_one_step(model)
     named = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
     return {"digest": model.digest, "dt": dt, **named}
 
@@ -29,7 +30,7 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         dt: its sample time [s]; None if unknown, which is not compared.
         file: its path.
     """
-    model = getattr(model, "plain", model)
+    model = of_one_step(model)
     here = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
     differing = [
         f"{key} {_listed(tuned_for[key])} (here {_listed(here[key])})"
@@ -51,7 +52,7 @@ def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | Non
     Arguments are those of `check_same_quantities`; the model has the file's Q and R.
     """
     check_same_quantities(tuned_for, model, dt, file)
-    model = getattr(model, "plain", model)
+    model = of_one_step(model)
     if model.digest != tuned_for["digest"]:
         raise ValueError(
             f"a tuned file must be for the model it is used with, but {file} was tuned for a model of digest "

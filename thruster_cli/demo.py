@@ -24,7 +24,7 @@ from tuning.reporting.figures import comparison_figure, history_figure
 from tuning.reporting.report import Report, write_report
 from tuning.reporting.time_figures import estimates_figure
 from tuning.search.plan import TRAINING_SEEDS, Plan
-from tuning.search.space import AUTO, AUTO_FILTER_TYPES
+from tuning.search.space import AUTO
 from tuning.thruster.find import find_scenario
 
 FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs/tuning.md
@@ -99,9 +99,10 @@ def advice_on_type(tuning: Tuning, best: Tuning) -> str:
     """What the choice of the filter type is worth."""
     ratio = score_ratio(best.proof.tuned, tuning.proof.tuned)
     gain = f"{100 * (1 - ratio.value):.0f} % below" if ratio.high < 1 else "no better than"
+    count, name = len(best.plan.filter_types), best.result.choice.name
     return (
-        f"A second study (--filter auto --budget {BUDGET:g}) also chose the filter type, among "
-        f"{len(AUTO_FILTER_TYPES)}: {best.result.choice.name}. Its score is {gain} that of the tuned {FILTER}."
+        f"A second study (--filter auto --budget {BUDGET:g}) also chose the filter type, among {count}: {name}. "
+        f"Its score is {gain} that of the tuned {FILTER}."
     )
 
 

@@ -15,6 +15,8 @@ from thruster_cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.excitation import Steps
+from tuning.problems.model_problem import ModelProblem
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search import trials as tuning_trials
 from tuning.search.among_types import ESTIMATED, ESTIMATED_Q, SMALLER, TRANSFERRED, UNTUNED, ends_a_round
@@ -62,6 +64,13 @@ def studied(plan, count):
 def test_the_kinds_are_all_filters_with_a_covariance_the_ekf_first():
     assert AUTO_FILTER_TYPES[0] == "ekf" and len(set(AUTO_FILTER_TYPES)) == len(AUTO_FILTER_TYPES)
     assert set(AUTO_FILTER_TYPES) == {name for name, kind in FILTERS.items() if kind.has_covariance}
+
+
+def test_a_filter_that_a_model_does_not_allow_is_left_out():
+    model = MISMATCH.model().replace(operating_state=None, operating_input=None, operating_points=None)
+    plan = PLAN._replace(scenarios=(ModelProblem(model, inputs=Steps(12.0), steps=60),))
+    assert set(AUTO_FILTER_TYPES) - set(plan.filter_types) == {"kf", "kf-steady"}
+    assert PLAN.filter_types == AUTO_FILTER_TYPES
 
 
 @pytest.mark.parametrize("kind", AUTO_FILTER_TYPES)

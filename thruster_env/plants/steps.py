@@ -77,6 +77,11 @@ def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepMode
     return found
 
 
+def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
+    """The plain model of one of any steps; any other model itself."""
+    return model.plain if isinstance(model, AnyStepModel) else model
+
+
 @makes_functions
 def with_ratio(function: Callable, form: type, count: int, place: int, inputs: int) -> Callable:
     """`function(x, u, c)` with the constant at a place times u[inputs], of the other inputs."""

@@ -22,7 +22,7 @@ from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, everything_of, has_search_space, neutral, parameters, untuned_choice
+from tuning.search.space import Choice, everything_of, fits, has_search_space, neutral, parameters, untuned_choice
 
 MOST_SEEDS = 64
 MOST_ACROSS = 128  # values of each number on a map
@@ -67,7 +67,7 @@ class Bench:
     @cached_property
     def filters(self) -> tuple[str, ...]:
         """Names of the filters that may be chosen on the problem."""
-        return tuple(name for name in FILTERS if has_search_space(name) and _fits(name, self.problem))
+        return tuple(name for name in FILTERS if has_search_space(name) and fits(name, self.problem))
 
     @property
     def has_truth(self) -> bool:
@@ -215,12 +215,3 @@ class Bench:
 
     def _shown(self, problem: Problem, seeds: int) -> Shown:
         return shown_data(problem, at_least("seeds", seeds, 1, MOST_SEEDS), self.seed, self.held_out)
-
-
-def _fits(name: str, problem: Problem) -> bool:
-    """Whether a filter can be made on a problem."""
-    try:
-        rule_of_thumb(name, problem).filter(problem)
-    except ValueError:
-        return False
-    return True

@@ -5,7 +5,7 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import optuna
 from optuna.trial import FrozenTrial, TrialState
@@ -38,9 +38,8 @@ def enqueue_next_type(study: optuna.Study, plan: Plan) -> None:
     trials = study.get_trials(deepcopy=False)
     if any(one.state == TrialState.WAITING for one in trials) or (trials and UNTUNED not in trials[0].user_attrs):
         return  # a study that begins with something else has enqueued all at once
-    begun = {(key, name) for one in trials for key, name in one.user_attrs.items()}
     for key, name in _first_trials(plan):
-        if (key, name) not in begun:
+        if not any(one.user_attrs.get(key) == name for one in trials):
             parameters = _first_parameters(study, plan, key, name)
             if parameters is not None and not any(is_near(one.params, parameters) for one in trials):
                 study.enqueue_trial(parameters, user_attrs={key: name})
@@ -80,8 +79,12 @@ def _estimated(study: optuna.Study, plan: Plan, with_r: bool) -> dict | None:
         return noise_by_gradient(study, plan)
     if not with_r:
         choice = choice._replace(model={**choice.model, R: untuned_choice(name, problem).model[R]})
-    found = trial_parameters(choice, plan.space())
-    return {key: value for key, value in found.items() if key != FILTER_TYPE and " " not in key}
+    return _shared(trial_parameters(choice, plan.space()))
+
+
+def _shared(parameters: Mapping) -> dict:
+    """Those of a trial's parameters that all filter types have: Q and R, or the problem's own."""
+    return {name: value for name, value in parameters.items() if name != FILTER_TYPE and " " not in name}
 
 
 def enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial, budget: float) -> None:
@@ -114,8 +117,7 @@ def enqueue_transferred_noise(study: optuna.Study) -> None:
     best = best_trial(finished)
     if best is None:
         return
-    shared = {name: value for name, value in best.params.items() if name != FILTER_TYPE and " " not in name}
     latest = {trial.params[FILTER_TYPE]: trial for trial in finished if not is_over_budget(trial)}
     for name, trial in latest.items():
         if name != best.params[FILTER_TYPE]:
-            study.enqueue_trial({**trial.params, **shared}, user_attrs={TRANSFERRED: best.number})
+            study.enqueue_trial({**trial.params, **_shared(best.params)}, user_attrs={TRANSFERRED: best.number})

@@ -26,6 +26,7 @@ from tuning.search.space import (
     AUTO_FILTER_TYPES,
     Choice,
     choice_of,
+    fits,
     has_search_space,
     joint_distributions,
     joint_parameters,
@@ -80,7 +81,9 @@ class Plan(NamedTuple):
     @property
     def filter_types(self) -> tuple[str, ...]:
         """Names of the filters among which a trial chooses."""
-        return AUTO_FILTER_TYPES if self.filter == AUTO else (self.filter,)
+        if self.filter != AUTO:
+            return (self.filter,)
+        return tuple(name for name in AUTO_FILTER_TYPES if all(fits(name, one) for one in self.scenarios))
 
     @property
     def is_constrained(self) -> bool:

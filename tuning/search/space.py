@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -221,6 +222,16 @@ def everything_of(problem: Problem) -> dict[str, Any]:
 def has_search_space(name: str) -> bool:
     """Whether a filter has any parameter to choose."""
     return filter_class(name).has_covariance or bool(_of_filter(name))
+
+
+@lru_cache(maxsize=512)
+def fits(name: str, problem: Problem) -> bool:
+    """Whether a filter can be made on a problem: `kf`, say, needs an affine model or an operating point."""
+    try:
+        untuned_choice(name, problem).filter(problem)
+    except ValueError:
+        return False
+    return True
 
 
 def parameters_of(choice: Choice) -> dict[str, float | int]:
