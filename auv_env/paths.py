@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from auv_env.manoeuvres import MANOEUVRES, run
-from thruster_env.numerics.checks import as_floats, one_of, shown
+from thruster_env.numerics.checks import as_floats, one_of, short_repr
 
 SPACING = 0.2  # [m] between points of a manoeuvre's path: 2 mm from the arc where it turns most tightly
 STRAIGHT_AHEAD = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
@@ -80,13 +80,17 @@ def make_path(given, depth: float = 0.0) -> Path:
         except ValueError:
             points = np.empty(0)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
-            raise ValueError(f"{rule}, but got {shown(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
         if len(points) > MOST_POINTS or np.abs(points).max() > 1e6:
-            raise ValueError(f"path must have at most {MOST_POINTS} points within 1e6 m, but got {shown(given)}")
+            raise ValueError(
+                f"path must have at most {MOST_POINTS} points within 1e6 m, but got {short_repr(given)}"
+            )
     pieces = np.diff(points, axis=0)
     lengths = np.linalg.norm(pieces, axis=1)
     if (np.hypot(pieces[:, 0], pieces[:, 1]) < 1e-6 * (1.0 + lengths)).any():
-        raise ValueError(f"each piece of path must lead somewhere else than up or down, but got {shown(given)}")
+        raise ValueError(
+            f"each piece of path must lead somewhere else than up or down, but got {short_repr(given)}"
+        )
     return Path(points[:-1] + [0.0, 0.0, depth], pieces / lengths[:, None], lengths)
 
 

@@ -16,7 +16,16 @@ from auv_env.operating import required_substeps
 from auv_env.parameters import VehicleParameters, derive_constants
 from auv_env.presets import preset_parameters
 from auv_env.quantities import COMMANDS, INPUTS, STATES
-from thruster_env.numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector
+from thruster_env.numerics.checks import (
+    at_least,
+    between,
+    covariance,
+    finite,
+    one_of,
+    positive,
+    short_repr,
+    vector,
+)
 from thruster_env.plants.disturbances.effects import Effect, dropping_channels
 from thruster_env.plants.disturbances.missing import SampleEvery
 from thruster_env.plants.quantities import Quantity
@@ -167,12 +176,12 @@ def _sensors(given, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str,
     if not isinstance(given, Mapping):
         if not hasattr(given, "__iter__"):
             rule = "sensors must be a suite's name, a list of channels or a mapping from them"
-            raise ValueError(f"{rule}, but got {shown(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
         names = list(given)
         known = [one_of("a channel of sensors", name, tuple(CHANNELS)) for name in names]
         given = {name: _timing(default_instrument(name), dt) for name in known}
         if len(given) != len(names):
-            raise ValueError(f"sensors must name each channel once, but got {shown(names)}")
+            raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
     if not given:
         raise ValueError("sensors must name at least one channel, but got none")
     if len(given) > MAX_CHANNELS:
@@ -205,7 +214,7 @@ def _initial_distribution(given) -> tuple[np.ndarray, np.ndarray]:
         return mean, covariance("the cov of initial_state", given["cov"], STATES_COUNT, largest=largest)
     raise ValueError(
         "initial_state must be None, twelve numbers, {'speed': U} or {'mean': [..], 'cov': [..]}, "
-        f"but got {shown(given)}"
+        f"but got {short_repr(given)}"
     )
 
 
@@ -213,5 +222,5 @@ def state(name: str, value) -> np.ndarray:
     """Return a state (12,); raise ValueError unless it is twelve numbers from which finite ones can follow."""
     given = vector(name, value, STATES_COUNT)
     if np.abs(given).max() > LARGEST_STATE:
-        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {shown(value)}")
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
     return given

@@ -44,7 +44,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     choice = oracle_choice("enkf", scenario).with_size(ENSEMBLE_SIZE)
     count = SEEDS * scenario.steps * ENSEMBLE_SIZE
 
-    def judge():
+    def compute_metrics():
         evaluate(choice.filter(scenario), data, scenario.scale)
 
     a_step = times(step_of_filter(choice.filter(scenario)), 1 / ENSEMBLE_SIZE)
@@ -52,7 +52,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     floor = floor_measures(scenario.plant, scenario.steps)
     whole_floor = _sum(*floor.values())
     workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
-    timing = side_by_side(shared(judge, count), whole_floor, rounds)
+    timing = side_by_side(shared(compute_metrics, count), whole_floor, rounds)
     yield Row(f"evaluate, {workload}", "floor", timing, ratio_goal=EVALUATE_GOAL, limit=limit)
     timing = side_by_side(shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
     yield Row("the same without metrics", "floor", timing, ratio_goal=RUN_GOAL, limit=limit)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.rows import Row, machine_lines, machine_name
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.files import write_whole
 from thruster_env.numerics.markdown import table, with_tables
 
@@ -21,7 +21,7 @@ def check_page(path: Path) -> None:
     try:
         found = path.read_text()
     except (OSError, UnicodeDecodeError):
-        raise ValueError(f"--page must be a page that can be read, but got {shown(str(path))}") from None
+        raise ValueError(f"--page must be a page that can be read, but got {short_repr(str(path))}") from None
     if MARK not in found:
         raise ValueError(f"--page must be a page with {MARK}PROCESSOR, N cores -->, but {path} has none")
 

@@ -50,14 +50,14 @@ class Filter:
         return self.model
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The filter's own parameters, packed behind the model's: from `layout.own_place` on."""
         return ()
 
     @property
     def numbers(self) -> np.ndarray:
         """Packed parameters that the kernels read, one float64 row: the model's, then the filter's own."""
-        return np.append(self.kernel_model.numbers, self.own_numbers)
+        return np.append(self.kernel_model.numbers, self.own_parameters)
 
     @property
     def size(self) -> int:
@@ -118,7 +118,7 @@ class Filter:
         It is put back with `_put_back`, but after an error.
         """
         kept = self._kept_sessions()
-        source = self.kernel_model.numbers_from, self.own_numbers
+        source = self.kernel_model.numbers_from, self.own_parameters
         if kept:
             try:
                 was, session = kept.pop()  # which no other thread has then

@@ -11,7 +11,7 @@ import numpy as np
 from filters.engine.belief import Belief
 from filters.engine.session import Session
 from filters.monitoring.monitor import Health, Monitor, monitor_of, watch_of
-from thruster_env.numerics.checks import as_floats, finite, one_of, positive, shown
+from thruster_env.numerics.checks import as_floats, finite, one_of, positive, short_repr
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -118,7 +118,7 @@ class Live:
             raise ValueError(f"time must not step back behind {self.time:.9g} s, but got {time:.9g}")
         given = as_floats(() if u is None else u).reshape(-1)
         if given.shape != (self._inputs,) or not np.isfinite(given).all():
-            raise ValueError(f"u must be {self._inputs} finite numbers, but got {shown(u)}")
+            raise ValueError(f"u must be {self._inputs} finite numbers, but got {short_repr(u)}")
         if time > self.time + ROUNDING * self._step:
             self._predict(time, given)
 
@@ -160,7 +160,7 @@ class Live:
         values = as_floats(z).reshape(-1)
         names = [sensor] if isinstance(sensor, str) else list(self._channels) if sensor is None else list(sensor)
         if len(values) != len(names):
-            raise ValueError(f"z must have a number for each of {', '.join(names)}, but got {shown(z)}")
+            raise ValueError(f"z must have a number for each of {', '.join(names)}, but got {short_repr(z)}")
         given = self._nothing.copy()
         for name, value in zip(names, values.tolist(), strict=True):
             given[self._channels[one_of("sensor", name, tuple(self._channels))]] = value
@@ -169,7 +169,7 @@ class Live:
 
     def _checked(self, values: np.ndarray) -> np.ndarray:
         if not self._skips and np.isnan(values).any():
-            raise ValueError(f"z must not be NaN with skip_missing=False, but got {shown(values.tolist())}")
+            raise ValueError(f"z must not be NaN with skip_missing=False, but got {short_repr(values.tolist())}")
         return values
 
     def _predict(self, time: float, u: np.ndarray) -> None:

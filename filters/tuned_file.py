@@ -14,7 +14,7 @@ from typing import Any
 
 from filters.registry import FILTERS, LISTED, tunable_numbers
 from filters.tuned_model import check_model_data
-from thruster_env.numerics.checks import finite, one_of, positive, shown
+from thruster_env.numerics.checks import finite, one_of, positive, short_repr
 
 FILE_FORMAT = "tuned filter"
 OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3
@@ -62,7 +62,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
     if content.get("hash") != sealed(content)["hash"]:
         raise ValueError(
             f"a tuned file must be unchanged, with the hash of its content, but {path} was edited: its hash is "
-            f"{shown(content.get('hash'))}"
+            f"{short_repr(content.get('hash'))}"
         )
     try:
         content = _of_this_version(content)
@@ -86,7 +86,7 @@ def _of_this_version(content: dict) -> dict:
         _mapping("plant", content["plant"])
     for part in ("problem", "digest"):
         if not isinstance(content.get(part), str):
-            raise ValueError(f"the {part} of a tuned file must be text, but got {shown(content.get(part))}")
+            raise ValueError(f"the {part} of a tuned file must be text, but got {short_repr(content.get(part))}")
     return content
 
 
@@ -97,7 +97,9 @@ def _check_version(path: str | Path, version) -> None:
     if isinstance(version, int):
         advice = ": update thruster-env" if version > FILE_VERSION else ": tune again"
     known = f"{', '.join(map(str, READ_VERSIONS[:-1]))} or {READ_VERSIONS[-1]}"
-    raise ValueError(f"a tuned file must be of version {known}, but {path} is of version {shown(version)}{advice}")
+    raise ValueError(
+        f"a tuned file must be of version {known}, but {path} is of version {short_repr(version)}{advice}"
+    )
 
 
 def _check_filter(entry, known: tuple[str, ...] | None) -> None:
@@ -106,7 +108,9 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
     Arguments of the model are those that are known, or any names if None.
     """
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
-        raise ValueError(f"a tuned file must have a filter with name, numbers and model, but got {shown(entry)}")
+        raise ValueError(
+            f"a tuned file must have a filter with name, numbers and model, but got {short_repr(entry)}"
+        )
     name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS), LISTED)
     numbers = tunable_numbers(name)
     for key, value in _mapping("numbers", entry["numbers"]).items():
@@ -117,10 +121,10 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
         if known is not None:
             one_of("an argument of the model of a tuned file", key, known)
         elif not key.isidentifier():
-            raise ValueError(f"an argument of the model of a tuned file must be a name, but got {shown(key)}")
+            raise ValueError(f"an argument of the model of a tuned file must be a name, but got {short_repr(key)}")
     for key in NOISE:
         if model.get(key) is None:
-            raise ValueError(f"the model of a tuned file must have a {key}, but got {shown(model)}")
+            raise ValueError(f"the model of a tuned file must have a {key}, but got {short_repr(model)}")
     for key, value in model.items():
         if key == STATES and isinstance(value, str):
             continue
@@ -134,7 +138,7 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
     for key, value in _mapping(AUGMENTED, model.get(AUGMENTED, {})).items():
         _check_finite(f"{AUGMENTED}, {key}", value)
         if not isinstance(value, list) or len(value) != 3:
-            raise ValueError(f"{AUGMENTED}, {key} must be std, walk and mean, but got {shown(value)}")
+            raise ValueError(f"{AUGMENTED}, {key} must be std, walk and mean, but got {short_repr(value)}")
 
 
 def _check_finite(name: str, value) -> None:
@@ -142,11 +146,11 @@ def _check_finite(name: str, value) -> None:
     rows = value if isinstance(value, list) and value else [value]
     for part in (part for row in rows for part in (row if isinstance(row, list) and row else [row])):
         if isinstance(part, bool) or not isinstance(part, int | float):
-            raise ValueError(f"{name} must be made of finite numbers, but got {shown(value)}")
+            raise ValueError(f"{name} must be made of finite numbers, but got {short_repr(value)}")
         finite(name, part)
 
 
 def _mapping(part: str, value) -> dict:
     if not isinstance(value, dict):
-        raise ValueError(f"the {part} of a tuned file must be a mapping, but got {shown(value)}")
+        raise ValueError(f"the {part} of a tuned file must be a mapping, but got {short_repr(value)}")
     return value

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.plants.steps import of_one_step
@@ -67,7 +67,7 @@ def check_model_data(given) -> None:
     if not sound or not all(
         isinstance(given[key], list) and all(map(_is_quantity, given[key])) for key in VECTORS
     ):
-        raise ValueError(f"the model of a tuned file must have {', '.join(KEYS)}, but got {shown(given)}")
+        raise ValueError(f"the model of a tuned file must have {', '.join(KEYS)}, but got {short_repr(given)}")
 
 
 def _is_quantity(given) -> bool:

@@ -53,8 +53,8 @@ def pendulum_errors() -> str:
     for name in ("ekf", "ukf"):
         plan = Plan(name, (pendulum,))
         choice = run_study(open_study("pendulum", plan, None), plan, TRIALS).choice
-        proof = evaluate_held_out(choice, pendulum, 0)
-        for word, one in (("rule of thumb", proof.untuned), ("tuned", proof.tuned)):
+        comparison = evaluate_held_out(choice, pendulum, 0)
+        for word, one in (("rule of thumb", comparison.untuned), ("tuned", comparison.tuned)):
             sigma = choice.model["sigma"] if word == "tuned" else pendulum.untuned["sigma"]
             errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in one.rmse]
             rows.append([name, word, f"{sigma:.3f}", *errors, f"{one.nees.value:.2f}", f"{one.nis.value:.2f}"])

@@ -11,7 +11,7 @@ from filters.consistency.intervals import Interval, rmse_ratios
 from filters.filter import Filter
 from filters.gaussian.fuzzy import BLENDINGS
 from pages.filter_gaussian import FLOW, FLOW_RMSE
-from pages.filter_runs import LOOKS, Runs, held_runs, judged, nees, times
+from pages.filter_runs import STYLES, Runs, errors_of, held_runs, nees, times
 from pages.page import digits, legend_below, log_ticks, table
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.numerics.plots import DARK, SKY, new_figure, save_figure, tidy
@@ -23,7 +23,7 @@ SHOWN_WIDTH = 12.0  # [V], of the run that is drawn
 WIDTHS = (1.0, 2.0, 4.0, 6.0, 9.0, SHOWN_WIDTH, 16.0, 20.0, 24.0)  # [V]
 TABLE_WIDTHS = (2.0, 6.0, 12.0)  # [V]
 BLENDING_LOOKS = {
-    "weights": LOOKS["fuzzy"],
+    "weights": STYLES["fuzzy"],
     "moments": {"color": SKY},
     "output": {"color": DARK, "linestyle": ":"},
 }
@@ -35,22 +35,22 @@ def picture(path: Path) -> Path:
     left, right = figure.subplots(1, 2, width_ratios=(2, 3))
     tidy((left, right))
     looks = {f"fuzzy, {one}": look for one, look in BLENDING_LOOKS.items()}
-    looks |= {name: LOOKS[name] for name in ("kf", "ekf")}
+    looks |= {name: STYLES[name] for name in ("kf", "ekf")}
     errors = {label: [] for label in looks}
     for width in WIDTHS:
         model, runs = _about_the_centre(width, 20)
         filters = {f"fuzzy, {one}": _fuzzy(model, width, blending=one) for one in BLENDINGS}
         filters |= {name: make_filter(name, model) for name in ("kf", "ekf")}
         for label, filter_ in filters.items():
-            errors[label].append(judged(filter_, runs)[1])
+            errors[label].append(errors_of(filter_, runs)[1])
             if width == SHOWN_WIDTH:
                 estimate = run(filter_, *runs.given).means[0, :, 1]
                 right.plot(times(len(estimate)), estimate, **looks[label])
         if width == SHOWN_WIDTH:
-            right.plot(times(501), runs.states[0, :, 1], **LOOKS["truth"])
+            right.plot(times(501), runs.states[0, :, 1], **STYLES["truth"])
     for label, values in errors.items():
         left.plot(WIDTHS, values, label=label, **looks[label])
-    left.plot([], [], label="truth", **LOOKS["truth"])
+    left.plot([], [], label="truth", **STYLES["truth"])
     log_ticks(left.yaxis, (0.03, 0.1, 0.3, 1, 3, 10))
     left.set_xlabel("width of the voltages' range about 12 V [V]")
     left.set_ylabel(FLOW_RMSE)

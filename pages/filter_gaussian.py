@@ -16,7 +16,7 @@ from filters import (
     thruster_model,
 )
 from filters.posterior import posterior_bound
-from pages.filter_runs import LOOKS, PUBLISHED_NOISE, RUNS, deviations, held_runs, judged, rmse, runs_of, times
+from pages.filter_runs import PUBLISHED_NOISE, RUNS, STYLES, deviations, errors_of, held_runs, rmse, runs_of, times
 from pages.page import legend_below, log_ticks
 from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
@@ -43,11 +43,11 @@ def kalman(path: Path) -> Path:
     tidy((left, right))
     for name, filter_ in filters.items():
         errors = [rmse(run(filter_, *runs.given), runs)[1] for runs in steady]
-        left.plot(voltages, errors, label=names[name], **LOOKS[name])
+        left.plot(voltages, errors, label=names[name], **STYLES[name])
         estimate = run(filter_, *reversing.given).means[0, :, 1]
-        right.plot(times(len(estimate)), estimate, **LOOKS[name])
-    right.plot(times(501), reversing.states[0, :, 1], **LOOKS["truth"])
-    left.plot([], [], label="truth", **LOOKS["truth"])
+        right.plot(times(len(estimate)), estimate, **STYLES[name])
+    right.plot(times(501), reversing.states[0, :, 1], **STYLES["truth"])
+    left.plot([], [], label="truth", **STYLES["truth"])
     log_ticks(left.yaxis, (0.03, 0.05, 0.1, 0.2, 0.5))
     left.set_xlabel("constant voltage [V]")
     left.set_ylabel(FLOW_RMSE)
@@ -84,11 +84,11 @@ def one_update(path: Path) -> Path:
     right.plot(flow, prior / prior.sum() / step, color=DARK, linestyle=":", label="prior")
     for name in ("ekf", "iekf", "ukf"):
         belief, _ = make_filter(name, model).update(make_filter(name, model).init(), [z])
-        right.plot(flow, _density(flow, belief.mean[1], belief.cov[1, 1]), label=name, **LOOKS[name])
+        right.plot(flow, _density(flow, belief.mean[1], belief.cov[1, 1]), label=name, **STYLES[name])
     sums = GaussianSumFilter(model=model)
     means, covs, weights = sums.part_estimates(sums.update(sums.init(), [z])[0])
     density = sum(w * _density(flow, x[1], p[1, 1]) for w, x, p in zip(weights, means, covs, strict=True))
-    right.plot(flow, density, label="gsf, its parts", **LOOKS["gsf"])
+    right.plot(flow, density, label="gsf, its parts", **STYLES["gsf"])
     right.set_ylabel("density [s/m]")
     left.plot([mean], [z_at_mean], "o", color=BLUE, markersize=5)
     for axis in (left, right):
@@ -108,7 +108,7 @@ def sigma_points(path: Path) -> Path:
         estimates = run(make_filter(name, model), *runs.given)
         error, spread = (part[0, window] for part in (estimates.means[..., 1], deviations(estimates, 1)))
         error = error - runs.states[0, window, 1]
-        left.plot(times(501)[window], error, **(LOOKS[name] | {"linewidth": 1.2}))
+        left.plot(times(501)[window], error, **(STYLES[name] | {"linewidth": 1.2}))
         if name == "ekf":
             edges = -1.96 * spread, 1.96 * spread
             left.fill_between(times(501)[window], *edges, color=BLUE, alpha=0.15, linewidth=0)
@@ -118,7 +118,7 @@ def sigma_points(path: Path) -> Path:
     stds = np.geomspace(0.02, 0.5**0.5, 10)
     ratios = np.array([_over_the_bound(names, std) for std in stds])
     for name, ratio in zip(names, ratios.T, strict=True):
-        right.plot(stds, ratio, label=name, **LOOKS[name])
+        right.plot(stds, ratio, label=name, **STYLES[name])
     log_ticks(right.xaxis, (0.02, 0.05, 0.1, 0.2, 0.5))
     log_ticks(right.yaxis, (1, 2, 5))
     right.set_xlabel("noise of the flow, std a step [m/s]")
@@ -131,9 +131,9 @@ def smoothers(path: Path) -> Path:
     """Errors over the lag, and a gap in the measurements seen forwards and backwards."""
     model, runs = thruster_model(), held_runs()
     kinds = {
-        "ekf": ("ekf", {}, LOOKS["ekf"]),
-        "enkf, N = 20": ("enkf", {"ensemble_size": 20}, LOOKS["enkf"]),
-        "enkf, N = 200": ("enkf", {"ensemble_size": 200}, LOOKS["enkf"] | {"linestyle": "--"}),
+        "ekf": ("ekf", {}, STYLES["ekf"]),
+        "enkf, N = 20": ("enkf", {"ensemble_size": 20}, STYLES["enkf"]),
+        "enkf, N = 200": ("enkf", {"ensemble_size": 200}, STYLES["enkf"] | {"linestyle": "--"}),
     }
     lags = (0, 1, 2, 3, 5, 7, 10, 15, 20, 30, 50)
     figure = new_figure((9.6, 3.6))
@@ -174,7 +174,7 @@ def _over_the_bound(names: tuple[str, ...], std: float) -> list[float]:
     noise = PUBLISHED_NOISE | {"process_noise_cov": (0.5, std**2)}
     runs, model = held_runs(RUNS, **noise), thruster_model(**noise)
     bound = posterior_bound(model, runs.inputs)[:, FIRST_SCORED_STEP:, 1, 1].mean() ** 0.5
-    return [judged(make_filter(name, model), runs)[1] / bound for name in names]
+    return [errors_of(make_filter(name, model), runs)[1] / bound for name in names]
 
 
 def _smoothed_rmse(filter_, runs, lag: int) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from filters import InteractingMultipleModelFilter, affine_model, make_filter, run, thruster_model
 from filters.filter import Filter
-from pages.filter_runs import LOOKS, times
+from pages.filter_runs import STYLES, times
 from thruster_env.numerics.plots import PALE, new_figure, save_figure, tidy
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -68,9 +68,9 @@ def several(path: Path) -> Path:
             if filter_ is imm:
                 probabilities.append(imm.mode_probabilities(belief)[1])
         right.plot(
-            times(STEPS + 1), np.array(means)[:, 1] - states[:, 1], label=filter_.name, **LOOKS[filter_.name]
+            times(STEPS + 1), np.array(means)[:, 1] - states[:, 1], label=filter_.name, **STYLES[filter_.name]
         )
-    left.plot(times(STEPS + 1), probabilities, **LOOKS["imm"])
+    left.plot(times(STEPS + 1), probabilities, **STYLES["imm"])
     for axis in (left, right):
         axis.axvspan(
             *times(STEPS + 1)[[LOST_FROM, LOST_TO]], color=PALE, alpha=0.3, label="half of the thrust is lost"
@@ -126,8 +126,8 @@ def weighted(path: Path) -> Path:
         found = [errors(one) for one in filters]
         shown = min(3, len(filters) - 1)
         label = {"fading": "fading, a = 1.15", "h-infinity": "h-infinity, theta = 0.3"}.get(name, name)
-        left.plot(frequencies, found[shown][0], label=label, **LOOKS[name])
-        right.plot([one for _, one in found], [one.max() for one, _ in found], marker="o", ms=4, **LOOKS[name])
+        left.plot(frequencies, found[shown][0], label=label, **STYLES[name])
+        right.plot([one for _, one in found], [one.max() for one, _ in found], marker="o", ms=4, **STYLES[name])
     left.set_xscale("log")
     left.set_xlabel("frequency of the acceleration [rad/step]")
     left.set_ylabel("RMS error of the position")

@@ -16,7 +16,7 @@ from filters import (
     run,
     thruster_model,
 )
-from pages.filter_runs import LOOKS, RUNS, SEED, Runs, deviations, held_runs, judged, times
+from pages.filter_runs import RUNS, SEED, STYLES, Runs, deviations, errors_of, held_runs, times
 from pages.page import legend_below, log_ticks
 from thruster_env.numerics.plots import BLUE, DARK, MUSTARD, RUST, new_figure, save_figure, tidy
 
@@ -46,20 +46,22 @@ def adaptive(path: Path) -> Path:
     figure = new_figure((9.6, 3.6))
     left, right = figure.subplots(1, 2)
     tidy((left, right))
-    left.plot(times(501), stds, label="truth", **LOOKS["truth"])
+    left.plot(times(501), stds, label="truth", **STYLES["truth"])
     for filter_ in (VariationalBayesFilter(model=model), SageHusaFilter(model=model)):
         found = np.sqrt([_learnt_noise(filter_, runs, run_) for run_ in range(len(runs.keys))])
-        left.plot(times(501), found.mean(axis=0), label=filter_.name, **LOOKS[filter_.name])
+        left.plot(times(501), found.mean(axis=0), label=filter_.name, **STYLES[filter_.name])
         left.fill_between(
-            times(501), *np.quantile(found, (0.1, 0.9), axis=0), alpha=0.2, color=LOOKS[filter_.name]["color"]
+            times(501), *np.quantile(found, (0.1, 0.9), axis=0), alpha=0.2, color=STYLES[filter_.name]["color"]
         )
     left.set_xlabel("time [s]")
     left.set_ylabel("std of the sensor's noise [N]")
     left.legend(fontsize=8, frameon=False, loc="upper left")
     shares = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6)
     for name in ("ekf", "sage-husa", "vb", "ekf-robust"):
-        errors = [judged(make_filter(name, thruster_model()), held_runs(**outliers(share)))[1] for share in shares]
-        right.plot([100 * share for share in shares], errors, label=name, **LOOKS[name])
+        errors = [
+            errors_of(make_filter(name, thruster_model()), held_runs(**outliers(share)))[1] for share in shares
+        ]
+        right.plot([100 * share for share in shares], errors, label=name, **STYLES[name])
     right.set_xlabel("measurements that are off by 10 N [%]")
     right.set_ylabel(FLOW_RMSE)
     right.set_ylim(0.04, 0.12)
@@ -76,8 +78,8 @@ def baselines(path: Path) -> Path:
         runs, window = held_runs(1, ambient_velocity=flow), slice(100, 251)
         for name in ("inversion", "low-pass", "open-loop", "ekf"):
             estimate = run(make_filter(name, thruster_model()), *runs.given).means[0, window, 1]
-            axis.plot(times(501)[window], estimate, label=name, **LOOKS[name])
-        axis.plot(times(501)[window], runs.states[0, window, 1], label="truth", **LOOKS["truth"])
+            axis.plot(times(501)[window], estimate, label=name, **STYLES[name])
+        axis.plot(times(501)[window], runs.states[0, window, 1], label="truth", **STYLES["truth"])
         axis.set_title(f"ambient flow {flow:g} m/s, believed to be 0", fontsize=10)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel(FLOW)
@@ -103,7 +105,7 @@ def augmented(path: Path) -> Path:
         left.fill_between(
             times(501), mean - 1.96 * spread, mean + 1.96 * spread, color=colour, alpha=0.15, linewidth=0
         )
-    left.axhline(0.6, label="truth", **LOOKS["truth"])
+    left.axhline(0.6, label="truth", **STYLES["truth"])
     left.set_xlabel("time [s]")
     left.set_ylabel("ambient flow and 95 % band [m/s]")
     left.legend(fontsize=8, frameon=False, loc="lower right")
@@ -113,7 +115,7 @@ def augmented(path: Path) -> Path:
         runs = held_runs(20, ambient_velocity=flow)
         models = (thruster_model(), joint, thruster_model(ambient_velocity=flow))
         for values, model in zip(errors.values(), models, strict=True):
-            values.append(judged(ExtendedKalmanFilter(model=model), runs)[1])
+            values.append(errors_of(ExtendedKalmanFilter(model=model), runs)[1])
     for (label, values), look in zip(errors.items(), ((RUST, "--"), (BLUE, "-"), (DARK, ":")), strict=True):
         right.plot(flows, values, color=look[0], linestyle=look[1], label=f"flow {label}")
     right.set_ylim(bottom=0.03)
@@ -153,8 +155,8 @@ def varying(path: Path) -> Path:
         filled = runs._replace(measurements=_held(runs.measurements))
         given = ((ExtendedKalmanFilter, runs), (ExtendedKalmanFilter, filled))
         for values, (kind, data) in zip(errors.values(), given, strict=False):
-            values.append(judged(kind(model=model), data)[1])
-        errors["open loop"].append(judged(make_filter("open-loop", model), runs)[1])
+            values.append(errors_of(kind(model=model), data)[1])
+        errors["open loop"].append(errors_of(make_filter("open-loop", model), runs)[1])
     looks = ((BLUE, "-"), (RUST, "--"), (MUSTARD, ":"))
     for (label, values), (colour, dashes) in zip(errors.items(), looks, strict=True):
         right.plot([100 * share for share in shares], values, color=colour, linestyle=dashes, label=label)

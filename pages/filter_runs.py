@@ -9,7 +9,7 @@ import numpy as np
 from filters import Estimates, run
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
-from filters.looks import TRUTH, look
+from filters.plot_styles import TRUTH, plot_style
 from filters.registry import FILTERS
 from thruster_env.numerics.plots import MUSTARD
 from thruster_env.numerics.streams import episode_keys, filter_keys
@@ -22,7 +22,7 @@ SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
 PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}
 
 # Those of the page alone beside those that filters have everywhere.
-LOOKS = {name: look(name) for name in FILTERS} | {
+STYLES = {name: plot_style(name) for name in FILTERS} | {
     "truth": TRUTH,
     "scheduled": {"color": MUSTARD, "linestyle": "-."},
 }
@@ -70,7 +70,7 @@ def nees(estimates: Estimates, runs: Runs) -> float:
     return float(there.mean()) if there.size else float("nan")
 
 
-def judged(filter_: Filter, runs: Runs) -> tuple[float, float, float]:
+def errors_of(filter_: Filter, runs: Runs) -> tuple[float, float, float]:
     """RMSE of omega_m [rad/s], RMSE of U_a [m/s] and mean NEES of a filter."""
     estimates = run(filter_, *runs.given)
     return (*rmse(estimates, runs), nees(estimates, runs))

@@ -8,7 +8,7 @@ import numpy as np
 
 from filters import ParticleFilter, make_filter, run, thruster_model
 from filters.ensembles.recording import record_members
-from pages.filter_runs import LOOKS, PUBLISHED_NOISE, Runs, held_runs, judged, runs_of, times
+from pages.filter_runs import PUBLISHED_NOISE, STYLES, Runs, errors_of, held_runs, runs_of, times
 from pages.page import log_ticks
 from thruster_env.numerics.plots import DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
@@ -30,18 +30,18 @@ def ensembles(path: Path) -> Path:
     axes = figure.subplots(1, 3)
     tidy(axes)
     for name in ("enkf", "etkf", "denkf", "enkf-n"):
-        results = [judged(make_filter(name, model, ensemble_size=size), runs) for size in sizes]
+        results = [errors_of(make_filter(name, model, ensemble_size=size), runs) for size in sizes]
         for axis, values in zip(axes, list(zip(*results, strict=True))[1:], strict=False):
-            axis.plot(sizes, values, label=name, **LOOKS[name])
-    _, error, _ = judged(make_filter("ekf", model), runs)
-    axes[0].axhline(error, label="ekf", **LOOKS["ekf"])
+            axis.plot(sizes, values, label=name, **STYLES[name])
+    _, error, _ = errors_of(make_filter("ekf", model), runs)
+    axes[0].axhline(error, label="ekf", **STYLES["ekf"])
     axes[1].axhline(2.0, color=DARK, linestyle=":", label="2 is right")
     controls = {
         "inflation": ((1.0, 1.02, 1.05, 1.1, 1.2), RUST, "o-"),
         "relaxation": ((0.0, 0.25, 0.5, 0.75, 0.9), DARK, "s--"),
     }
     for control, (values, colour, marks) in controls.items():
-        points = [judged(make_filter("enkf", model, ensemble_size=8, **{control: v}), runs)[1:] for v in values]
+        points = [errors_of(make_filter("enkf", model, ensemble_size=8, **{control: v}), runs)[1:] for v in values]
         axes[2].plot(*zip(*points, strict=True), marks, color=colour, markersize=4, linewidth=1.2, label=control)
         for value, (x, y) in zip(values, points, strict=True):
             place, side = ((5, 3), "left") if control == "inflation" else ((-6, -3), "right")
@@ -76,8 +76,8 @@ def modes(path: Path) -> Path:
     cells = (*(np.append(between, between[-1] + 0.01) - 0.005,), edges)
     left.pcolormesh(*cells, np.sqrt(density.T), cmap="Greys", rasterized=True)
     looks = {
-        "ekf": LOOKS["ekf"],
-        "pf": LOOKS["pf"],
+        "ekf": STYLES["ekf"],
+        "pf": STYLES["pf"],
         "truth": {"color": RUST, "linestyle": "none", "marker": "o", "markersize": 3},
     }
     for name in looks:
@@ -91,11 +91,11 @@ def modes(path: Path) -> Path:
     runs, model = held_runs(20, **PUBLISHED_NOISE), thruster_model(**PUBLISHED_NOISE)
     sizes = (20, 50, 100, 200, 500, 1000, 2000)
     for name in ("pf", "enkf", "ienkf"):
-        errors = [judged(make_filter(name, model, ensemble_size=size), runs)[1] for size in sizes]
-        right.plot(sizes, errors, label=name, **LOOKS[name])
+        errors = [errors_of(make_filter(name, model, ensemble_size=size), runs)[1] for size in sizes]
+        right.plot(sizes, errors, label=name, **STYLES[name])
     for name in ("ekf", "gsf"):
-        look = LOOKS[name] | {"linestyle": ":"}
-        right.axhline(judged(make_filter(name, model), runs)[1], label=name, **look)
+        look = STYLES[name] | {"linestyle": ":"}
+        right.axhline(errors_of(make_filter(name, model), runs)[1], label=name, **look)
     log_ticks(right.xaxis, (20, 50, 100, 200, 500, 1000, 2000))
     right.set_ylim(0.15, 0.56)
     right.set_title("published noise, thrust measured", fontsize=10)

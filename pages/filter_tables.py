@@ -13,7 +13,7 @@ from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_fil
 from filters.filter import Filter
 from filters.registry import tunable_numbers
 from pages.filter_noise import LOUD, outliers
-from pages.filter_runs import PUBLISHED_NOISE, Runs, held_runs, judged
+from pages.filter_runs import PUBLISHED_NOISE, Runs, errors_of, held_runs
 from pages.filter_sampled import SIGNLESS, signless_runs
 from pages.page import digits, table
 from thruster_env.numerics.compiled import interpreted
@@ -128,7 +128,7 @@ def advice() -> str:
     for situation in situations():
         runs = situation.runs()
         for place, (label, filter_) in enumerate(situation.filters.items()):
-            motor, flow, squares = judged(filter_, runs)
+            motor, flow, squares = errors_of(filter_, runs)
             honesty = "" if np.isnan(squares) else digits(squares) if squares < 1000 else "> 1000"
             rows.append(["" if place else situation.name, label, digits(motor), digits(flow), honesty])
     return table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)

@@ -113,7 +113,7 @@ def numbers() -> str:
     """The prediction as programs: its values, and their derivatives."""
     made, memory = stages()
     both = as_programs(made[0], memory.length, MOST)
-    texts = ("\n".join(_shown(one)) for one in (both.values, both.slopes))
+    texts = ("\n".join(_lines(one)) for one in (both.values, both.slopes))
     return block(
         "\n\n".join(f"# {title}\n{text}" for title, text in zip(("values", "slopes"), texts, strict=True))
     )
@@ -125,7 +125,7 @@ def program() -> str:
     memory = RowMemory(model.shape, extended.ExtendedKalmanFilter.page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     advanced = kernels.stages_of(extended.ExtendedKalmanFilter.page, memory, equations)[2]
-    return block("\n".join(_shown(as_programs(advanced, 0, MOST).values)))
+    return block("\n".join(_lines(as_programs(advanced, 0, MOST).values)))
 
 
 def members() -> str:
@@ -142,7 +142,7 @@ def loops() -> str:
     update = as_programs(stages_of_members(kind.page, memory, equations)["analyse"], 0, MOST).values
     ordered = [*(one for _, one in update.reads), *update.works]
     names = {one.place: f"t{k}" for k, one in enumerate(ordered)}
-    texts = dict(line.split(" = ", 1) for line in _shown(update) if line.startswith("t"))
+    texts = dict(line.split(" = ", 1) for line in _lines(update) if line.startswith("t"))
     parts = cut(update, model.n)
     lines = [f"{names[one.place]} = {place}" for place, one in parts.reads]
     for turn in parts.turns:
@@ -158,7 +158,7 @@ def loops() -> str:
     return block("\n".join(lines), "text")
 
 
-def _shown(program: Program) -> list[str]:
+def _lines(program: Program) -> list[str]:
     """A program's lines, with constants in decimal digits."""
     lines = []
     for line in program.text:

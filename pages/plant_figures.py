@@ -32,7 +32,7 @@ from thruster_env.simulation import simulate
 from thruster_env.task import Task
 
 # Presets are told apart by colour and by dashes; open_bladed hardly turns and is left out of the pictures.
-LOOKS = {
+STYLES = {
     "tunnel": (BLUE, "-"),
     "tunnel_physical": (SKY, "--"),
     "open_bladed_corrected": (RUST, "-."),
@@ -48,7 +48,7 @@ def responses(path: Path) -> Path:
     figure = new_figure((9.6, 6.0))
     axes = figure.subplots(3, 2, sharex=True, sharey="row", height_ratios=(2, 2, 3))
     tidy(axes.flat)
-    for name, (colour, dashes) in LOOKS.items():
+    for name, (colour, dashes) in STYLES.items():
         top = FULL_VOLTAGE[name]
         plant = make_plant(name, dt=dt, max_voltage=top, measurement_noise_cov=0.0, **QUIET)
         settled = plant._replace(initial_mean=np.array(steady_state(plant.parameters, top / 2)[:2]))
@@ -75,7 +75,7 @@ def steady_states(path: Path) -> Path:
     figure = new_figure((9.6, 3.6))
     axes = figure.subplots(1, 3)
     tidy(axes)
-    for place, (name, (colour, dashes)) in enumerate(LOOKS.items()):
+    for place, (name, (colour, dashes)) in enumerate(STYLES.items()):
         p = PRESETS[name]
         voltages = np.linspace(-1, 1, 81) * FULL_VOLTAGE[name]
         points = np.array([steady_state(p, voltage) for voltage in voltages])
@@ -94,10 +94,10 @@ def steady_states(path: Path) -> Path:
     axes[2].set_yscale("log")
     axes[2].minorticks_off()
     axes[2].set_yticks([0.1, 0.2, 0.5, 1, 2], ["0.1", "0.2", "0.5", "1", "2"])
-    axes[2].set_xlim(-0.5, len(LOOKS) - 0.5)
+    axes[2].set_xlim(-0.5, len(STYLES) - 0.5)
     axes[2].set_ylim(0.1, 8)
     axes[2].set_ylabel("thrust coefficient $K_T$ [-]")
-    axes[2].set_xticks(range(len(LOOKS)), [name.replace("_", "\n") for name in LOOKS], fontsize=8)
+    axes[2].set_xticks(range(len(STYLES)), [name.replace("_", "\n") for name in STYLES], fontsize=8)
     axes[2].grid(axis="x", visible=False)
     axes[2].legend(fontsize=8, frameon=False, loc="upper left")
     legend_below(figure, axes[0])
@@ -213,12 +213,12 @@ def run(plant: Plant, voltages: np.ndarray, task: Task | None = None, seed: int 
     return np.array(record)
 
 
-def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, shown: tuple[int, str]) -> Path:
-    """One column a plant: the row `shown` above, the thrust below, each beside that of the plain plant."""
+def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, first_row: tuple[int, str]) -> Path:
+    """One column a plant: the row `first_row` above, the thrust below, each beside that of the plain plant."""
     figure = new_figure((9.6, 4.6))
     axes = figure.subplots(2, 4, sharex=True, sharey="row")
     tidy(axes.flat)
-    row, label = shown
+    row, label = first_row
     time = 0.01 * np.arange(1, len(voltages) + 1)
     undisturbed = run(plain, voltages)[1:]
     for column, (title, plant) in zip(axes.T, plants.items(), strict=True):

@@ -40,12 +40,12 @@ FILTERPY = "filters.estimators.filterpy:unscented"
 
 def network_mismatch() -> str:
     """A wrong model: filters that believe in it, and a network that never saw it."""
-    return _beside_network("mismatch")
+    return _problem_of_network("mismatch")
 
 
 def network_outliers() -> str:
     """Outliers."""
-    return _beside_network("outliers")
+    return _problem_of_network("outliers")
 
 
 def network_elsewhere() -> str:
@@ -71,7 +71,7 @@ def filterpy() -> str:
     return "\n".join(lines)
 
 
-def _beside_network(name: str) -> str:
+def _problem_of_network(name: str) -> str:
     """The oracle EKF first, then the tuned filters and the network that has learnt from this scenario."""
     tuned = [
         Contender(f"{kind}, tuned", lambda problem, kind=kind: _tuned(kind, name)) for kind in ("ekf", "enkf")

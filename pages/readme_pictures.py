@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def tuned(path: Path, tuning: Tuning) -> Path:
     """The flow velocity, which nothing measures, on a held-out run: estimate and error before and after tuning."""
     scenario = tuning.scenario
-    data, unit = scenario.data(tuning.proof.seeds[:1]), scenario.model().states[FLOW]
+    data, unit = scenario.data(tuning.comparison.seeds[:1]), scenario.model().states[FLOW]
     time = scenario.dt * np.arange(data.states.shape[1])
     figure = new_figure((10.8, 4.4))
     axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(3, 2))

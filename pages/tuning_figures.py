@@ -94,12 +94,12 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
         scenario = find_scenario(name)
         for kind in FILTERS:
             result = studied(kind, scenario, trials=trials)
-            proof = evaluate_held_out(result.choice, scenario, SEED)
-            found = proof.ratios
+            comparison = evaluate_held_out(result.choice, scenario, SEED)
+            found = comparison.ratios
             ratios = [_about(found[one]) if one in found else "none" for one in (SCALED, RULE, ORACLE)]
             ratios.append(f"{result.choice.numbers['ensemble_size']}" if result.sizes else "")
-            nees = proof.tuned.nees.value
-            honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{proof.tuned.nis.value:.2f}"
+            nees = comparison.tuned.nees.value
+            honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{comparison.tuned.nis.value:.2f}"
             price = f"{100 * (result.best_value / result.free_value - 1):.1f} %"
             rows.append([f"`{name}`" if kind == FILTERS[0] else "", f"`{kind}`", *ratios, *honesty, price])
     return table(COLUMNS, rows)
@@ -111,14 +111,14 @@ def recovered() -> str:
     for name in ("published_tunnel", "published_open_bladed"):
         scenario = find_scenario(name)
         bad = bad_start("kf", scenario)
-        proof = evaluate_held_out(studied("kf", scenario, bad).choice, scenario, SEED)
-        started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
-        ratios = (score_ratio(one, proof.true) for one in (started, proof.tuned))
+        comparison = evaluate_held_out(studied("kf", scenario, bad).choice, scenario, SEED)
+        started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
+        ratios = (score_ratio(one, comparison.true) for one in (started, comparison.tuned))
         rows.append([f"`{name}`", *(_about(ratio, 4) for ratio in ratios)])
     return table(["scenario", "start over oracle", "tuned over oracle"], rows)
 
 
-def likeliest() -> str:
+def maximum_likelihood() -> str:
     """The maximum of the likelihood beside the true numbers."""
     scenario = find_scenario("nominal")
     found = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
@@ -142,9 +142,9 @@ def aims() -> str:
 
 
 def _proved(what: str, choice: Choice, scenario: Scenario, names=(), identified=()) -> list[str]:
-    proof = evaluate_held_out(choice, scenario, SEED)
+    comparison = evaluate_held_out(choice, scenario, SEED)
     loose = ", ".join(name for name, known in zip(names, identified, strict=True) if not known)
-    ratio, tuned = proof.ratios[SCALED], proof.tuned
+    ratio, tuned = comparison.ratios[SCALED], comparison.tuned
     return [what, _about(ratio), f"{tuned.nees.value:.3g}", f"{tuned.nis.value:.3g}", loose]
 
 
@@ -153,7 +153,9 @@ def _about(value: Interval, digits: int = 3) -> str:
 
 
 FIGURES: dict[str, Callable[[Path], Path]] = {"tuning_ridge.png": ridge}
-TABLES: dict[str, Callable[[], str]] = {made.__name__: made for made in (earned, recovered, likeliest, aims)}
+TABLES: dict[str, Callable[[], str]] = {
+    made.__name__: made for made in (earned, recovered, maximum_likelihood, aims)
+}
 TABLES |= RECOVERY_TABLES | MASSES_TABLES
 
 

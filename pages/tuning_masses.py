@@ -59,11 +59,11 @@ def many() -> str:
         ended = tune_by_gradient("kf", problem, data, [1.0], "score", options)
         found[f"gradient of the score, {name} Q and R, {len(ended.free)} numbers"] = ended.choice
     for name, choice in found.items():
-        proof = evaluate_held_out(choice, problem, plan.seed)
+        comparison = evaluate_held_out(choice, problem, plan.seed)
         if not rows:
-            ratio = score_ratio(proof.evaluations[NOISE], proof.evaluations[GIVEN])
+            ratio = score_ratio(comparison.evaluations[NOISE], comparison.evaluations[GIVEN])
             rows.append(["noise estimation", f"{ratio.value:.2f}"])
-        rows.append([name, f"{proof.ratios[GIVEN].value:.2f}"])
+        rows.append([name, f"{comparison.ratios[GIVEN].value:.2f}"])
     return table(["", "score over the given one"], rows)
 
 

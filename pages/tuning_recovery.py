@@ -56,10 +56,10 @@ def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS)
         plan = Plan(kind, (scenario,), seed)
         study = open_study("page", plan, None, bad_start(kind, scenario))
         choice = run_study(study, plan, trials).or_interrupted().choice
-        proof = evaluate_held_out(choice, scenario, seed)
+        comparison = evaluate_held_out(choice, scenario, seed)
         known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
         ratios = known.tuned / [true[number] for number in known.names]
-        found.append(Found(ratios, score_ratio(proof.tuned, proof.true), known))
+        found.append(Found(ratios, score_ratio(comparison.tuned, comparison.true), known))
     return found
 
 

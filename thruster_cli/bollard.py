@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from thruster_cli.output import announce_compilation, check_targets, emit, table
-from thruster_env.logged import Shown
+from thruster_env.logged import Recorder
 from thruster_env.parameters import ThrusterParameters, preset_parameters
 from thruster_env.plant import make_plant
 from thruster_env.preset_file import PresetFile, is_file, write_preset
@@ -115,7 +115,7 @@ def from_step(
         raise ValueError(f"a step response must have a step of the voltage, but {path} has none")
     largest = float(np.abs(log.inputs).max())
     plant = make_plant(parameters, log.dt, max_voltage=max(largest, 1.0), sensors=["speed"])
-    family = ThrusterFamily([log], plant, Shown(), (*MOTOR, "added_mass"))
+    family = ThrusterFamily([log], plant, Recorder(), (*MOTOR, "added_mass"))
 
     def values_of(motor_rate: float, **values: float) -> dict[str, float]:
         return {**{name: motor_rate * getattr(parameters, name) for name in MOTOR}, **values}

@@ -28,20 +28,20 @@ def check_request(path: Path, filter_: Filter) -> None:
 
 
 def check_covariance(
-    choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path
+    choice: Choice, name: str, scenario: Problem, comparison: Comparison, path: Path
 ) -> tuple[list[str], dict]:
     """Draw the checks of a choice, called `name`; return the text to print and the numbers behind it."""
-    report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds), scenario.dt)
+    report = check_consistency(choice.filter(scenario), scenario.data(comparison.seeds), scenario.dt)
     said, against, ratios = sentences(report), {}, None
-    if report.has_truth and proof.true is not None:
-        ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares, proof.tuned.weights)
+    if report.has_truth and comparison.true is not None:
+        ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
         against[f"{name}\nover {ORACLE}"] = ratios
         named = list(zip(report.states, ratios, strict=True))
         said += [comparison_sentence(state, name, ORACLE, ratio) for state, ratio in named[:MOST_STATES]]
         if len(named) > MOST_STATES:
             said.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
-    consistency_figure(path, report, title, against, proof.tuned.scored or None)
+    consistency_figure(path, report, title, against, comparison.tuned.scored or None)
     data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
     return [f"Is the {name} filter consistent?", *said, f"Picture: {path}"], data
 

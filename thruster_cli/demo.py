@@ -81,7 +81,7 @@ def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
 
 def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) -> list[str | Table]:
     """What was tuned on what, the errors before and after, and one sentence on the gain."""
-    found, seeds = tuning.result, len(tuning.proof.seeds)
+    found, seeds = tuning.result, len(tuning.comparison.seeds)
     stopped = ", interrupted," if found.interrupted else ""
     return [
         f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {found.finished} trials{stopped} on "
@@ -97,7 +97,7 @@ def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) 
 
 def advice_on_type(tuning: Tuning, best: Tuning) -> str:
     """What the choice of the filter type is worth."""
-    ratio = score_ratio(best.proof.tuned, tuning.proof.tuned)
+    ratio = score_ratio(best.comparison.tuned, tuning.comparison.tuned)
     gain = f"{100 * (1 - ratio.value):.0f} % below" if ratio.high < 1 else "no better than"
     count, name = len(best.plan.filter_types), best.result.choice.name
     return (
@@ -108,22 +108,22 @@ def advice_on_type(tuning: Tuning, best: Tuning) -> str:
 
 def error_table(tuning: Tuning, best: Tuning | None) -> Table:
     """A row a filter: its R, the RMSE of both states and how far above the bound it lies, mean NEES and NIS."""
-    proof, scenario = tuning.proof, tuning.scenario
+    comparison, scenario = tuning.comparison, tuning.scenario
     choices = {TUNED: tuning.result.choice, **baselines(FILTER, scenario, tuning.plan.seed)}
     rows = []
-    evaluations, others = dict(proof.evaluations), {*proof.evaluations} - {TUNED}
+    evaluations, others = dict(comparison.evaluations), {*comparison.evaluations} - {TUNED}
     if best is not None:
         name = f"auto: {best.result.choice.name}"
-        evaluations[name], choices[name] = best.proof.tuned, best.result.choice
+        evaluations[name], choices[name] = best.comparison.tuned, best.result.choice
     for name, found in evaluations.items():
         if name in others and same_filter(choices[name], choices[TUNED]):
             continue  # its numbers stand in the row "tuned"
-        pairs = zip(found.rmse, above_bound(found, proof.bound), strict=True)
+        pairs = zip(found.rmse, above_bound(found, comparison.bound), strict=True)
         errors = [cell for rmse, above in pairs for cell in (f"{rmse.value:#.3g}", f"{above:+.0f} %")]
         ((variance,),) = choices[name].filter(scenario).model.measurement_noise_cov
         rows.append([name, f"{variance:.3g}", *errors, *consistency_cells(found)])
-    speed, flow = (f"{limit:#.3g}" for limit in proof.bound)
-    rows.append(["bound", "", speed, "", flow, "", str(len(proof.bound)), "1"])
+    speed, flow = (f"{limit:#.3g}" for limit in comparison.bound)
+    rows.append(["bound", "", speed, "", flow, "", str(len(comparison.bound)), "1"])
     heads = [
         head
         for state in scenario.model().states
@@ -136,10 +136,12 @@ def error_table(tuning: Tuning, best: Tuning | None) -> Table:
 
 def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return a caption for each file."""
-    proof, scenario = tuning.proof, tuning.scenario
-    label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
+    comparison, scenario = tuning.comparison, tuning.scenario
+    label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(comparison.seeds[:1])
     run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
-    errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
+    errors = comparison_figure(
+        out / "rmse.png", comparison, f"{label}: RMSE on {len(comparison.seeds)} held-out seeds"
+    )
     search = history_figure(
         out / "history.png", tuning.result.trials, f"Study of {label}", score_label((scenario,))
     )
@@ -160,7 +162,7 @@ def before_and_after(tuning: Tuning) -> dict[str, Filter]:
 
 def best_baseline(tuning: Tuning) -> str:
     """The baseline with the lowest score among those that need no truth."""
-    found = tuning.proof.evaluations
+    found = tuning.comparison.evaluations
     return min(
         (name for name in found if name not in (TUNED, NOISE, ORACLE)), key=lambda name: found[name].score.value
     )

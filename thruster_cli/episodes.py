@@ -19,7 +19,7 @@ from thruster_env.control.controllers import PIController
 from thruster_env.numerics.checks import at_least, one_of, within
 from thruster_env.numerics.streams import episode_keys
 from thruster_env.plants.logs.log import Log
-from thruster_env.plants.rendering.film import OnStep, Played, steps_a_frame, write_film
+from thruster_env.plants.rendering.video import OnStep, Played, steps_a_frame, write_video
 from thruster_env.rendering.env import renderer_of
 from thruster_env.rendering.history import Moment, Overlay
 from tuning.problems.excitation import EXCITATIONS, excitation_of
@@ -31,16 +31,16 @@ ENV = "BowThrusterTracking-v0"
 MOST_STEPS = 100_000
 
 
-def play_pi(film: Path | None, seed: int, on_step: OnStep, **arguments) -> Played:
+def play_pi(video: Path | None, seed: int, on_step: OnStep, **arguments) -> Played:
     """One episode of the env that follows a reference, by the PI controller on its measured thrust.
 
     Args:
-        film: an .mp4 or .gif file; None for a window.
+        video: an .mp4 or .gif file; None for a window.
         seed: of the episode.
         on_step: called after each step.
         **arguments: of `estimated_env`.
     """
-    with estimated_env(film, **arguments) as env:
+    with estimated_env(video, **arguments) as env:
         controller, state, ended = PIController.for_env(env), None, True
 
         def act(observation, step: int) -> np.ndarray:
@@ -49,16 +49,16 @@ def play_pi(film: Path | None, seed: int, on_step: OnStep, **arguments) -> Playe
             ended = False
             return action
 
-        return _shown(env, act, film, seed, on_step)
+        return _played(env, act, video, seed, on_step)
 
 
 def play_voltages(
-    film: Path | None, seed: int, on_step: OnStep, given: float | str, steps: int, **arguments
+    video: Path | None, seed: int, on_step: OnStep, given: float | str, steps: int, **arguments
 ) -> Played:
     """A thruster under a constant voltage [V], or a sequence by the name of an excitation."""
     if not isinstance(given, str):
         warn_beyond(arguments.get("preset", "tunnel"), given)
-    with estimated_env(film, steps=steps, **arguments) as env:
+    with estimated_env(video, steps=steps, **arguments) as env:
         thruster: Any = env.unwrapped
         plant = thruster.plant
         if isinstance(given, str):
@@ -68,12 +68,12 @@ def play_voltages(
             voltages = np.full(steps, within("voltage", given, plant.max_voltage))
         moment = thruster.moment_of  # there is a reference, but nobody follows it
         thruster.moment_of = lambda report: moment(report)._replace(reference=None)
-        return _shown(env, lambda observation, step: voltages[[step]], film, seed, on_step)
+        return _played(env, lambda observation, step: voltages[[step]], video, seed, on_step)
 
 
 @contextmanager
 def estimated_env(
-    film: Path | None,
+    video: Path | None,
     preset: str = "tunnel",
     steps: int = 500,
     filter: str | None = None,
@@ -83,7 +83,7 @@ def estimated_env(
     """A thruster drawn with a filter's estimate.
 
     Args:
-        film: None for a window.
+        video: None for a window.
         preset: of the thruster.
         steps: of an episode.
         filter: by name; "ekf" if None and no tuned file.
@@ -91,7 +91,7 @@ def estimated_env(
         size: of pictures, (width, height) [px]; None for the env's own.
     """
     at_least("steps", steps, 1, MOST_STEPS)
-    mode = "human" if film is None else "rgb_array"
+    mode = "human" if video is None else "rgb_array"
     env = gym.make(ENV, preset=preset, render_mode=mode, render_size=size, max_episode_steps=steps)
     try:
         given = {"filter": filter} if tuned is None else {"tuned": str(tuned)}
@@ -100,8 +100,8 @@ def estimated_env(
         env.close()
 
 
-def _shown(env, act, film: Path | None, seed: int, on_step: OnStep) -> Played:
-    every, dt = steps_a_frame(film, env.unwrapped.plant.dt), env.unwrapped.plant.dt
+def _played(env, act, video: Path | None, seed: int, on_step: OnStep) -> Played:
+    every, dt = steps_a_frame(video, env.unwrapped.plant.dt), env.unwrapped.plant.dt
     count = env.spec.max_episode_steps
     observation, _ = env.reset(seed=seed)
     frames = [env.render()] if every else []
@@ -112,13 +112,13 @@ def _shown(env, act, film: Path | None, seed: int, on_step: OnStep) -> Played:
         if every and steps % every == 0:
             frames.append(env.render())
         on_step(steps, count)
-    if film is not None:
-        write_film(film, frames, 1 / (dt * every))
+    if video is not None:
+        write_video(video, frames, 1 / (dt * every))
     return Played(steps, total, steps * dt)
 
 
 def play_log(
-    film: Path | None,
+    video: Path | None,
     log: Log,
     offer,
     on_step: OnStep,
@@ -131,7 +131,7 @@ def play_log(
     """A recorded run of a thruster: its voltage and measurements, what else was recorded, and a filter's estimate.
 
     Args:
-        film: an .mp4 or .gif file; None for a window.
+        video: an .mp4 or .gif file; None for a window.
         log: of the thruster.
         offer: what offers its model and has its `plant`.
         on_step: called after each row.
@@ -141,22 +141,22 @@ def play_log(
         seed: of the filter's random numbers.
     """
     found = estimate_log(log, filter, offer, tuned=tuned, seed=seed)
-    every = steps_a_frame(film, log.dt)
+    every = steps_a_frame(video, log.dt)
     largest = float(np.abs(log.inputs).max())
     plant = offer.plant._replace(max_voltage=max(offer.plant.max_voltage, largest), dt=log.dt)
-    mode = "human" if film is None else "rgb_array"
+    mode = "human" if video is None else "rgb_array"
     renderer = renderer_of(plant, mode, max(1, round(1 / log.dt)), size)
     frames: list[np.ndarray] = []
     try:
         for row, (moment, overlay) in enumerate(zip(moments(log), overlays(found), strict=True)):
             renderer.add(moment, overlay)
-            if film is None or row % every == 0:
+            if video is None or row % every == 0:
                 frame = renderer.draw()
                 if frame is not None:  # in no window
                     frames.append(frame)
             on_step(row, log.steps)
-        if film is not None:
-            write_film(film, frames, 1 / (log.dt * every))
+        if video is not None:
+            write_video(video, frames, 1 / (log.dt * every))
     finally:
         renderer.close()
     return Played(log.steps, 0.0, log.steps * log.dt)

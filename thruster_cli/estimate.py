@@ -136,7 +136,7 @@ def command(
 
         log_figure(plot, found, f"{_title(found)} on {log.name}", alarms)
     files = [str(path) for path in (out, plot) if path is not None]
-    shown = [*_shown(found, told), *_alarms(found, alarms), *[f"wrote {path}" for path in files]]
+    shown = [*_report(found, told), *_alarms(found, alarms), *[f"wrote {path}" for path in files]]
     emit(shown, {**_as_json(found, told), **_alarms_as_json(found, alarms), "files": files}, json)
 
 
@@ -144,7 +144,7 @@ def _title(found: LogEstimate) -> str:
     return f"{found.filter.name}, smoothed," if found.smoothed else found.filter.name
 
 
-def _shown(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
+def _report(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
     log = found.log
     how = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
     about = f"{log.steps + 1} rows, dt {log.dt:g} s{how}"

@@ -28,7 +28,7 @@ from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from tuning.api.evaluate import subject_of
 from tuning.api.held_out import on_held_out
-from tuning.api.own_numbers import DEFAULT_FILTER
+from tuning.api.user_choice import DEFAULT_FILTER
 from tuning.evaluation.baselines import GIVEN, TUNED, given
 from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
@@ -105,15 +105,16 @@ def command(
         check_request(consistency, choice.filter(chosen))
     announce_compilation()
     found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
-    proof, data = found.proof, found.to_dict()
-    where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
+    comparison, data = found.comparison, found.to_dict()
+    seeds_used = f"{chosen.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
+    where = f"held-out {seeds_used}, scenario {chosen.name}"
     shown: list[RenderableType] = [choice_table(found.choices, chosen)]
-    shown.append(comparison_table(found.evaluations, proof.bound, where, chosen.scale_about))
+    shown.append(comparison_table(found.evaluations, comparison.bound, where, chosen.scale_about))
     shown += found.sentences()
     if consistency is not None:
-        name = TUNED if tuned is not None else GIVEN if own else proof.rule
+        name = TUNED if tuned is not None else GIVEN if own else comparison.rule
         with working("checking the covariance"):
-            words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
+            words, data["consistency"] = check_covariance(choice, name, chosen, comparison, consistency)
         shown += words
     emit(shown, data, json)
 

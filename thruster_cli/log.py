@@ -83,10 +83,10 @@ def command(
         from thruster_env.plants.logs.figure import findings_figure
 
         findings_figure(plot, recorded)
-    emit(_shown(recorded, plot), _as_json(recorded, plot), json)
+    emit(_report(recorded, plot), _as_json(recorded, plot), json)
 
 
-def _shown(log: Log, plot: Path | None) -> list[RenderableType]:
+def _report(log: Log, plot: Path | None) -> list[RenderableType]:
     rows = []
     for channel in log.channels:
         values = log.series(channel).values

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
@@ -25,5 +25,7 @@ def problems_of(
     if given:
         first = next(iter(given))
         option = {"sensors": "sensor", "columns": "column"}.get(first, first).replace("_", "-")
-        raise ValueError(f"--{option} must come with --log, but got --{option} {shown(given[first])} without one")
+        raise ValueError(
+            f"--{option} must come with --log, but got --{option} {short_repr(given[first])} without one"
+        )
     return tuple(of_preset(find_problem(name), preset) for name in names or [default])

@@ -24,13 +24,13 @@ from thruster_env.numerics.text_tables import table as table  # for the commands
 from thruster_env.plant import largest_known_voltage
 from thruster_env.plants.logs.recorders.registry import ENDINGS
 from thruster_env.plants.logs.table import SUFFIXES
-from thruster_env.plants.logs.write import check_not_beside, check_suffix
+from thruster_env.plants.logs.write import check_not_among, check_suffix
 
 PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
-def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
+def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
     """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
     if json_target == "-":
         sys.stdout.write(as_text(data))
@@ -38,7 +38,7 @@ def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -
     _check_json(json_target)
     if json_target is not None:  # first: there may be nobody left who reads what is printed
         write_whole(json_target, as_text(data))
-    for part in shown:
+    for part in parts:
         console.print(part)
 
 
@@ -66,7 +66,7 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
     for target in named:
         check_not_read(target, given)
     for target in named:
-        check_not_beside(target)
+        check_not_among(target)
         check_target(target)
     _check_json(json_target)
 

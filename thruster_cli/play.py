@@ -22,9 +22,9 @@ from thruster_cli.options import (
     filter_option,
 )
 from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
-from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.numerics.checks import at_least, one_of, short_repr
 from thruster_env.plants.rendered import LARGEST, SMALLEST
-from thruster_env.plants.rendering.film import Played, check_drawing
+from thruster_env.plants.rendering.video import Played, check_drawing
 from tuning.problems.seeds import held_out_seeds
 
 STEPS = 500
@@ -117,19 +117,19 @@ def command(
     if model is not None:  # then it is what is played
         given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
         _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
-        played, shown, film = _of_policy(model, out, window, seed, picture, json)
+        played, shown, video = _of_policy(model, out, window, seed, picture, json)
     else:
-        film = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
-        check_drawing(film)
-        _check_even(film, picture)
-        check_targets((film,), json, read=(log, tuned, preset))
+        video = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
+        check_drawing(video)
+        _check_even(video, picture)
+        check_targets((video,), json, read=(log, tuned, preset))
         options = {"filter": filter_name, "tuned": tuned, "size": picture}
         played, shown = _without_policy(
-            what, chosen[what], film, seed or 0, preset, steps, sensor, column, options
+            what, chosen[what], video, seed or 0, preset, steps, sensor, column, options
         )
-    data = {**played._asdict(), "video": None if film is None else str(film)}
-    if film is not None:
-        shown.append(f"Video: {film}")
+    data = {**played._asdict(), "video": None if video is None else str(video)}
+    if video is not None:
+        shown.append(f"Video: {video}")
     emit(shown, data, json)
 
 
@@ -146,7 +146,7 @@ def size_of(text: str) -> tuple[int, int]:
     """A picture's (width, height) [px] from a text such as 640x400; ValueError for any other."""
     found = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower(), re.ASCII)
     if found is None:
-        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, as 640x400, but got {shown(text)}")
+        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, as 640x400, but got {short_repr(text)}")
     width, height = (
         at_least(f"the {side} of --size", int(value), SMALLEST, LARGEST)
         for side, value in zip(("width", "height"), found.groups(), strict=True)
@@ -154,9 +154,9 @@ def size_of(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _check_even(film: Path | None, size: tuple[int, int] | None) -> None:
+def _check_even(video: Path | None, size: tuple[int, int] | None) -> None:
     """Raise ValueError for an .mp4 of an odd size, whose colours would be coded as browsers do not show them."""
-    if film is not None and film.suffix == ".mp4" and size is not None:
+    if video is not None and video.suffix == ".mp4" and size is not None:
         for side, value in zip(("width", "height"), size, strict=True):
             if value % 2:
                 raise ValueError(f"the {side} of --size must be even for an .mp4, but got {value}")
@@ -189,32 +189,32 @@ def _of_policy(
         from thruster_env.training.saved import find_saved, read_configuration
     folder = find_saved(model)
     seed = held_out_seeds(read_configuration(folder).seed, 2)[0] if seed is None else seed
-    film = None if window else out or model / f"episode-seed{seed}.mp4"
-    check_drawing(film)
-    _check_even(film, size)
-    check_targets((film,), json)
+    video = None if window else out or model / f"episode-seed{seed}.mp4"
+    check_drawing(video)
+    _check_even(video, size)
+    check_targets((video,), json)
     announce_compilation()
-    played = _drawn(lambda on_step: play(folder, film, seed, on_step, size))
+    played = _drawn(lambda on_step: play(folder, video, seed, on_step, size))
     said = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
-    return played, [said], film
+    return played, [said], video
 
 
-def _without_policy(what, given, film, seed, preset, steps, sensor, column, options) -> tuple[Played, list[str]]:
+def _without_policy(what, given, video, seed, preset, steps, sensor, column, options) -> tuple[Played, list[str]]:
     from thruster_cli.episodes import POLICIES, play_log, play_pi, play_voltages
     from tuning.logs.read import read_named
 
     announce_compilation()
     if what == "--log":
         log, offer = read_named(given, preset, None, sensor, column)
-        played = _drawn(lambda on_step: play_log(film, log, offer, on_step, seed=seed, **options))
+        played = _drawn(lambda on_step: play_log(video, log, offer, on_step, seed=seed, **options))
         return played, [f"{log.name}: {played.steps} steps, {played.seconds:.1f} s."]
     options |= {"preset": preset or "tunnel", "steps": STEPS if steps is None else steps}
     if what == "--policy":
         one_of("policy", given, POLICIES)
-        played = _drawn(lambda on_step: play_pi(film, seed, on_step, **options))
+        played = _drawn(lambda on_step: play_pi(video, seed, on_step, **options))
         said = f"return {played.total_reward:.3f} in "
     else:
-        played, said = _drawn(lambda on_step: play_voltages(film, seed, on_step, given, **options)), ""
+        played, said = _drawn(lambda on_step: play_voltages(video, seed, on_step, given, **options)), ""
     return played, [f"Episode {seed}: {said}{played.steps} steps, {played.seconds:.1f} s."]
 
 

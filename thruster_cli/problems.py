@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuning.problems.rooms import built_in
+from tuning.problems.plant_packages import built_in
 
 PROBLEMS = (
     f"{', '.join(built_in())}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a "

@@ -12,9 +12,9 @@ from thruster_cli.output import announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
-from tuning.reporting.beside import Source, write_beside
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
+from tuning.reporting.two_studies import Source, write_two_studies
 from tuning.search.study import quiet_optuna
 
 
@@ -60,6 +60,6 @@ def command(
         if len(sources) == 1:
             report = write_report(sources[0], storage, out, given)
         else:
-            report = write_beside([Source(one, storage, given) for one in sources], out)
+            report = write_two_studies([Source(one, storage, given) for one in sources], out)
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from thruster_env.numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, short_repr
 
 
 def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:
@@ -13,7 +13,7 @@ def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:
     for name, text in given.items():
         low, colon, high = text.partition(":")
         if not colon:
-            raise ValueError(f"--range must have the form NAME=LOW:HIGH, but got {shown(f'{name}={text}')}")
+            raise ValueError(f"--range must have the form NAME=LOW:HIGH, but got {short_repr(f'{name}={text}')}")
         found[name] = finite(f"low of {name}", low), finite(f"high of {name}", high)
     return found
 

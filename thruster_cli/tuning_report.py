@@ -23,7 +23,7 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.augmented import within
-from tuning.problems.rooms import built_in
+from tuning.problems.plant_packages import built_in
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
 from tuning.reporting.residual_words import residual_sentences
@@ -42,25 +42,25 @@ def report(tuning: Tuning) -> list[RenderableType]:
     """The gain of a tuning, the path of its filter and the next command; then tables and sentences."""
     result, plan = tuning.result, tuning.plan
     shown: list[RenderableType] = [*tuning.chosen]
-    for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
-        where = f"{scenario.name}: " if len(tuning.proofs) > 1 else ""
-        first, *others = gains(proof, scenario.seed_word)
+    for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
+        where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
+        first, *others = gains(comparison, scenario.seed_word)
         shown += [f"{where}{first}", *others]
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
     shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
     shown += [one for scenario in plan.scenarios for one in scenario.remarks]
-    for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
+    for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
-        evaluations = proof.evaluations
+        evaluations = comparison.evaluations
         choices = {name: found[name] for name in evaluations}
-        span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
+        span_of_seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [
             choice_table(choices, scenario),
-            comparison_table(proof.evaluations, proof.bound, where, scenario.scale_about),
+            comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
         ]
-        shown += [_consistency_sentence(proof.tuned), *residual_sentences(scenario, plan.seed)]
+        shown += [_consistency_sentence(comparison.tuned), *residual_sentences(scenario, plan.seed)]
     shown += at_ends(result.choice, plan)
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)
@@ -73,15 +73,17 @@ def report(tuning: Tuning) -> list[RenderableType]:
 def blown_up(tuning: Tuning) -> list[str]:
     """Advice on a model that diverges between samples, where no Q and R help; empty if it does not."""
     found = []
-    for scenario, proof in zip(tuning.plan.scenarios, tuning.proofs, strict=True):
-        data = scenario.data(proof.seeds)
+    for scenario, comparison in zip(tuning.plan.scenarios, tuning.comparisons, strict=True):
+        data = scenario.data(comparison.seeds)
         found.append(blow_up_on(tuning.result.choice.filter(scenario), data, scenario.dt))
     return [one for one in dict.fromkeys(found) if one]
 
 
 def way_out(tuning: Tuning) -> list[str]:
     """Advice if the tuned filter is worse than the best baseline; empty otherwise."""
-    ratios = [next(iter(proof.ratios.items())) for proof in tuning.proofs if proof.tuned.has_truth]
+    ratios = [
+        next(iter(comparison.ratios.items())) for comparison in tuning.comparisons if comparison.tuned.has_truth
+    ]
     worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
     if not worse or tuning.gradient is not None or tuning.way is not None:
         return []
@@ -142,7 +144,7 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
             "its band."
         )
     if plan.objectives == ("score",):  # which needs truth
-        found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
+        found = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
         trained, proved = apart(result.best_value, found)
         shown.append(
             f"Optimism, the bias of the score on the {word} that chose the filter: the tuned filter has "
@@ -171,7 +173,7 @@ def gave_way(result: StudyResult) -> bool:
 
 
 def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Comparison) -> list[str]:
-    ours, theirs = tuning.proof.tuned, rival.tuned
+    ours, theirs = tuning.comparison.tuned, rival.tuned
     loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
     words = []
     optimum, optima = ("maximum", "maxima") if gradient.objective == LIKELIHOOD else ("minimum", "minima")
@@ -201,8 +203,8 @@ def as_json(tuning: Tuning) -> dict:
     """The result of a tuning as plain data."""
     result, plan = tuning.result, tuning.plan
     held_out = {
-        scenario.name: {**metrics(proof), **ratios_as_json(proof)}
-        for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True)
+        scenario.name: {**metrics(comparison), **ratios_as_json(comparison)}
+        for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
     }
     data = {
         "study": tuning.study,
@@ -247,7 +249,7 @@ def as_json(tuning: Tuning) -> dict:
             "identified": dict(zip(found.names, found.identified.tolist(), strict=True)),
             "agree": found.agree,
             "seconds": found.seconds,
-            "score_over_optuna": score_ratio(tuning.proof.tuned, tuning.rival.tuned),
+            "score_over_optuna": score_ratio(tuning.comparison.tuned, tuning.rival.tuned),
         }
     return data
 
@@ -258,9 +260,9 @@ def _errors(found: GradientResult, log: bool) -> dict[str, float]:
     return {one.name: error for one, error in pairs if one.log == log}
 
 
-def ratios_as_json(proof: Comparison) -> dict:
+def ratios_as_json(comparison: Comparison) -> dict:
     """Score of the tuned filter over that of each baseline; None where there is no such baseline."""
-    ratios, rule = proof.ratios, RULE if proof.rule == RULE else GIVEN
+    ratios, rule = comparison.ratios, RULE if comparison.rule == RULE else GIVEN
     names = {"given": GIVEN, "scaled": SCALED, "untuned": rule, "noise": NOISE, "true": ORACLE}
     return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
 

@@ -34,12 +34,12 @@ def command(
     announce_compilation()
     with working(f"recomputing the metrics of {file}"):
         found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model)])
-    emit(_shown(file, found), _as_json(file, found), json)
+    emit(_report(file, found), _as_json(file, found), json)
     if not found.holds:
         sys.exit(1)
 
 
-def _shown(file: Path, found: Verification) -> list[RenderableType]:
+def _report(file: Path, found: Verification) -> list[RenderableType]:
     shown: list[RenderableType] = []
     if found.holds:
         shown.append(f"{file} holds: {found.checked} numbers are the same within {TOLERANCE:g} of their size.")

@@ -23,7 +23,7 @@ from thruster_env.dynamics import Constants, substep, substep_jacobian
 from thruster_env.effects.amplifier import outside
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.model import channel_functions, model_of_plant, thrust_of
-from thruster_env.numerics.checks import covariance, finite, positive, shown
+from thruster_env.numerics.checks import covariance, finite, positive, short_repr
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.tuples import matrix_of, tuple_of, written_out
@@ -53,7 +53,7 @@ NO_BAND = 0.0, 0.0
 LONGEST_LAGS = 700.0  # time constants in a step, beyond which nothing is left of the last reading
 
 
-class Shown(NamedTuple):
+class Recorder(NamedTuple):
     """What logs contain beside the equations of motion: dead band, bias and lag."""
 
     dead_band_low: float = 0.0  # [V]
@@ -62,7 +62,7 @@ class Shown(NamedTuple):
     lag: tuple[tuple[str, float], ...] = ()  # time constants [s] by channel
 
 
-def shown_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Mapping | None = None) -> Shown:
+def recorder_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Mapping | None = None) -> Recorder:
     """Check dead band, bias and lag of a plant's logs; ValueError states the rule and the value.
 
     Args:
@@ -80,10 +80,10 @@ def shown_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Map
     unknown = [name for name in (*(bias or {}), *(lag or {})) if name not in plant.channels]
     if unknown:
         known = ", ".join(plant.channels)
-        raise ValueError(f"bias and lag must be of measured channels, {known}, but got {shown(unknown[0])}")
+        raise ValueError(f"bias and lag must be of measured channels, {known}, but got {short_repr(unknown[0])}")
     biases = tuple((name, finite(f"bias of {name}", value)) for name, value in (bias or {}).items() if value)
     lags = ((n, positive(f"lag of {n}", value, zero_allowed=True)) for n, value in (lag or {}).items())
-    return Shown(low, high, biases, tuple((name, value) for name, value in lags if value > 0))
+    return Recorder(low, high, biases, tuple((name, value) for name, value in lags if value > 0))
 
 
 def logged_model(
@@ -117,10 +117,10 @@ def logged_model(
     base = model_of_plant(
         plant._replace(dead_band=NO_BAND), operating_voltage=operating_voltage, prior_cov_factor=prior_cov_factor
     )
-    return with_shown(base, plant, seen)
+    return with_recorder(base, plant, seen)
 
 
-def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Shown]:
+def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Recorder]:
     """A plant and the properties of its recorder, arguments of `logged_model`."""
     preset = plant_arguments.get("preset")
     recorder = read_preset(preset).recorder if preset is not None and is_file(preset) else {}
@@ -138,12 +138,12 @@ def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> t
         for name in ("bias", "lag")
     ]
     bias, lag = (of_file if given is None else given for of_file, given in zip(known, (bias, lag), strict=True))
-    return plant, shown_of(plant, dead_band, bias, lag)
+    return plant, recorder_of(plant, dead_band, bias, lag)
 
 
-def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool = False) -> StateSpaceModel:
+def with_recorder(base: StateSpaceModel, plant: Plant, seen: Recorder, *, always: bool = False) -> StateSpaceModel:
     """A plant's model with its recorder's properties; without any the model itself, unless `always`."""
-    if seen == Shown() and not always:
+    if seen == Recorder() and not always:
         return base
     channels, lags, biases = plant.channels, dict(seen.lag), dict(seen.bias)
     lagging = tuple(channel in lags for channel in channels)
@@ -185,7 +185,7 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
         prior_mean=extended(base.prior_mean),
         prior_cov=slopes @ base.prior_cov @ slopes.T,
         operating_state=extended(operating),
-        operating_points=None if seen != Shown() else base.operating_points,
+        operating_points=None if seen != Recorder() else base.operating_points,
         state_low=np.minimum(*ends),
         state_high=np.maximum(*ends),
         states=(*base.states, *lagging_states),

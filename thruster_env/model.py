@@ -155,9 +155,9 @@ def model_of_plant(
     )
     if plant.dead_band == (0.0, 0.0):
         return model
-    from thruster_env.logged import Shown, with_shown
+    from thruster_env.logged import Recorder, with_recorder
 
-    return with_shown(model, plant, Shown(*plant.dead_band))
+    return with_recorder(model, plant, Recorder(*plant.dead_band))
 
 
 def thrust_of(x, c):

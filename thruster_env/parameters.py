@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.dynamics import Constants
-from thruster_env.numerics.checks import between, meant, one_of, positive, shown, within
+from thruster_env.numerics.checks import between, meant, one_of, positive, short_repr, within
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
 ANGLES = ("as-printed", "rotor-plane", "shaft-axis")
@@ -215,7 +215,7 @@ def _parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameter
     if not isinstance(preset, str) or preset not in PRESETS:
         names = ", ".join(PRESETS)
         rule = f"preset must be one of {names}, or a file that ends in .toml"
-        raise ValueError(f"{rule}, but got {shown(preset)}{meant(preset, PRESETS)}")
+        raise ValueError(f"{rule}, but got {short_repr(preset)}{meant(preset, PRESETS)}")
     return PRESETS[preset]
 
 

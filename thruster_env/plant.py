@@ -21,7 +21,7 @@ from thruster_env.numerics.checks import (
     finite,
     one_of,
     positive,
-    shown,
+    short_repr,
     vector,
     within,
 )
@@ -165,11 +165,13 @@ def _sensors(given) -> dict[str, tuple[Effect, ...]]:
         given = ("thrust",)
     if not isinstance(given, Mapping):
         if isinstance(given, str) or not hasattr(given, "__iter__"):
-            raise ValueError(f"sensors must be a list of channels or a mapping from them, but got {shown(given)}")
+            raise ValueError(
+                f"sensors must be a list of channels or a mapping from them, but got {short_repr(given)}"
+            )
         names = list(given)
         given = {name: () for name in names if isinstance(name, str)}
         if len(given) != len(names):
-            raise ValueError(f"sensors must name each channel once, but got {shown(names)}")
+            raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
     if not given:
         raise ValueError("sensors must name at least one channel, but got none")
     if len(given) > MAX_CHANNELS:
@@ -193,7 +195,7 @@ def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[
         return mean, covariance("the cov of initial_state", initial_state["cov"], 2, largest=LARGEST_STATE**2)
     raise ValueError(
         "initial_state must be None, two numbers, {'voltage': V} or {'mean': [..], 'cov': [..]}, "
-        f"but got {shown(initial_state)}"
+        f"but got {short_repr(initial_state)}"
     )
 
 
@@ -201,5 +203,5 @@ def state(name: str, value) -> np.ndarray:
     """Return a state (2,); raise ValueError unless it is two numbers from which finite ones can follow."""
     given = vector(name, value, 2)
     if np.abs(given).max() > LARGEST_STATE:
-        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {shown(value)}")
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
     return given

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thruster_env.channels import CHANNELS
-from thruster_env.numerics.checks import finite, one_of, positive, shown
+from thruster_env.numerics.checks import finite, one_of, positive, short_repr
 from thruster_env.numerics.files import write_whole
 from thruster_env.numerics.toml import as_toml, read_toml
 from thruster_env.parameters import ThrusterParameters, checked
-from thruster_env.plants.logs.write import check_not_beside
+from thruster_env.plants.logs.write import check_not_among
 
 SECTIONS = ("thruster", "dead_band", "recorder", "identified")
 BY_CHANNEL = ("measurement_noise_cov", "bias", "lag", "clock_offset")
@@ -67,7 +67,9 @@ def preset_mapping(path: str | Path) -> dict[str, Any]:
 def _checked(content: dict) -> PresetFile:
     unknown = sorted(set(content) - set(SECTIONS))
     if unknown or not all(isinstance(part, dict) for part in content.values()):
-        raise ValueError(f"a preset file must have the tables {', '.join(SECTIONS)}, but got {shown(unknown)}")
+        raise ValueError(
+            f"a preset file must have the tables {', '.join(SECTIONS)}, but got {short_repr(unknown)}"
+        )
     thruster, band = content.get("thruster", {}), content.get("dead_band", {})
     missing = [name for name in ThrusterParameters._fields if name not in thruster]
     unknown = [name for name in thruster if name not in ThrusterParameters._fields]
@@ -77,7 +79,7 @@ def _checked(content: dict) -> PresetFile:
         off = f"{unknown[0]} is none" if unknown else f"{missing[0]} is missing"
         raise ValueError(f"thruster of a preset file must have the fields {names}, but {off}")
     if sorted(band) not in ([], ["high", "low"]):
-        raise ValueError(f"dead_band of a preset file must have low and high, but got {shown(sorted(band))}")
+        raise ValueError(f"dead_band of a preset file must have low and high, but got {short_repr(sorted(band))}")
     for name, value in (*thruster.items(), *band.items()):
         _check_no_switch(name, value)
     recorder = content.get("recorder", {})
@@ -90,22 +92,24 @@ def _check_recorder(recorder: dict) -> None:
     """Raise ValueError for what is unknown or no number, whoever reads it later."""
     unknown = sorted(set(recorder) - set(RECORDER))
     if unknown:
-        raise ValueError(f"recorder of a preset file must have {', '.join(RECORDER)}, but got {shown(unknown)}")
+        raise ValueError(
+            f"recorder of a preset file must have {', '.join(RECORDER)}, but got {short_repr(unknown)}"
+        )
     positive("dt of a preset file", recorder.get("dt", 1.0))
     finite("ambient_velocity of a preset file", recorder.get("ambient_velocity", 0.0))
     sensors = recorder.get("sensors", [])
     if not isinstance(sensors, list) or not all(isinstance(channel, str) for channel in sensors):
-        raise ValueError(f"sensors of a preset file must be a list of channels, but got {shown(sensors)}")
+        raise ValueError(f"sensors of a preset file must be a list of channels, but got {short_repr(sensors)}")
     known = [one_of("a channel of sensors", channel, tuple(CHANNELS)) for channel in sensors] or list(CHANNELS)
     for name in BY_CHANNEL:
         table = recorder.get(name, {})
         if not isinstance(table, dict):
-            raise ValueError(f"{name} of a preset file must be a table by channel, but got {shown(table)}")
+            raise ValueError(f"{name} of a preset file must be a table by channel, but got {short_repr(table)}")
         for channel, value in table.items():
             if channel not in known:
                 channels = ", ".join(known)
                 raise ValueError(
-                    f"{name} of a preset file must be of channels {channels}, but got {shown(channel)}"
+                    f"{name} of a preset file must be of channels {channels}, but got {short_repr(channel)}"
                 )
             check = finite if name in ("bias", "clock_offset") else partial(positive, zero_allowed=True)
             check(f"{name} of {channel}", value)
@@ -120,10 +124,10 @@ def checked_band(ends) -> tuple[float, float]:
     """A dead band (low, high) [V]; ValueError unless low <= 0 <= high."""
     pair = tuple(ends) if isinstance(ends, (tuple, list)) else ()
     if len(pair) != 2:
-        raise ValueError(f"dead_band must be two voltages, low and high, but got {shown(ends)}")
+        raise ValueError(f"dead_band must be two voltages, low and high, but got {short_repr(ends)}")
     low, high = (finite("dead_band", end) for end in pair)
     if not low <= 0.0 <= high:
-        raise ValueError(f"dead_band must be from low <= 0 to high >= 0, but got {shown(pair)}")
+        raise ValueError(f"dead_band must be from low <= 0 to high >= 0, but got {short_repr(pair)}")
     return low, high
 
 
@@ -140,7 +144,7 @@ def write_preset(path: str | Path, preset: PresetFile, about: str = "") -> None:
     """
     if not is_file(path):
         raise ValueError(f"a preset file must end in .toml, but got {str(path)!r}")
-    check_not_beside(path)
+    check_not_among(path)
     low, high = preset.dead_band
     tables = {
         "thruster": preset.parameters._asdict(),

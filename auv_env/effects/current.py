@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from thruster_env.numerics.checks import shown, within
+from thruster_env.numerics.checks import short_repr, within
 from thruster_env.plants.disturbances.effects import Effect, Registry
 from thruster_env.plants.disturbances.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
 
@@ -41,11 +41,13 @@ def make_current(given) -> Current:
         entries = list(given) if hasattr(given, "__iter__") and not isinstance(given, str) else []
         if len(entries) != len(DIRECTIONS):
             rule = "current must be three velocities (north, east, down) [m/s] or a mapping from directions"
-            raise ValueError(f"{rule}, but got {shown(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
         given = dict(zip(DIRECTIONS, entries, strict=True))
     unknown = [direction for direction in given if direction not in DIRECTIONS]
     if unknown:
-        raise ValueError(f"directions of current must be among {', '.join(DIRECTIONS)}, but got {shown(unknown)}")
+        raise ValueError(
+            f"directions of current must be among {', '.join(DIRECTIONS)}, but got {short_repr(unknown)}"
+        )
     found = {direction: _signals(direction, given[direction]) for direction in DIRECTIONS if direction in given}
     return {direction: signals for direction, signals in found.items() if signals}
 

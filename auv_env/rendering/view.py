@@ -59,7 +59,7 @@ class View:
         trail = _points(columns, "")
         seen = trail[np.isfinite(trail).all(axis=1)]
         place = seen[-1] if len(seen) else np.zeros(3)
-        path = _shown_part(self._path, seen) + [0.0, 0.0, offset]
+        path = _part_in_view(self._path, seen) + [0.0, 0.0, offset]
         shown = np.concatenate([seen, path, [place]])
         low, high = shown.min(axis=0), shown.max(axis=0)
         floor = high[2] + 0.12 * max(LEAST_SIZE, float((high - low).max()))
@@ -172,7 +172,7 @@ def _points(columns: dict[str, np.ndarray], prefix: str) -> np.ndarray:
     return np.stack([columns[f"{prefix}{name}"] for name in ("x", "y", "depth")], axis=-1)
 
 
-def _shown_part(path: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _part_in_view(path: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """A path's points; of a single straight line those from where the vehicle was to some way ahead of it."""
     if len(path) > 2:
         return path

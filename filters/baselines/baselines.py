@@ -123,7 +123,7 @@ class OpenLoop(Filter):
         return None
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """How far a root is looked for, and how much of the last measurement is kept in the next."""
         return 0.0, 0.0
 
@@ -176,7 +176,7 @@ class Inversion(OpenLoop):
         return self.inverted, self.channel
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """How far a root is looked for, and how much of the last measurement is kept in the next."""
         return self._numbers(0.0)
 
@@ -212,7 +212,7 @@ class LowPass(Inversion):
         object.__setattr__(self, "time_constant", positive("time_constant", self.time_constant))
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """How far a root is looked for, and how much of the last measurement is kept in the next."""
         return self._numbers(math.exp(-1.0 / self.time_constant))
 

@@ -65,4 +65,4 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
         raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
     form = {"form": "covariance"} if filter_.forms else {}  # of the same estimates
     used = replace(filter_, model=model, **form)
-    return Differentiable(used.kernel_model, used.written_page, used.own_numbers)
+    return Differentiable(used.kernel_model, used.written_page, used.own_parameters)

@@ -39,7 +39,7 @@ class Memory(NumbersMemory):
         self.tail, self.predicted_tail = tail, tail + m + 2
         own = self.predicted_tail + m + 2
         x = given(Place("rows", 0), (n,))
-        super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, beside=x), own)
+        super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, like=x), own)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
         flying = (x, self.P) if page.begin is None else together(page.begin(model, x, self.P))
@@ -55,18 +55,18 @@ class Memory(NumbersMemory):
         self.slope = self.state  # of the score
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
         r, c, size, self.prior, own_slopes = starts_of(n * n, m * m, shape.constants, 1, self.begun)[1:]
-        self.u, self.z = self.beside("rows", self.input, shape.inputs), self.beside("rows", self.measured, m)
+        self.u, self.z = self.read("rows", self.input, shape.inputs), self.read("rows", self.measured, m)
         self.ratio = self.ratio_in("rows", self.input)
-        self.tails = [self.beside("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
-        self.truth = self.beside("rows", self.true, n)
-        self.weights = self.beside("numbers", own + page.own_size, n, n, symmetric=True)
-        self.constants_slope = self.beside("move", c, shape.constants)
-        self.size = self.beside("move", size)
+        self.tails = [self.read("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
+        self.truth = self.read("rows", self.true, n)
+        self.weights = self.read("numbers", own + page.own_size, n, n, symmetric=True)
+        self.constants_slope = self.read("move", c, shape.constants)
+        self.size = self.read("move", size)
         self.moves: dict[Matrix, Matrix] = {
-            self.x: self.beside("change", 0, n),
-            self.P: self.beside("change", n, n, n, symmetric=True),
-            self.Q: self.beside("move", 0, n, n, symmetric=True),
-            self.R: self.beside("move", r, m, m, symmetric=True),
+            self.x: self.read("change", 0, n),
+            self.P: self.read("change", n, n, n, symmetric=True),
+            self.Q: self.read("move", 0, n, n, symmetric=True),
+            self.R: self.read("move", r, m, m, symmetric=True),
         }
         self.flying = [self.x, self.P]
         if page.begin is not None:
@@ -74,13 +74,11 @@ class Memory(NumbersMemory):
         self.kept = {
             name: self._moving(at, one) for at, (name, one) in zip(of_kept, started.items(), strict=False)
         }
-        slopes = page.parameters(lambda place, size: self.beside("move", own_slopes + place, *size))
+        slopes = page.parameters(lambda place, size: self.read("move", own_slopes + place, *size))
         self.own_slopes = dict(zip(self.own[: len(page.own)], slopes, strict=False))
 
     def _moving(self, at: int, like: Matrix) -> Matrix:
         """A matrix like another one that lies in `rows`, and its slope at the same place in `change`."""
-        made, slope = (
-            self.beside(array, at, *like.shape, symmetric=like.symmetric) for array in ("rows", "change")
-        )
+        made, slope = (self.read(array, at, *like.shape, symmetric=like.symmetric) for array in ("rows", "change"))
         self.moves[made] = slope
         return made

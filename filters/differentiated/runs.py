@@ -78,7 +78,7 @@ def derivatives(
     by `own_slopes`, (p, their count). Of what is not wanted there is nothing: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
-    model, page, own_numbers = differentiable(model, used)
+    model, page, own_parameters = differentiable(model, used)
     if model.functions != functions:  # those of an affine approximation, with constants of its own
         if wanted.constants:
             raise ValueError(
@@ -86,10 +86,10 @@ def derivatives(
             )
         slopes = slopes._replace(constants=np.zeros((parameters, len(model.constants))))
     if own_slopes is None:
-        own_slopes = np.zeros((parameters, len(own_numbers)))
-    if own_slopes.shape != (parameters, len(own_numbers)):
+        own_slopes = np.zeros((parameters, len(own_parameters)))
+    if own_slopes.shape != (parameters, len(own_parameters)):
         raise ValueError(
-            f"own_slopes must have the shape {(parameters, len(own_numbers))}, but got {own_slopes.shape}"
+            f"own_slopes must have the shape {(parameters, len(own_parameters))}, but got {own_slopes.shape}"
         )
     wanted = wanted._replace(own=bool(own_slopes.any()))
     recursion = recursion_of(model.functions, model.shape, wanted, page)
@@ -100,7 +100,7 @@ def derivatives(
     tails = [tail_of(np.inf, m), tail_of(given.degrees, m)]
     states, weights = truth or Truth(np.zeros((count, 0, 0)), np.zeros(0))
     of_density = tails if turns == 2 else tails[::-1]
-    numbers = np.concatenate([model.numbers, *of_density, own_numbers, np.diag(weights).ravel()])
+    numbers = np.concatenate([model.numbers, *of_density, own_parameters, np.diag(weights).ravel()])
     out = np.zeros((count, blocks, 1 + parameters))
     information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
     arguments = (

@@ -10,7 +10,7 @@ import numpy as np
 from filters.engine.compile import batch, new_memory, vectors
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.numerics.checks import as_floats, covariance, shown
+from thruster_env.numerics.checks import as_floats, covariance, short_repr
 from thruster_env.numerics.streams import filter_keys
 from thruster_env.numerics.threads import spread
 from thruster_env.plants.layout import LANES, with_root
@@ -153,7 +153,7 @@ def _floats(name: str, value) -> np.ndarray:
     try:
         return as_floats(value)
     except ValueError:
-        raise ValueError(f"{name} must be an array of numbers, but got {shown(value)}") from None
+        raise ValueError(f"{name} must be an array of numbers, but got {short_repr(value)}") from None
 
 
 def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:

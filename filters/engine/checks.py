@@ -7,7 +7,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from filters.engine.belief import Belief, LostBelief
-from thruster_env.numerics.checks import as_floats, at_least, covariance, shown
+from thruster_env.numerics.checks import as_floats, at_least, covariance, short_repr
 
 FEW = 4  # states, up to which a belief is looked at in Python
 ROUNDING = 1e-9  # of a covariance's largest variance: what filters leave of a negative one is below that
@@ -23,7 +23,7 @@ def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) ->
     if array.shape != like.shape or wrong.any():
         rule = "finite or NaN" if missing_allowed else "finite"
         count = f"{like.size} number{'' if like.size == 1 else 's'}"
-        raise ValueError(f"{name} must be {count}, each {rule}, but got {shown(value)}")
+        raise ValueError(f"{name} must be {count}, each {rule}, but got {short_repr(value)}")
     return array
 
 
@@ -37,7 +37,7 @@ def checked_key(key) -> tuple[int, int]:
             return words[0], words[1]
     except (TypeError, ValueError, OverflowError):
         pass
-    raise ValueError(f"key must be two whole numbers from 0 to 2^32 - 1, but got {shown(key)}")
+    raise ValueError(f"key must be two whole numbers from 0 to 2^32 - 1, but got {short_repr(key)}")
 
 
 def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray:
@@ -52,10 +52,10 @@ def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray
     whose = f"the {count} actions" if count > 1 else "an action"
     numbers = f"{size} number{'' if size == 1 else 's'}"
     if array.size != count * size:
-        raise ValueError(f"{whose} must be {numbers}{' each' * (count > 1)}, but got {shown(actions)}")
+        raise ValueError(f"{whose} must be {numbers}{' each' * (count > 1)}, but got {short_repr(actions)}")
     array = array.reshape(count, size)
     if (np.isnan(array).any(axis=1) & ~np.asarray(ignored)).any():
-        raise ValueError(f"{whose} must be {numbers} and not NaN, but got {shown(actions)}")
+        raise ValueError(f"{whose} must be {numbers} and not NaN, but got {short_repr(actions)}")
     return array
 
 
@@ -74,10 +74,10 @@ def check_belief(belief: Belief) -> None:
     finite = {"mean": belief.mean, "members": belief.members[: len(belief.mean)]}
     for name, values in finite.items():
         if not np.isfinite(as_floats(values)).all():
-            raise ValueError(f"{name} of a belief must be finite, but got {shown(values)}")
+            raise ValueError(f"{name} of a belief must be finite, but got {short_repr(values)}")
     for name in ("members", "extras"):
         if np.isnan(as_floats(getattr(belief, name))).any():
-            raise ValueError(f"{name} of a belief must not be NaN, but got {shown(getattr(belief, name))}")
+            raise ValueError(f"{name} of a belief must not be NaN, but got {short_repr(getattr(belief, name))}")
     covariance("cov of a belief", belief.cov, len(belief.mean), rounding=ROUNDING)
 
 

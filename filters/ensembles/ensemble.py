@@ -16,7 +16,7 @@ from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import covariance, mean, on_branch
 from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.scalars import entries_product
-from thruster_env.numerics.checks import at_least, positive, shown
+from thruster_env.numerics.checks import at_least, positive, short_repr
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
@@ -103,7 +103,7 @@ class EnsembleFilter(FilterWithPage):
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
         relaxation = positive("relaxation", self.relaxation, zero_allowed=True)
         if relaxation > 1.0:
-            raise ValueError(f"relaxation must be at most 1, but got {shown(self.relaxation)}")
+            raise ValueError(f"relaxation must be at most 1, but got {short_repr(self.relaxation)}")
         object.__setattr__(self, "ensemble_size", size)
         object.__setattr__(self, "inflation", positive("inflation", self.inflation))
         object.__setattr__(self, "relaxation", relaxation)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from filters.estimators.estimator import Output
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
 CALLED = {
@@ -72,7 +72,7 @@ class Checks:
         if is_cov and array.shape == (*leading, *size) != shape:
             array = array[..., None] * np.eye(*size)
         if array.shape != shape:
-            got = f"shape {array.shape}" if array.size else shown(value)
+            got = f"shape {array.shape}" if array.size else short_repr(value)
             raise ValueError(
                 f"{CALLED[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
             )

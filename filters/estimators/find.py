@@ -7,7 +7,7 @@ from typing import Any
 from filters.estimators.estimator import is_estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import is_code, object_named, said
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -64,7 +64,7 @@ def estimator_named(given) -> Any:
 def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
     what = f"estimator {label!r}"
     if not callable(make):
-        raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {shown(make)}")
+        raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {short_repr(make)}")
     try:
         found = make(model=model, **numbers) if _is_filter_class(make) else make(model, **numbers)
     except Exception as error:
@@ -73,7 +73,7 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
     if not isinstance(found, Filter) and not is_estimator(found):
         raise ValueError(
             f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, "
-            f"measurements), but made {shown(found)}"
+            f"measurements), but made {short_repr(found)}"
         )
     return found
 

@@ -12,7 +12,7 @@ from filters.estimators.checked import Checks, absent, log_likelihoods, without_
 from filters.estimators.estimator import Output, is_estimator
 from filters.estimators.session import EstimatorSession, seed_of
 from filters.filter import Filter
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.global_generators import GlobalGenerators, seeded_copy
 from thruster_env.numerics.modules import said
 from thruster_env.numerics.streams import GLOBAL_GENERATORS, derived_seed
@@ -47,7 +47,7 @@ class ForeignFilter(Filter):
         if not is_estimator(found):
             raise ValueError(
                 f"an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
-                f"but got {shown(found)}"
+                f"but got {short_repr(found)}"
             )
         check = getattr(found, "check_model", None)
         if callable(check):

@@ -16,7 +16,7 @@ from filters.filter import Filter
 from filters.gaussian.mixture import blender, rule_programs
 from filters.pages.kernels import nothing_to_summarise, prior_start
 from thruster_env.numerics import matrices
-from thruster_env.numerics.checks import one_of, shown, vector
+from thruster_env.numerics.checks import one_of, short_repr, vector
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.sources import tuple_of, written_out
 from thruster_env.numerics.tuples import vector_reader
@@ -209,7 +209,7 @@ class FuzzyKalmanFilter(Filter):
         model = self.model
         one_of("blending", self.blending, BLENDINGS)
         if not isinstance(self.offsets, bool):
-            raise ValueError(f"offsets must be True or False, but got {shown(self.offsets)}")
+            raise ValueError(f"offsets must be True or False, but got {short_repr(self.offsets)}")
         object.__setattr__(self, "premises", self._checked_premises())
         low = model.state_low if self.low is None else self.low
         high = model.state_high if self.high is None else self.high
@@ -223,7 +223,9 @@ class FuzzyKalmanFilter(Filter):
             )
         low, high = vector("low", low, model.n), vector("high", high, model.n)
         if not (low < high).all():
-            raise ValueError(f"low must be below high in every state, but got {shown(low)} and {shown(high)}")
+            raise ValueError(
+                f"low must be below high in every state, but got {short_repr(low)} and {short_repr(high)}"
+            )
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
 
@@ -239,7 +241,7 @@ class FuzzyKalmanFilter(Filter):
             places = ()
         if not 1 <= len(places) <= MOST_STATES or len(set(places)) < len(places):
             rule = f"premises must name 1 to {MOST_STATES} different states, for there is a rule for each corner"
-            count = f"all {n} states" if self.premises is None else shown(self.premises)
+            count = f"all {n} states" if self.premises is None else short_repr(self.premises)
             raise ValueError(f"{rule} of their range, but got {count}")
         return places
 
@@ -259,7 +261,7 @@ class FuzzyKalmanFilter(Filter):
         return corner
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The range, then the rules' models."""
         return (*self.low, *self.high, *(number for rule in self.rules for number in rule.constants))
 

@@ -151,7 +151,7 @@ class GaussianSumFilter(Filter):
         return nodes * np.sqrt((1.0 - variance) / (weights @ nodes**2)), weights, float(variance)
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The component, s^2, nodes and weights."""
         nodes, weights, variance = self.standard_split
         return (float(self.component), variance, *nodes, *weights)

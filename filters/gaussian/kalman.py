@@ -85,7 +85,7 @@ class KalmanFilter(AffineFilter):
                 f"but got schedule={self.schedule}, form={self.form!r}, "
                 f"operating_points={self.model.operating_points!r}"
             )
-        _ = self.own_numbers  # an operating point that does not exist shows here
+        _ = self.own_parameters  # an operating point that does not exist shows here
 
     @cached_property
     def parameters(self) -> dict[str, np.ndarray]:

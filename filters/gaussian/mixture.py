@@ -111,7 +111,7 @@ def part_update(functions: Functions, shape: Shape) -> Callable:
     n, m = shape.n, shape.m
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        x, p = memory.beside("rows", 0, n), memory.beside("rows", n, n, n, symmetric=True)
+        x, p = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
         seen = n + n * n + 1
         return [stored(extended.update(model, x, p, memory.z), (x, p, seen, seen + m, seen + m + m * m))]
 
@@ -128,9 +128,9 @@ def rule_programs(functions: Functions, shape: Shape) -> tuple[Callable, Callabl
     n, m, count = shape.n, shape.m, shape.constants
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        x, p = memory.beside("rows", 0, n), memory.beside("rows", n, n, n, symmetric=True)
-        rule = model.at(memory.beside("given", 0, count))
-        u, z = memory.beside("given", count, shape.inputs), memory.beside("given", count, m)
+        x, p = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
+        rule = model.at(memory.read("given", 0, count))
+        u, z = memory.read("given", count, shape.inputs), memory.read("given", count, m)
         predicted = extended.settle(rule, *extended.advance(rule, x, p, u))
         *updated, _ = extended.update(rule, x, p, z)
         seen = n + n * n + 1

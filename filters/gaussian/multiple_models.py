@@ -14,7 +14,7 @@ from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places
 from filters.filter import Filter
 from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.numerics.checks import between, one_of, positive, shown
+from thruster_env.numerics.checks import between, one_of, positive, short_repr
 from thruster_env.plants.state_space import StateSpaceModel
 
 MOST_MODES = 32
@@ -75,7 +75,7 @@ class MultipleModelFilter(Filter):
         names = [self.mode_filter] * len(models) if isinstance(self.mode_filter, str) else self.mode_filter
         if not isinstance(names, Sequence) or len(names) != len(models):
             rule = f"mode_filter must be one name, or one for each of {len(models)} modes"
-            raise ValueError(f"{rule}, but got {shown(names)}")
+            raise ValueError(f"{rule}, but got {short_repr(names)}")
         free = (model.replace(bounds=()) if model.bounds else model for model in models)
         found = tuple(make_filter(name, model) for name, model in zip(names, free, strict=True))
         for one in found:
@@ -87,11 +87,11 @@ class MultipleModelFilter(Filter):
     def _models(self) -> list[StateSpaceModel]:
         model, modes = self.model, self.usual_modes if self.modes is None else self.modes
         if not isinstance(modes, Sequence) or not 2 <= len(modes) <= MOST_MODES:
-            raise ValueError(f"modes must be a list of 2 to {MOST_MODES} models, but got {shown(modes)}")
+            raise ValueError(f"modes must be a list of 2 to {MOST_MODES} models, but got {short_repr(modes)}")
         models = [self._changed(one) if isinstance(one, Mapping) else one for one in modes]
         for one in models:
             if not isinstance(one, StateSpaceModel):
-                raise ValueError(f"a mode must be a model, or changes of one, but got {shown(one)}")
+                raise ValueError(f"a mode must be a model, or changes of one, but got {short_repr(one)}")
             if _sizes(one) != _sizes(model):
                 rule = "states, measurements, inputs and angles of a mode must be those of the model"
                 raise ValueError(f"{rule}, {_sizes(model)}, but got {_sizes(one)}")
@@ -104,7 +104,7 @@ class MultipleModelFilter(Filter):
         )
 
     @cached_property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """p, Pi, and the numbers of all modes."""
         of_modes = [one.numbers for one in self.mode_filters]
         return tuple(np.concatenate([self.p, self.transition_matrix.ravel(), *of_modes]).tolist())
@@ -237,5 +237,5 @@ def _probabilities(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
         or not np.allclose(sums, 1.0, rtol=0.0, atol=SUM_TOLERANCE)
     ):
         rule = f"{name} must be {' x '.join(map(str, shape))} numbers of at least 0 that sum to 1"
-        raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {shown(given)}")
+        raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {short_repr(given)}")
     return found

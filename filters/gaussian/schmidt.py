@@ -14,7 +14,7 @@ from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 
 
 def update(model, x, P, z):
@@ -56,7 +56,7 @@ class SchmidtKalmanFilter(PageFilter):
         """Check the indices; raise ValueError that states the rule and the value."""
         n, given = self.model.n, self.considered
         if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
-            raise ValueError(f"considered must be a list of indices, but got {shown(given)}")
+            raise ValueError(f"considered must be a list of indices, but got {short_repr(given)}")
         places = tuple(sorted({place_of("considered", one, n) for one in given}))
         object.__setattr__(self, "considered", places)
 

@@ -16,7 +16,7 @@ Trans. Automatic Control 16(6).
 from __future__ import annotations
 
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import above, beside, factor_of, forward_quotient, part, triangle, zeros
+from thruster_env.numerics.algebra.blocks import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
 from thruster_env.numerics.algebra.densities import density
 from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import root, square
@@ -39,7 +39,7 @@ def advance(model, x, L, u):
 
 def settle(model, x, L):
     """The end of a step."""
-    L = triangle(beside(L, model.Q_root))
+    L = triangle(hstack(L, model.Q_root))
     return x, square(L), {"L": L}
 
 
@@ -48,7 +48,7 @@ def update(model, x, P, z):
     n, m, seen, L = len(x), len(z), present(z), model.kept["L"]
     H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - model.h(x), model.measurement_angles))
-    both = triangle(above(beside(root(R), H @ L), beside(zeros(L, n, m), L)))
+    both = triangle(vstack(hstack(root(R), H @ L), hstack(zeros(L, n, m), L)))
     return updated(model, x, both, v, seen)
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import beside, factor_of, forward_quotient, triangle
+from thruster_env.numerics.algebra.blocks import factor_of, forward_quotient, hstack, triangle
 from thruster_env.numerics.algebra.densities import density
 from thruster_env.numerics.algebra.graphs import where
 from thruster_env.numerics.algebra.matrices import operation, same
@@ -40,7 +40,7 @@ def advance(model, x, U, u):
 
 def settle(model, x, U):
     """The end of a step."""
-    UD = weighted_factors(beside(U, model.Q_root), model.kept["UD"])
+    UD = weighted_factors(hstack(U, model.Q_root), model.kept["UD"])
     return x, square(upper_root(UD)), {"UD": UD}
 
 
@@ -50,7 +50,7 @@ def update(model, x, P, z):
     H, R_root = only(seen, model.H(x)), root(uncorrelated(seen, model.R))
     v = only(seen, wrap(z - model.h(x), model.measurement_angles))
     white = forward_quotient(R_root, H)
-    of_s = triangle(beside(R_root, H @ upper_root(UD)))
+    of_s = triangle(hstack(R_root, H @ upper_root(UD)))
     x = wrap(x + measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
     UD = measured_factors(UD, white)
     return x, square(upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), seen), {"UD": UD}
@@ -115,17 +115,17 @@ def _measured(ud: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ud, gain = np.array(ud), np.full((n, m), 0.0, dtype=ud.dtype)
     for c in range(m):
         f = [h[c, j] + sum(ud[i, j] * h[c, i] for i in range(j)) for j in range(n)]
-        above, k = 1.0, np.full(n, 0.0, dtype=ud.dtype)
+        vstack, k = 1.0, np.full(n, 0.0, dtype=ud.dtype)
         for j in range(n):
             g = ud[j, j] * f[j]
-            total = above + f[j] * g
-            ud[j, j] = ud[j, j] * above / total
+            total = vstack + f[j] * g
+            ud[j, j] = ud[j, j] * vstack / total
             for i in range(j):
                 was = ud[i, j]
-                ud[i, j] = was - k[i] * f[j] / above
+                ud[i, j] = was - k[i] * f[j] / vstack
                 k[i] = k[i] + was * g
-            k[j], above = g, total
-        k = k / above
+            k[j], vstack = g, total
+        k = k / vstack
         known = h[c] @ gain  # what the channels before say of this one
         gain = gain - k[:, None] * known[None, :]
         gain[:, c] = gain[:, c] + k

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from filters.gaussian.square_root import start, updated
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.blocks import above, beside, part, triangle, zeros
+from thruster_env.numerics.algebra.blocks import hstack, part, triangle, vstack, zeros
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import first, ones, others, outer, root, square, units
@@ -72,13 +72,13 @@ def begin_by_root(model, x, P):
 
 def deviations(model, D, s):
     """A matrix A with A A' = scatter(D, s)."""
-    return beside(D * model.own.weight_root, outer(s * model.own.shift_root, ones(part(D, 0, 0, len(s), 1))))
+    return hstack(D * model.own.weight_root, outer(s * model.own.shift_root, ones(part(D, 0, 0, len(s), 1))))
 
 
 def settle_root(model, X):
     """The end of a step."""
     x, s, D = moments(model, X, model.state_angles)
-    L = triangle(beside(deviations(model, D, s), model.Q_root))
+    L = triangle(hstack(deviations(model, D, s), model.Q_root))
     return wrap(x, model.state_angles), square(L), {"L": L}
 
 
@@ -89,7 +89,7 @@ def update_root(model, x, P, z):
     s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - y, model.measurement_angles))
     of_x = (L * model.own.spread) @ others(units(x)) * model.own.weight_root
-    both = above(beside(deviations(model, D, s), root(R)), beside(of_x, zeros(L, n, m + 1)))
+    both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
     return updated(model, x, triangle(both), v, seen)
 
 

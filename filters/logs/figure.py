@@ -10,7 +10,7 @@ import numpy as np
 from filters.logs.alarms import LogAlarms, episodes
 from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
-from filters.looks import TRUTH, colour_of
+from filters.plot_styles import TRUTH, colour_of
 from thruster_env.numerics.angles import with_breaks, wrapped
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import new_figure, save_figure, tidy

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from filters.monitoring import recursion
 from filters.monitoring.thresholds import chi_square, cusum_threshold, glr_threshold
-from thruster_env.numerics.checks import as_floats, at_least, one_of, positive, shown
+from thruster_env.numerics.checks import as_floats, at_least, one_of, positive, short_repr
 from thruster_env.numerics.compiled import CompiledOrPython, inlined
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Monitor:
         """Check the attributes."""
         steps = positive("steps_between", self.steps_between)
         if not 100.0 <= steps <= 1e12:
-            raise ValueError(f"steps_between must be from 100 to 1e12, but got {shown(self.steps_between)}")
+            raise ValueError(f"steps_between must be from 100 to 1e12, but got {short_repr(self.steps_between)}")
         object.__setattr__(self, "steps_between", steps)
         object.__setattr__(self, "bias", positive("bias", self.bias))
         for name, least, most in (

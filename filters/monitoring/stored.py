@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.monitoring.monitor import Monitor, monitor_of
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 
 SAFELY = 2  # times the longest run of equal, or missing, readings of what is healthy
 THRESHOLDS = "thresholds"
@@ -64,7 +64,7 @@ def tuned_monitor(path: str | Path) -> Monitor:
     if given is None:
         raise ValueError(f"a tuned file must have a monitor (tune again, or give the steps), but {path} has none")
     if not isinstance(given, Mapping):
-        raise ValueError(f"the monitor of a tuned file must be a mapping, but {path} has {shown(given)}")
+        raise ValueError(f"the monitor of a tuned file must be a mapping, but {path} has {short_repr(given)}")
     try:
         found = monitor_of({name: value for name, value in given.items() if name != THRESHOLDS})
     except ValueError as error:

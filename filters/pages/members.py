@@ -43,12 +43,12 @@ class MembersMemory(NumbersMemory):
         """Take the sizes."""
         row = memory_places(shape.n, shape.m)
         x = given(Place("table", 0), (shape.n,), member=True)
-        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
+        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
         super().__init__(shape, page, x, p, own_place(shape))
-        self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
-        self.w, self.e = (given(Place("draws", 0), (size,), member=True, beside=x) for size in (shape.n, shape.m))
-        self.mean = self.beside("rows", row.mean, shape.n)
+        self.w, self.e = (given(Place("draws", 0), (size,), member=True, like=x) for size in (shape.n, shape.m))
+        self.mean = self.read("rows", row.mean, shape.n)
 
 
 def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:

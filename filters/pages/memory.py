@@ -33,17 +33,17 @@ class NumbersMemory:
         self.belief = Place("rows", row.mean), Place("rows", row.cov)
         self.told = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
-        self.Q = self.beside("numbers", places.q, n, n, symmetric=True)
-        self.R = self.beside("numbers", places.r, m, m, symmetric=True)
-        self.Q_root = self.beside("numbers", places.q_root, n, n)
-        self.R_root = self.beside("numbers", places.r_root, m, m)
-        self.prior_mean = self.beside("numbers", places.prior_mean, n)
-        self.prior_root = self.beside("numbers", places.prior_root, n, n)
-        self.scales = self.beside("numbers", places.scales, n)
+        self.Q = self.read("numbers", places.q, n, n, symmetric=True)
+        self.R = self.read("numbers", places.r, m, m, symmetric=True)
+        self.Q_root = self.read("numbers", places.q_root, n, n)
+        self.R_root = self.read("numbers", places.r_root, m, m)
+        self.prior_mean = self.read("numbers", places.prior_mean, n)
+        self.prior_root = self.read("numbers", places.prior_root, n, n)
+        self.scales = self.read("numbers", places.scales, n)
         # Where there are none, they must not lie where the filter's parameters begin: tensors are known by place.
         at = places.constants if shape.constants else places.substeps
-        self.constants = self.beside("numbers", at, shape.constants)
-        self.own = page.parameters(lambda place, size: self.beside("numbers", own + place, *size))
+        self.constants = self.read("numbers", at, shape.constants)
+        self.own = page.parameters(lambda place, size: self.read("numbers", own + place, *size))
         self.kept: Mapping[str, Matrix] = {}
         self.constants_slope: Matrix | None = None
         self.ratio: Matrix | None = None
@@ -51,11 +51,11 @@ class NumbersMemory:
 
     def ratio_in(self, array: str, inputs: int) -> Matrix | None:
         """The last of the inputs, which lie in an array from a place on, of a model with a step ratio."""
-        return self.beside(array, inputs + self.shape.inputs - 1) if self.shape.step_ratio else None
+        return self.read(array, inputs + self.shape.inputs - 1) if self.shape.step_ratio else None
 
-    def beside(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
+    def read(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
         """A matrix that lies in an array from a place on."""
-        return given(Place(array, first), shape, symmetric=symmetric, beside=self.x)
+        return given(Place(array, first), shape, symmetric=symmetric, like=self.x)
 
 
 class RowMemory(NumbersMemory):
@@ -70,9 +70,9 @@ class RowMemory(NumbersMemory):
         """Take the sizes; what is kept or in flight finds its place when it is known."""
         row = memory_places(shape.n, shape.m)
         x = given(Place("rows", row.mean), (shape.n,))
-        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
+        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
         super().__init__(shape, page, x, p, own_place(shape))
-        self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
         self.end = row.extras
 
@@ -82,6 +82,6 @@ class RowMemory(NumbersMemory):
 
     def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
         """A matrix of the same shape in the next places of the row."""
-        made = self.beside("rows", self.end, *like.shape, symmetric=symmetric)
+        made = self.read("rows", self.end, *like.shape, symmetric=symmetric)
         self.end += prod(like.shape)
         return made

@@ -42,7 +42,7 @@ class FilterWithPage(Filter):
         return (field.name for field in dataclasses.fields(self) if field.name not in ("model", "form"))
 
     @cached_property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The parameters, one behind the other."""
         return tuple(float(number) for value in self.parameters.values() for number in np.ravel(value))
 

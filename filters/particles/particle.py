@@ -119,9 +119,9 @@ class ParticleFilter(WeightedFilter):
         object.__setattr__(self, "resampling_threshold", threshold)
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The factor on the kernel's width, and the threshold."""
-        return *super().own_numbers, self.resampling_threshold
+        return *super().own_parameters, self.resampling_threshold
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""

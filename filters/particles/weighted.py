@@ -162,7 +162,7 @@ class WeightedFilter(Filter):
         object.__setattr__(self, "regularisation", width)
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The factor on the kernel's width."""
         return (self.regularisation,)
 

@@ -117,7 +117,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
         fingerprint  # noqa: B018 - part of the cache's key
         row, table, _ = now
         pair_row, pair_table, _ = pair
-        own_numbers, pair_numbers = numbers
+        own_parameters, pair_numbers = numbers
         forecast = np.zeros((n, table.shape[1]))
         u, z, times = np.zeros(inputs.shape[2]), np.zeros(m), measurements.shape[1]
         for b in range(first, last):
@@ -131,12 +131,12 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                 if k > 0:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k - 1, i]
-                    predict(now, u, own_numbers, size)
+                    predict(now, u, own_parameters, size)
                 else:
-                    start(now, own_numbers, size)
+                    start(now, own_parameters, size)
                 copy(forecast, 0, table)
-                update(now, z, own_numbers, size)
-                restart(now, own_numbers, size)
+                update(now, z, own_parameters, size)
+                restart(now, own_parameters, size)
                 keep(history, k, table, 0)
                 if row[divergences] > 0.0:
                     oldest, row[divergences] = k, 0.0

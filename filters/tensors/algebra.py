@@ -41,7 +41,7 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
     values: dict[Matrix, Any] = dict(known)
     for one in order:
         if one not in values:
-            arguments = (_beside(a, one, values) if isinstance(a, Matrix) else a for a in one.arguments)
+            arguments = (_with(a, one, values) if isinstance(a, Matrix) else a for a in one.arguments)
             if one.operation in CONSTANT:
                 size = one.arguments[0].shape
                 values[one] = torch.as_tensor(one.operation.compute(np.zeros(size)), dtype=like.dtype).to(
@@ -54,7 +54,7 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
     return values
 
 
-def _beside(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
+def _with(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
     """The value of an argument; a vector that is added to vectors of members, or multiplies them, is a column."""
     found = values[a]
     return found[..., None] if one.member and not a.member and one.operation in BY_ENTRIES else found
@@ -254,8 +254,8 @@ RULES: dict[Operation, Callable] = {
     points.hats: _hats,
     blocks.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
     blocks.triangle: _triangle,
-    blocks.beside: lambda a, b: _joined(-1, a, b),
-    blocks.above: lambda a, b: _joined(-2, a, b),
+    blocks.hstack: lambda a, b: _joined(-1, a, b),
+    blocks.vstack: lambda a, b: _joined(-2, a, b),
     blocks.part: lambda a, top, left, rows, columns: a[..., top : top + rows, left : left + columns],
     blocks.zeros: lambda a, *shape: a.new_zeros(shape),
     blocks.factor_of: lambda lower: lower,

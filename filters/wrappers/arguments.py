@@ -13,7 +13,7 @@ from filters.filter import Filter
 from filters.registry import make_filter, tunable_numbers
 from filters.wrappers.models import made, maker_of
 from filters.wrappers.tuned import tuned_filter
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.state_space import StateSpaceModel
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
@@ -31,13 +31,13 @@ def given_filter(filter, tuned) -> tuple:
         offered = getattr(tuned, "filter", None)
         if not isinstance(offered, Filter):
             rule = "tuned must be the path of a tuned file, or what tuning.tune returns"
-            raise ValueError(f"{rule} (pass a filter object as filter=...), but got {shown(tuned)}")
+            raise ValueError(f"{rule} (pass a filter object as filter=...), but got {short_repr(tuned)}")
         if filter is not None:
-            raise ValueError(f"tuned must come without filter: it has its own, but got {shown(filter)}")
+            raise ValueError(f"tuned must come without filter: it has its own, but got {short_repr(filter)}")
         filter, tuned = offered, None
     if not (filter is None or isinstance(filter, str | Filter) or is_foreign(filter)):
         rule = "filter must be a name, a filter that is made (as study.filter) or an estimator"
-        raise ValueError(f"{rule}; a study is tuned=study; but got {shown(filter)}")
+        raise ValueError(f"{rule}; a study is tuned=study; but got {short_repr(filter)}")
     return filter, tuned
 
 
@@ -55,7 +55,7 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
     if isinstance(filter, Filter):
         if model is not None or model_arguments is not None or numbers:
             rule = "a filter that is made must come without model, model_arguments and numbers: it has its own"
-            raise ValueError(f"{rule}, but got {shown(filter)} with some")
+            raise ValueError(f"{rule}, but got {short_repr(filter)} with some")
         return filter
     filter = "ekf" if filter is None else filter
     known = () if is_foreign(filter) else tunable_numbers(filter)
@@ -65,7 +65,7 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
             raise ValueError(f"{rule} (arguments of the model go into model_arguments), but got {name!r}")
     arguments = {} if model_arguments is None else model_arguments
     if not isinstance(arguments, Mapping):
-        raise ValueError(f"model_arguments must be a mapping, but got {shown(arguments)}")
+        raise ValueError(f"model_arguments must be a mapping, but got {short_repr(arguments)}")
     return make_filter(filter, model_for(env, model, arguments), **numbers)
 
 

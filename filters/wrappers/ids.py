@@ -15,7 +15,7 @@ from gymnasium.envs.registration import load_env_creator, register, registry
 
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.compiled import package_of
 
 PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
@@ -96,5 +96,5 @@ def register_filtered_envs() -> None:
 
 def _checked(arguments: Mapping | None) -> dict:
     if arguments is not None and not isinstance(arguments, Mapping):
-        raise ValueError(f"filter_arguments must be a mapping, but got {shown(arguments)}")
+        raise ValueError(f"filter_arguments must be a mapping, but got {short_repr(arguments)}")
     return dict(arguments or {})

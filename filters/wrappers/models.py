@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.state_space import StateSpaceModel
 
 
@@ -49,5 +49,5 @@ def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
     except TypeError as error:
         raise ValueError(f"{what} must take the given arguments: {error}") from None
     if not isinstance(found, StateSpaceModel):
-        raise ValueError(f"{what} must be a StateSpaceModel, but it is {shown(found)}")
+        raise ValueError(f"{what} must be a StateSpaceModel, but it is {short_repr(found)}")
     return found

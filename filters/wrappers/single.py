@@ -24,7 +24,7 @@ from filters.wrappers.arguments import (
     given_filter,
 )
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from thruster_env.numerics.checks import as_floats, one_of, shown
+from thruster_env.numerics.checks import as_floats, one_of, short_repr
 from thruster_env.numerics.checks import seed as checked_seed
 from thruster_env.numerics.streams import draw_key, filter_generator
 from thruster_env.plants.state_space import StateSpaceModel
@@ -139,7 +139,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         z = _measurement(observation, info)
         m = self._channels
         if np.shape(z) != (m,):
-            raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
+            raise ValueError(f"a measurement must have the model's {m} entries, but got {short_repr(z)}")
         self._held = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
         if self._watch is not None:

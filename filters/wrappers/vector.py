@@ -20,7 +20,7 @@ from filters.monitoring.monitor import Monitor, monitor_of, watch_of
 from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from thruster_env.numerics.checks import as_floats, one_of, shown
+from thruster_env.numerics.checks import as_floats, one_of, short_repr
 from thruster_env.numerics.keys import EpisodeKeys, reset_mask
 from thruster_env.numerics.streams import filter_generator
 from thruster_env.plants.state_space import StateSpaceModel
@@ -159,7 +159,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         z = as_floats(z)
         if z.shape != (self.num_envs, self._m):
             raise ValueError(
-                f"measurements must have shape {(self.num_envs, self._m)}, but got {shown(np.shape(z))}"
+                f"measurements must have shape {(self.num_envs, self._m)}, but got {short_repr(np.shape(z))}"
             )
         valid = info.get("measurement_valid")
         return z if valid is None else np.where(valid, z, np.nan)

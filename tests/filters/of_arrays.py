@@ -45,7 +45,7 @@ def parameters_of(page, numbers):
 def run_page(filter_, inputs, measurements):
     """Means, covariances, innovations, their covariances and log-likelihoods of one run, by the page itself."""
     page, model = filter_.written_page, filter_.kernel_model
-    equations = OfArrays(model, parameters_of(page, np.array(filter_.own_numbers)))
+    equations = OfArrays(model, parameters_of(page, np.array(filter_.own_parameters)))
     x, p, found = model.prior_mean, model.prior_cov, []
 
     def kept(results):

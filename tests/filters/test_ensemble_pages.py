@@ -58,7 +58,7 @@ def on_one_branch(x, angles):
 def run_page(filter_, key, inputs, measurements):
     """Means, covariances, innovations, their covariances and log-likelihoods of one run, by the page itself."""
     page, model = filter_.written_page, filter_.kernel_model
-    equations = OfMembers(model, parameters_of(page, np.array(filter_.own_numbers)))
+    equations = OfMembers(model, parameters_of(page, np.array(filter_.own_parameters)))
     width, found = padded(filter_.size, LANES), []
 
     def normals(rows, step, stream):

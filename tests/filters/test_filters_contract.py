@@ -184,7 +184,7 @@ def model_constants(filter_):
 
 def mean_at_sigma_points(filter_, belief):
     """The mean (m,) of what is measured at the points around a belief's mean."""
-    model, (spread, weight, *_), root = filter_.model, filter_.own_numbers, np.linalg.cholesky(belief.cov)
+    model, (spread, weight, *_), root = filter_.model, filter_.own_parameters, np.linalg.cholesky(belief.cov)
     points = belief.mean + spread * np.vstack([root.T, -root.T])
     seen = [model.observe(tuple(x), model.constants) for x in (belief.mean, *points)]
     return (1 - 2 * model.n * weight) * np.array(seen[0]) + weight * np.sum(seen[1:], axis=0)

@@ -240,8 +240,8 @@ class TestModelsThatNumbaRefuses:
         with interpreted():
             expected = run(make_filter("ekf", spring()), keys, inputs, z)
         found = run(make_filter("ekf", spring(transition=transition)), keys, inputs, z)
-        for part, twin in zip(found, expected, strict=True):  # one of them has central differences for F
-            np.testing.assert_allclose(part, twin, rtol=1e-8, atol=1e-8)
+        for part, rescaled in zip(found, expected, strict=True):  # one of them has central differences for F
+            np.testing.assert_allclose(part, rescaled, rtol=1e-8, atol=1e-8)
 
     def test_others_run_with_one_warning_and_the_results_of_a_compilable_twin(self, transition):
         name, numbers = "pf", {"ensemble_size": 5}  # others have pages, and need no numba for such models
@@ -254,8 +254,8 @@ class TestModelsThatNumbaRefuses:
             found = run(filter_, keys, inputs, z)
             again = run(filter_, keys, inputs, z)
         assert len([w for w in warned if "runs as Python" in str(w.message)]) == 1
-        for part, repeated, twin in zip(found, again, expected, strict=True):
-            np.testing.assert_allclose(part, twin, rtol=1e-12, atol=1e-12)
+        for part, repeated, rescaled in zip(found, again, expected, strict=True):
+            np.testing.assert_allclose(part, rescaled, rtol=1e-12, atol=1e-12)
             np.testing.assert_array_equal(part, repeated)
 
     def test_their_truths_are_drawn_all_the_same(self, transition):

@@ -77,11 +77,11 @@ def test_a_study_tunes_p0_and_the_number_survives(tmp_path):
     factor = result.choice.model["prior_cov_factor"]
     assert factor < 0.5  # an EKF that starts blind should not trust what a wide prior makes of the first thrust
     assert result.best_value < 0.9 * result.trials[0].values[0]
-    for twin in (trial for trial in result.trials if RESCALED in trial.user_attrs and "P0" in trial.params):
-        trial = result.trials[twin.user_attrs[f"{RESCALED} of"]]
-        factor_of_twin = twin.params["R"] / trial.params["R"]
-        wanted = np.clip(factor_of_twin * trial.params["P0"], *PRIOR_FACTORS)  # its range
-        assert twin.params["P0"] == pytest.approx(wanted, rel=1e-6)
+    for rescaled in (trial for trial in result.trials if RESCALED in trial.user_attrs and "P0" in trial.params):
+        trial = result.trials[rescaled.user_attrs[f"{RESCALED} of"]]
+        factor_of_rescaled = rescaled.params["R"] / trial.params["R"]
+        wanted = np.clip(factor_of_rescaled * trial.params["P0"], *PRIOR_FACTORS)  # its range
+        assert rescaled.params["P0"] == pytest.approx(wanted, rel=1e-6)
     path = tmp_path / "t.json"
     write_tuned(path, PLAN, result, [evaluate_held_out(result.choice, STARTUP, 0, 4)], "s")
     assert read_tuned(path) == (result.choice, STARTUP, 0)

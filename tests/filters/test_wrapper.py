@@ -309,12 +309,12 @@ class TestSpecifications:
         path = tmp_path / "tuned.json"
         path.write_text(json.dumps(TUNED))
         env = EstimateState(bow_thruster(), tuned=str(path))
-        twin = EstimateState(
+        rescaled = EstimateState(
             bow_thruster(), filter="enkf", ensemble_size=20, model_arguments={"process_noise_cov": [1, 4e-4]}
         )
         again = self.rebuilt(env)
         actions = voltages(10)
-        found = [infos_of("estimate", played(e, actions, 4)[2]) for e in (env, twin, again)]
+        found = [infos_of("estimate", played(e, actions, 4)[2]) for e in (env, rescaled, again)]
         np.testing.assert_array_equal(found[0], found[1])
         np.testing.assert_array_equal(found[0], found[2])
         assert env.filter.ensemble_size == 20

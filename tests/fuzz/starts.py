@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from tests.tuning.test_null_tests import EFFECTS
-from thruster_env.logged import Shown
+from thruster_env.logged import Recorder
 from thruster_env.plant import make_plant
 from tuning.identification import Identification, identify
 from tuning.thruster.identification import ThrusterFamily
@@ -59,7 +59,7 @@ def _logs(rng: np.random.Generator):
 
 def _identified(logs, effects: tuple[str, ...]) -> Identification:
     family = ThrusterFamily(
-        logs, make_plant(PRESET, sensors=SENSORS, max_voltage=12.0), Shown(), (*OWN[:2], *effects)
+        logs, make_plant(PRESET, sensors=SENSORS, max_voltage=12.0), Recorder(), (*OWN[:2], *effects)
     )
     return identify(family.data, family.model, family.free, starts=1)
 

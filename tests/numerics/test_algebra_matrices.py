@@ -69,7 +69,7 @@ ENTRIES = ("P", "R", "H", "F", "x", "v", "z")
 
 def as_matrices(values):
     first = given("P", values["P"].shape, symmetric=True)
-    others = {k: given(k, a.shape, symmetric=k == "R", beside=first) for k, a in values.items() if k != "P"}
+    others = {k: given(k, a.shape, symmetric=k == "R", like=first) for k, a in values.items() if k != "P"}
     return {"P": first, **others}
 
 
@@ -91,7 +91,7 @@ def test_slopes_are_those_of_central_differences(name, moving):
     directions = {k: a + a.T if k in "PR" else a for k, a in directions.items()}
     matrices = as_matrices(values)
     moves = {
-        matrices[k]: given(f"d{k}", a.shape, symmetric=k in "PR", beside=matrices["P"])
+        matrices[k]: given(f"d{k}", a.shape, symmetric=k in "PR", like=matrices["P"])
         for k, a in directions.items()
     }
     slope = slopes_of([FORMULAS[name](matrices)], moves)[0]
@@ -109,7 +109,7 @@ def test_slopes_are_those_of_central_differences(name, moving):
 
 def test_of_the_best_gain_no_derivative_is_formed():
     matrices = as_matrices(values_of_sizes(N, M))
-    moves = {matrices["P"]: given("dP", (N, N), symmetric=True, beside=matrices["P"])}
+    moves = {matrices["P"]: given("dP", (N, N), symmetric=True, like=matrices["P"])}
     divided = lambda wanted: [one for one in in_order(wanted) if one.operation is operations.quotient]  # noqa: E731
     slopes = slopes_of([posterior(matrices), FORMULAS["corrected"](matrices)], moves)
     assert {one.shape for one in divided(slopes)} == {(N, M), (M,)}
@@ -123,7 +123,7 @@ def test_calls_of_functions_are_the_formula(name, sizes):
     first, place = None, 0
     matrices, numbers = {}, []
     for key, value in values.items():
-        matrices[key] = given(Place("numbers", place), value.shape, symmetric=key in "PR", beside=first)
+        matrices[key] = given(Place("numbers", place), value.shape, symmetric=key in "PR", like=first)
         first, place = first or matrices[key], place + value.size
         numbers.append(value.ravel())
     wanted = FORMULAS[name](matrices)
@@ -166,4 +166,4 @@ def test_a_covariance_that_is_none_has_no_density():
     seen = np.array([True, True])
     assert np.isnan(log_density(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), seen))
     with pytest.raises(TypeError, match="no derivative"):
-        slopes_of([densities.dot(x := given("x", (2,)), x)], {x: given("dx", (2,), beside=x)})
+        slopes_of([densities.dot(x := given("x", (2,)), x)], {x: given("dx", (2,), like=x)})

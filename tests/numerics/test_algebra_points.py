@@ -22,7 +22,7 @@ def called(lower, slope):
     """The slope of a root by functions that are made for its size."""
     size = len(lower)
     of = given(Place("numbers", 0), lower.shape)
-    moves = given(Place("move", 0), lower.shape, symmetric=True, beside=of)
+    moves = given(Place("move", 0), lower.shape, symmetric=True, like=of)
     rows, numbers, move = np.zeros(size**2), lower.ravel(), slope.ravel()
     known = {of: of.operation, moves: moves.operation}
     calls_of([(Place("rows", 0), root_slope(of, moves))], known, {})(rows, np.zeros(1), numbers, move)

@@ -27,7 +27,7 @@ def spread(x, y):
 
 def stage_of(page):
     x = given(Place("table", 0), (N,), member=True)
-    y = given(Place("table", N), (N,), member=True, beside=x)
+    y = given(Place("table", N), (N,), member=True, like=x)
     places = Place("table", 0), Place("table", N), Place("rows", 0)
     return as_programs(Stage(dict(zip(places, page(x, y), strict=True)), {}), 0, 10_000).values
 

@@ -12,11 +12,11 @@ import pytest
 from numba.core import codegen, event
 from numba.extending import overload
 
-from thruster_env.numerics.compiled import compiled, inlined, kept_apart
+from thruster_env.numerics.compiled import compiled, inlined, not_inlined
 from thruster_env.numerics.optimising import RARELY
 
 
-@kept_apart
+@not_inlined
 def total(values):
     result = 0.0
     for i in range(values.shape[0]):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from thruster_env.numerics.compiled import package_of
-from tuning.problems import rooms as rooms_of_plants
+from tuning.problems.plant_packages import PLANT_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
@@ -70,7 +70,7 @@ def packages_of(path):
 
 def rooms_of(path):
     """The rooms that a file knows."""
-    return {package_of(name).replace(".", "/") for name in imports_of(path)}
+    return {room_of(name).replace(".", "/") for name in imports_of(path)}
 
 
 def test_imports_are_found_wherever_they_hide():
@@ -106,7 +106,7 @@ def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
     rooms = {room.replace("/", ".") for room in TUNING_OF_PLANTS}
     outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
     knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
-    assert not knowing and set(rooms_of_plants.ROOMS.values()) == {f"{room}.find" for room in rooms}
+    assert not knowing and set(PLANT_PACKAGES.values()) == {f"{room}.find" for room in rooms}
 
 
 def test_imports_of_training_go_in_no_circle_not_even_within_functions():

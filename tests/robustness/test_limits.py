@@ -11,7 +11,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
 from filters.tuned_file import read_tuned_file
 from thruster_cli.simulate import command
-from thruster_env.numerics.checks import as_floats, shown, vector
+from thruster_env.numerics.checks import as_floats, short_repr, vector
 from thruster_env.parameters import TUNNEL
 from thruster_env.studies.comparison import compare
 from thruster_env.training.setup import configuration_from_json
@@ -117,7 +117,7 @@ def deep(depth=100_000):
 
 def test_what_holds_itself_is_refused():
     for value in (*endless(), deep()):
-        assert "\n" not in shown(value)
+        assert "\n" not in short_repr(value)
         refused(lambda: as_floats(value), "an array must be")  # noqa: B023
         refused(lambda: vector("state", value), "state must be")  # noqa: B023
         refused(lambda: gym.make("BowThruster-v0", sensors=[value]), "must")  # noqa: B023

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thruster_env.logged import Shown
+from thruster_env.logged import Recorder
 from thruster_env.plant import make_plant
 from thruster_env.studies import identification
 from thruster_env.studies.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
@@ -41,7 +41,7 @@ def test_a_clock_that_is_ahead_is_found_where_it_is_and_not_where_interpolation_
         late.append(replace(log, measurements=rows))
     plant = make_plant(PRESET, sensors=SENSORS, max_voltage=AMPLITUDE)
     names = [name for name in TRUTH if name not in ("Q11", "Q22", "R11", "R22")]
-    family = ThrusterFamily(late, plant, Shown(), (*names, "clock_offset_speed"))
+    family = ThrusterFamily(late, plant, Recorder(), (*names, "clock_offset_speed"))
     objective = Objective(family.data, family.model, Coordinates(family.free))
 
     def value(offset):

@@ -203,9 +203,9 @@ def test_a_study_tunes_inflation_and_nothing_else():
 def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
     plan = Plan("ekf", (checked_problem(find_problem("thruster_env.studies.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
-    path, proof = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)
-    assert proof.tuned.score.value < proof.untuned.score.value
-    write_tuned(path, plan, result, [proof], "pendulum")
+    path, comparison = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)
+    assert comparison.tuned.score.value < comparison.untuned.score.value
+    write_tuned(path, plan, result, [comparison], "pendulum")
     done = thruster("report", path, "--problem", "thruster_env.studies.pendulum:problem")
     assert done.returncode == 0, done.stderr
     env = EstimateState(gym.make("Pendulum-v1"), tuned=path, model=pendulum.model())

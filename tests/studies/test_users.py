@@ -10,7 +10,7 @@ from filters.consistency.intervals import Interval
 from tests.linear_problem import LinearProblem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.studies.users import runs, significance, tables
-from thruster_env.studies.users.runs import Beside, Case, Panel, found_problems, run_panel
+from thruster_env.studies.users.runs import Case, Paired, Panel, found_problems, run_panel
 from thruster_env.studies.users.significance import chance_if_no_worse, holm
 from tuning.evaluation.evaluate import score, score_ratio
 
@@ -36,8 +36,8 @@ def pair(seed, runs=200, factor=1.0, scale=(1.0, 0.5, np.inf)):
 
 
 def case(problem="a", name="ekf", **baselines):
-    beside = {label.replace("_", " "): one for label, one in baselines.items()}
-    return Case(problem, name, 1.2, 1.05, 0, "", beside, 3.0)
+    paired = {label.replace("_", " "): one for label, one in baselines.items()}
+    return Case(problem, name, 1.2, 1.05, 0, "", paired, 3.0)
 
 
 def test_chances_are_uniform_where_neither_is_worse():
@@ -81,9 +81,9 @@ def test_holms_procedure_is_that_of_his_paper():
 
 def test_the_verdict_counts_neither_the_oracle_nor_the_same_filter():
     cases = [
-        case(given=Beside(Interval(1.1, 1.05, 1.15), 1e-9), oracle=Beside(Interval(2.0, 1.9, 2.1), 1e-30)),
-        case("b", given=Beside(SAME, 1.0), rule_of_thumb=Beside(Interval(0.5, 0.4, 0.6), 1.0)),
-        case("b", "ukf", given=Beside(Interval(1.01, 1.001, 1.02), 0.03)),
+        case(given=Paired(Interval(1.1, 1.05, 1.15), 1e-9), oracle=Paired(Interval(2.0, 1.9, 2.1), 1e-30)),
+        case("b", given=Paired(SAME, 1.0), rule_of_thumb=Paired(Interval(0.5, 0.4, 0.6), 1.0)),
+        case("b", "ukf", given=Paired(Interval(1.01, 1.001, 1.02), 0.03)),
     ]
     found = tables.verdict_of(cases)
     assert (found.comparisons, found.above, found.wins) == (3, 2, 1) and found.by_chance == pytest.approx(0.075)
@@ -121,8 +121,8 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
     assert [one["problem"] for one in first["cases"]] == ["altitude", "battery"]
     for one in first["cases"]:
         assert {"given", "noise estimation", "oracle"} <= set(one["baselines"])
-        for beside in one["baselines"].values():
-            assert beside["low"] <= beside["value"] <= beside["high"] and 0.0 <= beside["chance"] <= 1.0
+        for paired in one["baselines"].values():
+            assert paired["low"] <= paired["value"] <= paired["high"] and 0.0 <= paired["chance"] <= 1.0
     assert (tmp_path / "users.md").read_text().count("`battery`") == 1
     assert len((tmp_path / "users.csv").read_text().splitlines()) == 1 + sum(
         len(one["baselines"]) for one in first["cases"]

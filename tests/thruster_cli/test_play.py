@@ -10,7 +10,7 @@ from PIL import Image
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli import episodes
 from thruster_env.model import thruster_model
-from thruster_env.plants.rendering import film
+from thruster_env.plants.rendering import video
 from thruster_env.rendering.history import Moment, Overlay
 
 
@@ -114,9 +114,9 @@ def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F8
 
 
 def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
-    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="drawing needs pygame, which is not installed"):
-        film.check_drawing(None)
+        video.check_drawing(None)
 
 
 def test_torch_is_not_imported():

@@ -191,19 +191,19 @@ def test_names_of_files_need_no_quotes(name, file):
 
 
 def test_a_tuning_that_made_it_worse_says_what_to_do_next():
-    proof = SimpleNamespace(
+    comparison = SimpleNamespace(
         tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
     )
     tuning = SimpleNamespace(
         way=None,
-        proofs=[proof],
+        comparisons=[comparison],
         gradient=None,
         plan=SimpleNamespace(prune=True, filter="enkf"),
         result=SimpleNamespace(finished=6),
     )
     (said,) = way_out(tuning)
     assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
-    proof.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
+    comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
     assert way_out(tuning) == []
 
 

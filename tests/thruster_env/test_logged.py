@@ -6,7 +6,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import ExtendedKalmanFilter, run
-from thruster_env.logged import Shown, lag_weights, logged_model, with_shown
+from thruster_env.logged import Recorder, lag_weights, logged_model, with_recorder
 from thruster_env.model import model_of_plant, thruster_model
 from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, T200, preset_parameters
@@ -26,7 +26,7 @@ def stepped(model, x, u):
 def test_without_anything_shown_it_is_the_thruster_to_the_last_bit():
     base, plant = thruster_model(**PLANT), make_plant(**PLANT)
     assert logged_model(**PLANT).transition is base.transition
-    neutral = with_shown(base, plant, Shown(), always=True)
+    neutral = with_recorder(base, plant, Recorder(), always=True)
     for x in ((80.0, 1.2), (-30.0, 0.4), (0.0, 0.0)):
         for u in ((12.0,), (-0.3,), (0.0,)):
             assert (stepped(neutral, x, u) == stepped(base, x, u)).all()
@@ -96,7 +96,7 @@ def test_a_lag_that_goes_to_zero_leaves_the_likelihood_of_the_model_without():
 
     whole = likelihood(base)
     for lag in (0.0, 1e-9, 1e-6):
-        lagging = with_shown(base, plant, Shown(lag=(("speed", lag), ("thrust", lag))))
+        lagging = with_recorder(base, plant, Recorder(lag=(("speed", lag), ("thrust", lag))))
         assert likelihood(lagging) == pytest.approx(whole, abs=1e-6 + 1e5 * lag)
 
 

@@ -26,7 +26,7 @@ from tuning.reporting import leaderboard
 from tuning.reporting.consistency_figures import consistency_figure
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.figures import comparison_figure
-from tuning.reporting.panels import shown_states
+from tuning.reporting.panels import plotted_states
 from tuning.reporting.parts import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table, numbers_table
@@ -39,7 +39,7 @@ from tuning.thruster.find import find_scenario
 SEEDS = range(8)
 
 
-def proof_on(problem):
+def comparison_on(problem):
     """Rule of thumb, oracle in the tuned filter's place, and oracle on a problem, none of them compiled."""
     choices = [untuned_choice("kf", problem), oracle_choice("kf", problem), oracle_choice("kf", problem)]
     with interpreted():
@@ -50,10 +50,10 @@ def proof_on(problem):
 
 
 @pytest.fixture(scope="module")
-def proofs():
+def comparisons():
     """By number of states and whether there is truth."""
     problems = [LinearProblem(), LinearProblem(truth=False), LinearProblem(1, 1), LinearProblem(8)]
-    return {(one.n, one.truth): (one, proof_on(one)) for one in problems}
+    return {(one.n, one.truth): (one, comparison_on(one)) for one in problems}
 
 
 def printed(*parts, width=80):
@@ -64,9 +64,9 @@ def printed(*parts, width=80):
     return console.file.getvalue()
 
 
-def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(proofs):
-    problem, proof = proofs[3, True]
-    found, data = proof.true, problem.data(SEEDS)
+def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(comparisons):
+    problem, comparison = comparisons[3, True]
+    found, data = comparison.true, problem.data(SEEDS)
     with interpreted():
         estimates = run(
             oracle_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements
@@ -97,8 +97,8 @@ def test_states_with_an_infinite_scale_do_not_count():
             evaluate(filter_, data, scale)
 
 
-def test_without_truth_the_innovations_stay(proofs):
-    (_, known), (_, blind) = proofs[3, True], proofs[3, False]
+def test_without_truth_the_innovations_stay(comparisons):
+    (_, known), (_, blind) = comparisons[3, True], comparisons[3, False]
     with_truth, without = known.true, blind.true
     assert with_truth.has_truth and not without.has_truth
     assert (without.nis, without.log_likelihood) == (with_truth.nis, with_truth.log_likelihood)
@@ -125,9 +125,9 @@ def test_without_truth_the_innovations_stay(proofs):
         ((3, False), ["Innovations on here", "log L NIS div.", "Ideal: NIS 1.8"]),
     ],
 )
-def test_tables_fit_a_terminal_and_say_what_each_number_is(proofs, case, words):
-    problem, proof = proofs[case]
-    shown = printed(comparison_table(proof.evaluations, proof.bound, "here"))
+def test_tables_fit_a_terminal_and_say_what_each_number_is(comparisons, case, words):
+    problem, comparison = comparisons[case]
+    shown = printed(comparison_table(comparison.evaluations, comparison.bound, "here"))
     for word in words:
         assert word in " ".join(shown.split())
     assert max(map(len, shown.splitlines())) <= 80 and "nan" not in shown and "omega" not in shown
@@ -138,15 +138,17 @@ def test_tables_fit_a_terminal_and_say_what_each_number_is(proofs, case, words):
         assert "Q88 [K^2]" in numbers
 
 
-def test_without_a_bound_nothing_is_said_to_be_above_it(proofs):
-    problem, proof = proofs[3, True]
-    without = proof._replace(bound=np.full(3, np.nan))
+def test_without_a_bound_nothing_is_said_to_be_above_it(comparisons):
+    problem, comparison = comparisons[3, True]
+    without = comparison._replace(bound=np.full(3, np.nan))
     shown = printed(comparison_table(without.evaluations, without.bound, "here", problem.scale_about))
     assert "above" not in shown and "bound " not in shown and "expected" in shown
     assert "No bound; the score is RMSE over the scale given with the problem." in " ".join(shown.split())
-    assert "above" in printed(comparison_table(proof.evaluations, proof.bound, "here", problem.scale_about))
+    assert "above" in printed(
+        comparison_table(comparison.evaluations, comparison.bound, "here", problem.scale_about)
+    )
     assert errors_table(problem, without).columns[-1] == "expected"
-    assert errors_table(problem, proof).columns[-1] == "bound; expected"
+    assert errors_table(problem, comparison).columns[-1] == "bound; expected"
     assert score_label([problem]) == "score: mean RMSE over scale [-]"
     assert score_label([find_scenario("outliers")]) == "score: mean RMSE over bound [-]"
     assert score_label([find_scenario("outliers"), problem]) == "score: mean RMSE over scale [-]"
@@ -160,9 +162,9 @@ def test_one_zero_in_the_true_q_is_said_to_change_the_scale():
         assert problem.scale_about == words
 
 
-def test_the_tables_of_a_report_grow_downwards_with_the_states(proofs):
+def test_the_tables_of_a_report_grow_downwards_with_the_states(comparisons):
     cases = (1, True), (3, True), (8, True), (3, False)
-    few, three, many, blind = (errors_table(*proofs[case]) for case in cases)
+    few, three, many, blind = (errors_table(*comparisons[case]) for case in cases)
     assert list(few.columns[:4]) == ["filter", "score of tuned over this", "score", "RMSE p [m]"]
     first = ["score of tuned over this", "score", "RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]", "RMSE energy [J]"]
     assert [row[0] for row in three.rows][:6] == first and [row[0] for row in many.rows][:5] == first[:5]
@@ -222,8 +224,8 @@ def test_of_many_states_sentences_tell_the_worst():
 
 
 @pytest.mark.parametrize("case", [(1, True), (8, True), (3, False)])
-def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
-    problem, proof = proofs[case]
+def test_figures_are_drawn_for_any_plant(comparisons, case, tmp_path):
+    problem, comparison = comparisons[case]
     filters = {
         "one": untuned_choice("kf", problem).filter(problem),
         "two": oracle_choice("kf", problem).filter(problem),
@@ -232,23 +234,23 @@ def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
         estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     if problem.truth:
-        assert comparison_figure(tmp_path / "rmse.png", proof, "a title").is_file()
+        assert comparison_figure(tmp_path / "rmse.png", comparison, "a title").is_file()
     else:
         with pytest.raises(ValueError, match="needs the truth, but there is none"):
-            comparison_figure(tmp_path / "rmse.png", proof, "a title")
+            comparison_figure(tmp_path / "rmse.png", comparison, "a title")
 
 
 def test_of_many_states_the_scored_ones_have_panels_first():
     states = LinearProblem(8).model().states
-    assert shown_states(states[:6]) == ([0, 1, 2, 3, 4, 5], "")
-    assert shown_states(states) == ([0, 1, 2, 3, 4, 5], "2 of 8 states are left out")
-    assert shown_states(states, [2, 7]) == ([0, 1, 2, 3, 4, 7], "2 of 8 states are left out")
+    assert plotted_states(states[:6]) == ([0, 1, 2, 3, 4, 5], "")
+    assert plotted_states(states) == ([0, 1, 2, 3, 4, 5], "2 of 8 states are left out")
+    assert plotted_states(states, [2, 7]) == ([0, 1, 2, 3, 4, 7], "2 of 8 states are left out")
 
 
-def test_objectives_say_what_they_need(proofs):
-    (problem, proof), blind = proofs[3, True], proofs[3, False][0]
-    assert find_objective("output:E").value(proof.true, 0.0) == proof.true.output_rmse["E"].value
-    assert find_objective("nis").value(proof.true, 0.0) == abs(np.log(nis_ratio(proof.true)))
+def test_objectives_say_what_they_need(comparisons):
+    (problem, comparison), blind = comparisons[3, True], comparisons[3, False][0]
+    assert find_objective("output:E").value(comparison.true, 0.0) == comparison.true.output_rmse["E"].value
+    assert find_objective("nis").value(comparison.true, 0.0) == abs(np.log(nis_ratio(comparison.true)))
     assert find_objective("thrust").output == "T" == find_objective("output:T").output
     check_objectives(("likelihood", "nis", "c-nis", "cost"), blind)
     for objective in ("score", "mse", "log-score", "nees", "c-nees", "consistency", "output:E"):
@@ -262,18 +264,20 @@ def test_objectives_say_what_they_need(proofs):
         find_objective("output:")
 
 
-def test_a_report_without_truth_says_so_and_has_no_errors(proofs):
-    problem, proof = proofs[3, False]
+def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
+    problem, comparison = comparisons[3, False]
     plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), oracle_choice("kf", problem)
-    assert advice(choice, plan, [proof]).endswith("the covariance is consistent (mean NIS 1.76, expected 1.81).")
-    said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [proof]).parts
+    assert advice(choice, plan, [comparison]).endswith(
+        "the covariance is consistent (mean NIS 1.76, expected 1.81)."
+    )
+    said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [comparison]).parts
     assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
-    assert table == errors_table(problem, proof)
+    assert table == errors_table(problem, comparison)
     assert ensemble_sizes(oracle_choice("enkf", problem), plan, []) == []
 
 
-def test_numbers_of_a_filter_have_the_units_of_their_states(proofs, monkeypatch):
-    problem, _ = proofs[3, False]
+def test_numbers_of_a_filter_have_the_units_of_their_states(comparisons, monkeypatch):
+    problem, _ = comparisons[3, False]
     choice = oracle_choice("kf", problem)
     found = {"rule of thumb": untuned_choice("kf", problem), "oracle": choice}
     monkeypatch.setattr("tuning.reporting.tables.baselines", lambda *arguments: found)

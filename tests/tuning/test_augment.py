@@ -85,8 +85,8 @@ def test_every_reader_of_the_file_makes_the_same_filter(study, file, tmp_path, t
     env.reset(seed=1)
     assert env.step(env.action_space.sample())[-1]["estimate"].shape == (3,)
 
-    same = tuning.evaluate(file, seeds=5, **quiet).proof.tuned.score
-    assert tuning.evaluate(file, "ambient", seeds=5, **quiet).proof.tuned.score == same
+    same = tuning.evaluate(file, seeds=5, **quiet).comparison.tuned.score
+    assert tuning.evaluate(file, "ambient", seeds=5, **quiet).comparison.tuned.score == same
     (board,) = tuning.compare([str(file), "ekf"], "ambient", seeds=5, **quiet).boards
     assert board.rows[0].evaluation.score == same
     log, out = tmp_path / "run.csv", tmp_path / "estimates.csv"

@@ -38,11 +38,11 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
     found = baselines("kf", problem)
     assert list(found) == [GIVEN, SCALED, RULE, NOISE, ORACLE]
     np.testing.assert_array_equal(found[GIVEN].filter(problem).model.process_noise_cov, np.diag([0.5] * 3))
-    proof = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
-    assert list(proof.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
-    assert list(proof.ratios)[0] == GIVEN and proof.ratios[RULE] == (1.0, 1.0, 1.0)
-    assert " against the given numbers" in worth(proof).partition(" and ")[0]
-    assert "that of the given numbers, x " in gains(proof, "seeds")[0]
+    comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
+    assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
+    assert list(comparison.ratios)[0] == GIVEN and comparison.ratios[RULE] == (1.0, 1.0, 1.0)
+    assert " against the given numbers" in worth(comparison).partition(" and ")[0]
+    assert "that of the given numbers, x " in gains(comparison, "seeds")[0]
 
 
 def test_a_model_with_the_noise_of_its_plant_gives_nothing_for_that_is_the_oracle():
@@ -54,8 +54,8 @@ def test_the_default_of_the_user_s_function_is_the_rule_of_thumb_and_given():
     problem = altitude_problem.problem()
     assert problem.untuned == problem.given == altitude_problem.GIVEN
     assert list(baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
-    proof = evaluate_held_out(given("ekf", problem), problem, 0, 4)
-    assert list(proof.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
+    comparison = evaluate_held_out(given("ekf", problem), problem, 0, 4)
+    assert list(comparison.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
 
 
 def test_own_numbers_are_within_their_ranges_always():

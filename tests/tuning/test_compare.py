@@ -203,9 +203,9 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     scenario = find_scenario("mismatch")
     choice = untuned_choice("enkf", scenario)
     evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
-    proof = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
+    comparison = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
-    write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [proof], "s")
+    write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [comparison], "s")
     code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20)
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
     assert "Q and R: of mine the tuned ones; of ekf the plant's own (oracle; --knows true)." in out

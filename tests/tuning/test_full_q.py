@@ -103,10 +103,12 @@ def test_a_consistent_twin_has_the_same_correlation():
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 12)
     twins = [trial for trial in result.trials if RESCALED in trial.user_attrs and "R" in trial.params]
     assert twins
-    for twin in twins:
-        trial = result.trials[twin.user_attrs[f"{RESCALED} of"]]
-        assert twin.params["correlation_12"] == trial.params["correlation_12"]
-        assert twin.params["R"] / trial.params["R"] == pytest.approx(twin.params["Q11"] / trial.params["Q11"])
+    for rescaled in twins:
+        trial = result.trials[rescaled.user_attrs[f"{RESCALED} of"]]
+        assert rescaled.params["correlation_12"] == trial.params["correlation_12"]
+        assert rescaled.params["R"] / trial.params["R"] == pytest.approx(
+            rescaled.params["Q11"] / trial.params["Q11"]
+        )
 
 
 def test_the_gradient_refuses_a_budget_with_one_clear_line(tmp_path):

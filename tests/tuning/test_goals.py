@@ -203,8 +203,8 @@ def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
     assert choice_of("ekf", parameters_of(choice), plan.scenarios[0]).filter(plan.scenarios[0]).model.digest == (
         choice.filter(plan.scenarios[0]).model.digest
     )
-    ratios = result.proof.ratios
-    assert result.proof.true is not None and abs(ratios["oracle"].value - 1.0) < 0.01
+    ratios = result.comparison.ratios
+    assert result.comparison.true is not None and abs(ratios["oracle"].value - 1.0) < 0.01
     assert plan.identity["full_r"] and "full_r" not in plan._replace(full_r=False).identity
 
 

@@ -8,7 +8,7 @@ from filters.starts import Starts
 from tests.filters.test_sensitivity import pendulum
 from tests.models import random_affine
 from tests.tuning.test_identify import FREE, TRUTH, recorded
-from thruster_env.logged import Shown, logged_model
+from thruster_env.logged import Recorder, logged_model
 from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import make_plant
 from thruster_env.plants.logs.log import Log
@@ -46,7 +46,7 @@ def thruster_logs(sensors=("thrust", "speed"), first=0, speeds=((120.0, 160.0),)
 
 
 def identified(logs, sensors=("thrust", "speed"), free=OWN, **options):
-    family = ThrusterFamily(logs, make_plant(PRESET, sensors=sensors, max_voltage=12.0), Shown(), free)
+    family = ThrusterFamily(logs, make_plant(PRESET, sensors=sensors, max_voltage=12.0), Recorder(), free)
     return identify(family.data, family.model, family.free, starts=1, against=False, **options)
 
 

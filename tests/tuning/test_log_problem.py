@@ -147,17 +147,17 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     found = result.choice.model
     assert found["process_noise_cov"][0] == pytest.approx(Q, rel=0.3)
     assert found["measurement_noise_cov"] == pytest.approx(R, rel=0.15)
-    proof = evaluate_held_out(result.choice, problem, 0)
-    assert proof.seeds == problem.parts.held_out and not proof.tuned.has_truth
-    assert proof.likelihood_gains["given"].low > 0
+    comparison = evaluate_held_out(result.choice, problem, 0)
+    assert comparison.seeds == problem.parts.held_out and not comparison.tuned.has_truth
+    assert comparison.likelihood_gains["given"].low > 0
     known = identify(result.choice, (problem,), plan.training_data(), plan.space())
     assert known.identified.all() and (known.factors < 3).all()  # the errors of blocks of two runs are finite
-    said = scaling_sentence(proof)
+    said = scaling_sentence(comparison)
     assert "The scaled default is the given Q and R with this Q times" in said
     assert "give the model state_low and state_high" in said  # for the model has no ranges
-    assert "against the given numbers" in worth(proof) and "rule of thumb" not in worth(proof)
-    assert [row[0] for row in errors_table(problem, proof).rows][:2] == ["given", "scaled default"]
-    assert "given" in numbers_table(result.choice, problem, 0, proof.default).columns
+    assert "against the given numbers" in worth(comparison) and "rule of thumb" not in worth(comparison)
+    assert [row[0] for row in errors_table(problem, comparison).rows][:2] == ["given", "scaled default"]
+    assert "given" in numbers_table(result.choice, problem, 0, comparison.default).columns
 
 
 def test_what_has_ranges_has_a_rule_of_thumb():

@@ -7,7 +7,7 @@ import pytest
 
 from tests.tuning.test_identify import FREE, TRUTH, pendulum, recorded
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
-from thruster_env.logged import Shown
+from thruster_env.logged import Recorder
 from thruster_env.plant import make_plant
 from tuning.identification import identify
 from tuning.identification.gates import kept_variance, lost_information
@@ -29,7 +29,7 @@ EFFECTS = (
 
 def with_effects(logs, effects, **options):
     plant = make_plant(PRESET, sensors=("thrust", "speed"), max_voltage=12.0)
-    family = ThrusterFamily(logs, plant, Shown(), (*OWN[:2], *effects))
+    family = ThrusterFamily(logs, plant, Recorder(), (*OWN[:2], *effects))
     return identify(family.data, family.model, family.free, starts=1, **options)
 
 

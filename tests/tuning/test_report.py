@@ -64,8 +64,8 @@ def tuned(plan, trials, name="s", seeds=6):
     """A small study in a journal, and its tuned file, s.json."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     result = run_study(open_study(name, plan, open_storage(STORAGE)), plan, trials)
-    proofs = [evaluate_held_out(result.choice, scenario, plan.seed, seeds) for scenario in plan.scenarios]
-    write_tuned(f"{name}.json", plan, result, proofs, name)
+    comparisons = [evaluate_held_out(result.choice, scenario, plan.seed, seeds) for scenario in plan.scenarios]
+    write_tuned(f"{name}.json", plan, result, comparisons, name)
     return result
 
 
@@ -211,17 +211,17 @@ def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
 
 def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
     choice = untuned_choice("ekf", MISMATCH)
-    proof = evaluate_held_out(choice, MISMATCH, 0, 4)
+    comparison = evaluate_held_out(choice, MISMATCH, 0, 4)
     plan = Plan("ekf", (MISMATCH,))
-    assert advice(choice, plan, [proof]).startswith(
+    assert advice(choice, plan, [comparison]).startswith(
         "Tuning raises the score by 10 % [4, 21] against the scaled default and makes no significant difference "
         "on 4 seeds against the rule of thumb; the covariance is "
     )
-    worse = proof.untuned._replace(mean_squares=4 * proof.untuned.mean_squares)
-    said = advice(choice, plan, [proof._replace(tuned=worse)])
+    worse = comparison.untuned._replace(mean_squares=4 * comparison.untuned.mean_squares)
+    said = advice(choice, plan, [comparison._replace(tuned=worse)])
     assert "against the scaled default and by 100 % against the rule of thumb; " in said
-    blank = proof.tuned._replace(nees=Interval(np.nan, np.nan, np.nan))
-    assert advice(choice, plan, [Comparison(blank, blank, blank, proof.bound, range(4))]).endswith(
+    blank = comparison.tuned._replace(nees=Interval(np.nan, np.nan, np.nan))
+    assert advice(choice, plan, [Comparison(blank, blank, blank, comparison.bound, range(4))]).endswith(
         "makes no significant difference on 4 seeds against the rule of thumb."
     )
 

@@ -56,12 +56,12 @@ def test_where_there_is_no_scaled_default_it_says_why():
     assert found.choice is None and found.reason.startswith(
         "no factor on Q brings the mean NIS of ekf to 1: it is 4."
     )
-    proof = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
-    assert proof.scaled is None and list(proof.evaluations) == [RULE, NOISE, TUNED, ORACLE]
-    assert scaling_sentence(proof).startswith(
+    comparison = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
+    assert comparison.scaled is None and list(comparison.evaluations) == [RULE, NOISE, TUNED, ORACLE]
+    assert scaling_sentence(comparison).startswith(
         "There is no scaled default, so the rule of thumb comes first: no factor"
     )
-    assert worth(proof) == "makes no significant difference on 4 seeds against the rule of thumb"
+    assert worth(comparison) == "makes no significant difference on 4 seeds against the rule of thumb"
     with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q brings"):
         contender("ekf", "scaled").filter(startup)
 
@@ -80,39 +80,45 @@ def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
 
 def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_counts_first():
     choice = oracle_choice("ekf", MISMATCH)
-    proof = evaluate_held_out(choice, MISMATCH, 0, 40)
-    assert list(proof.evaluations) == [RULE, SCALED, NOISE, TUNED, ORACLE]
-    assert list(proof.ratios) == [SCALED, RULE, NOISE, ORACLE]
+    comparison = evaluate_held_out(choice, MISMATCH, 0, 40)
+    assert list(comparison.evaluations) == [RULE, SCALED, NOISE, TUNED, ORACLE]
+    assert list(comparison.ratios) == [SCALED, RULE, NOISE, ORACLE]
     data = MISMATCH.data(held_out_seeds(0, 40))
     default = evaluate(scaled_default("ekf", MISMATCH, 0).choice.filter(MISMATCH), data, MISMATCH.scale)
-    assert proof.ratios[SCALED] == score_ratio(proof.tuned, default) and proof.ratios[ORACLE] == (1.0, 1.0, 1.0)
-    assert proof.ratios[RULE].high < proof.ratios[SCALED].low  # the rule of thumb is the easier one to beat
-    said = worth(proof, "the error")
+    assert comparison.ratios[SCALED] == score_ratio(comparison.tuned, default) and comparison.ratios[ORACLE] == (
+        1.0,
+        1.0,
+        1.0,
+    )
+    assert (
+        comparison.ratios[RULE].high < comparison.ratios[SCALED].low
+    )  # the rule of thumb is the easier one to beat
+    said = worth(comparison, "the error")
     assert said.startswith("lowers the error by ") and " against the scaled default and by " in said
-    assert f"its Q times {proof.default.factor:.4g}" in scaling_sentence(proof)
+    assert f"its Q times {comparison.default.factor:.4g}" in scaling_sentence(comparison)
 
 
 def test_what_knows_of_no_scaled_default_says_nothing_of_it():
     found = evaluate(rule_of_thumb("ekf", MISMATCH).filter(MISMATCH), MISMATCH.data([1, 2]), MISMATCH.scale)
-    proof = Comparison(found, found, found, np.ones(2), range(2))
-    assert scaling_sentence(proof) == "" and list(proof.ratios) == [RULE, ORACLE]
+    comparison = Comparison(found, found, found, np.ones(2), range(2))
+    assert scaling_sentence(comparison) == "" and list(comparison.ratios) == [RULE, ORACLE]
 
 
 def test_three_baselines_stand_with_commas_and_a_verb_is_said_once():
     found = evaluate(rule_of_thumb("ekf", MISMATCH).filter(MISMATCH), MISMATCH.data([1, 2]), MISMATCH.scale)
-    proof = Comparison(found, found, found, np.ones(2), range(2))
+    comparison = Comparison(found, found, found, np.ones(2), range(2))
     given, default, rule = Interval(1.0, 0.9, 1.1), Interval(0.74, 0.7386, 0.7414), Interval(0.5, 0.5, 0.5)
     ratios = {RULE: rule, SCALED: default, GIVEN: given}
-    assert worth(proof._replace(kept_ratios=ratios)) == (
+    assert worth(comparison._replace(stored_ratios=ratios)) == (
         "makes no significant difference on 2 seeds against the given numbers, lowers the score by 26.0 % "
         "[25.9, 26.1] against the scaled default and by 50 % against the rule of thumb"
     )
-    said = worth(proof._replace(kept_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
+    said = worth(comparison._replace(stored_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
     many = "by 20 % [10, 30] against the"
     assert said == f"lowers the score {many} given numbers, {many} scaled default and {many} rule of thumb"
-    blind = proof._replace(tuned=found._replace(mean_squares=np.full((2, 2), np.nan)))
+    blind = comparison._replace(tuned=found._replace(mean_squares=np.full((2, 2), np.nan)))
     gains = {GIVEN: Interval(1.0, 0.5, 1.5), SCALED: Interval(0.0, 0.0, 0.0), RULE: Interval(-2.0, -3.0, -1.0)}
-    assert worth(blind._replace(kept_gains=gains)) == (
+    assert worth(blind._replace(stored_gains=gains)) == (
         "raises the log-likelihood of a run by 1.00 [0.50, 1.50] against the given numbers, by 0.00 against the "
         "scaled default and lowers the log-likelihood of a run by 2.00 [1.00, 3.00] against the rule of thumb"
     )

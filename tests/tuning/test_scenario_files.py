@@ -61,8 +61,8 @@ def test_a_tuned_filter_finds_the_file_of_its_scenario_again(file):
     choice = untuned_choice("ekf", scenario)
     evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
-    proof = Comparison(evaluation, evaluation, evaluation, np.array([1.0, 1.0]), range(2))
-    write_tuned("tuned.json", Plan("ekf", (scenario,)), result, [proof], "s")
+    comparison = Comparison(evaluation, evaluation, evaluation, np.array([1.0, 1.0]), range(2))
+    write_tuned("tuned.json", Plan("ekf", (scenario,)), result, [comparison], "s")
     assert read_tuned("tuned.json") == (choice, scenario, 0)
 
 

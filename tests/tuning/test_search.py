@@ -49,11 +49,11 @@ def test_the_winner_of_a_study_is_consistent_on_its_training_seeds_at_hardly_any
 
 def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
     result = studied(PLAN, 3)
-    untuned, twin = result.trials[:2]
-    assert violation(untuned) > 0 and twin.user_attrs[RESCALED] == 1
-    factors = {name: twin.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
+    untuned, rescaled = result.trials[:2]
+    assert violation(untuned) > 0 and rescaled.user_attrs[RESCALED] == 1
+    factors = {name: rescaled.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
     assert factors["Q11"] == pytest.approx(factors["R"]) == pytest.approx(factors["Q22"])
-    assert twin.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(twin) <= 0
+    assert rescaled.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(rescaled) <= 0
 
 
 def test_one_trial_has_the_most_likely_noise_and_finds_what_sampling_finds_late():
@@ -170,10 +170,10 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
     q, r = np.array(true.model["process_noise_cov"]) * factors[:2], scenario.measurement_noise_cov * factors[2]
     bad = true._replace(model={"process_noise_cov": tuple(q.tolist()), "measurement_noise_cov": float(r)})
     study = open_study("s", plan, optuna.storages.InMemoryStorage(), bad)
-    proof = evaluate_held_out(run_study(study, plan, 100).choice, scenario, plan.seed)
-    started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
-    assert score_ratio(started, proof.true).low > 1.1
-    assert score_ratio(proof.tuned, proof.true).high < 1.005
+    comparison = evaluate_held_out(run_study(study, plan, 100).choice, scenario, plan.seed)
+    started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
+    assert score_ratio(started, comparison.true).low > 1.1
+    assert score_ratio(comparison.tuned, comparison.true).high < 1.005
 
 
 def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):

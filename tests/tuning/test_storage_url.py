@@ -9,7 +9,7 @@ import sqlalchemy
 from tuning.reporting.subject import find_subject
 from tuning.search import database
 from tuning.search.storage import open_storage
-from tuning.search.storage_url import shown_storage, without_secrets
+from tuning.search.storage_url import public_url, without_secrets
 
 SHOWN = {
     "postgresql+psycopg2://tuner:secret@host:5432/studies": "postgresql+psycopg2://host:5432/studies",
@@ -39,7 +39,7 @@ SHOWN = {
 
 @pytest.mark.parametrize(("storage", "shown"), SHOWN.items(), ids=list(SHOWN))
 def test_scheme_host_and_database_are_shown_and_nothing_else(storage, shown):
-    assert shown_storage(storage) == shown
+    assert public_url(storage) == shown
     said = f"could not connect to {storage}: password secret, or cret@host, or se"
     said = without_secrets(said, storage)
     if shown != storage:

@@ -39,14 +39,16 @@ def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_se
     assert first == pytest.approx(dict(parameters_of(untuned_choice("ekf", SCENARIO))))
     true = SCENARIO.true["process_noise_cov"]
     assert all((t.params["Q11"], t.params["Q22"]) != true for t in result.trials)
-    proof = evaluate_held_out(result.choice, SCENARIO, 0, 100)
-    assert proof.tuned.score.high < proof.untuned.score.low
+    comparison = evaluate_held_out(result.choice, SCENARIO, 0, 100)
+    assert comparison.tuned.score.high < comparison.untuned.score.low
     assert result.best_value < result.trials[0].value
 
     path = tmp_path / "tuned.json"
-    write_tuned(path, PLAN, result, [proof], "s")
+    write_tuned(path, PLAN, result, [comparison], "s")
     assert read_tuned(path) == (result.choice, SCENARIO, 0)
-    assert json.loads(path.read_text())["held_out"]["mismatch"]["tuned"]["rmse"][0] == list(proof.tuned.rmse[0])
+    assert json.loads(path.read_text())["held_out"]["mismatch"]["tuned"]["rmse"][0] == list(
+        comparison.tuned.rmse[0]
+    )
 
 
 def test_the_same_seed_gives_the_same_study_and_another_seed_another():

@@ -75,7 +75,7 @@ def test_a_thinned_line_keeps_its_extremes_and_its_ends():
 def test_a_pair_shows_what_is_the_same_once():
     table, other = Table("", ["", "a"], [["x", "1"]]), Table("", ["", "a"], [["x", "2"]])
     parts = [Pair(["A", "B"], [table, table]), Pair(["A", "B"], [table, other]), Pair(["A", "B"], [table, None])]
-    text = html_page("t", ["one", "two"], [Section("s", parts)], beside=True)
+    text = html_page("t", ["one", "two"], [Section("s", parts)], two_columns=True)
     assert text.count('class="whose"') == 4 and text.count("<table") == 4 and text.count('class="advice"') == 2
 
 

@@ -14,7 +14,7 @@ from filters.tuned_file import read_tuned_file
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
-from tuning.api.own_numbers import own_choice
+from tuning.api.user_choice import user_choice
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED
 from tuning.evaluation.tuned import read_tuned
 from tuning.reporting.choice_words import choice_sentences
@@ -205,7 +205,7 @@ def test_own_numbers_are_evaluated_and_compared():
     found = tuning.evaluate(make_filter("kf", model), problem, seeds=10, progress=False)
     assert list(found.evaluations) == [RULE, SCALED, NOISE, "own numbers", ORACLE]
     assert found.choice.model["process_noise_cov"] == (1.0, 1.0, 1.0) and "own numbers" in str(found)
-    assert own_choice(model, problem).name == "ekf"
+    assert user_choice(model, problem).name == "ekf"
     compared = tuning.compare([model, "kf"], problem, seeds=10, progress=False)
     assert [row.label for row in compared.boards[0].rows] == ["ekf own numbers", "kf"]
     with pytest.raises(ValueError, match="own numbers must be of the model of"):

@@ -23,9 +23,9 @@ def content(tmp_path_factory):
     """What a tuned file of a small study on two scenarios holds."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 2)
-    proofs = [evaluate_held_out(result.choice, scenario, PLAN.seed, 4) for scenario in PLAN.scenarios]
+    comparisons = [evaluate_held_out(result.choice, scenario, PLAN.seed, 4) for scenario in PLAN.scenarios]
     path = tmp_path_factory.mktemp("tuned") / "tuned.json"
-    write_tuned(path, PLAN, result, proofs, "s")
+    write_tuned(path, PLAN, result, comparisons, "s")
     return json.loads(path.read_text())
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import SAMPLE_TIME
-from thruster_env.numerics.checks import finite, positive, shown, vector
+from thruster_env.numerics.checks import finite, positive, short_repr, vector
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
 from thruster_env.plants.disturbances.effects import LONGEST, Effect, Registry, set_field
@@ -130,7 +130,7 @@ class Constant(Effect):
 def held_time(name: str, value) -> float:
     """Return a time for which a level is held [s]; raise ValueError unless it is positive and at most LONGEST."""
     if (time := positive(name, value)) > LONGEST:
-        raise ValueError(f"{name} must be at most {LONGEST:g} s, but got {shown(value)}")
+        raise ValueError(f"{name} must be at most {LONGEST:g} s, but got {short_repr(value)}")
     return time
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from thruster_env.numerics.checks import one_of, positive, shown
+from thruster_env.numerics.checks import one_of, positive, short_repr
 from thruster_env.numerics.streams import PARAMETERS, normal_block, uniform_block
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plants.disturbances.effects import set_field
@@ -92,7 +92,9 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
     if given is None:
         return {}
     if not isinstance(given, Mapping):
-        raise ValueError(f"uncertainty must be a mapping from parameters to distributions, but got {shown(given)}")
+        raise ValueError(
+            f"uncertainty must be a mapping from parameters to distributions, but got {short_repr(given)}"
+        )
     made = {}
     for parameter, distribution in given.items():
         one_of("a name in uncertainty", parameter, UNCERTAIN)
@@ -102,12 +104,12 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
         names = ", ".join(DISTRIBUTIONS)
         rule = f"the distribution of {parameter} must be a mapping with arguments and a name out of {names}"
         if not isinstance(distribution, Mapping) or distribution.get("name") not in tuple(DISTRIBUTIONS):
-            raise ValueError(f"{rule}, but got {shown(distribution)}")
+            raise ValueError(f"{rule}, but got {short_repr(distribution)}")
         arguments = {key: value for key, value in distribution.items() if key != "name"}
         try:
             made[parameter] = DISTRIBUTIONS[distribution["name"]](**arguments)
         except TypeError:
-            raise ValueError(f"{rule}, but got {shown(distribution)}") from None
+            raise ValueError(f"{rule}, but got {short_repr(distribution)}") from None
     return made
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.numerics.compiled import inlined, kept_apart
+from thruster_env.numerics.compiled import inlined, not_inlined
 
 
 def called(function):
@@ -16,7 +16,7 @@ def called(function):
     return inlined(function, into_callers=False)
 
 
-@kept_apart
+@not_inlined
 def _products_of_rows(a, b, lower):
     """A b', or its part on and below the diagonal, in blocks of two rows of a and four of b that share reads.
 
@@ -49,13 +49,13 @@ def _products_of_rows(a, b, lower):
     return out
 
 
-@kept_apart
+@not_inlined
 def product_of_rows(a, b):
     """A b'."""
     return _products_of_rows(a, b, False)
 
 
-@kept_apart
+@not_inlined
 def add_product(out, a, b):
     """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
     rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
@@ -79,7 +79,7 @@ def product(a, b):
     return out
 
 
-@kept_apart
+@not_inlined
 def sparse_product(a, b):
     """A b; where four entries of a that lie side by side are zero, nothing is added."""
     out = np.zeros((a.shape[0], b.shape[1]))
@@ -102,7 +102,7 @@ def sparse_product(a, b):
     return out
 
 
-@kept_apart
+@not_inlined
 def deviations(table, first, rows, means, size):
     """Deviations from means (rows,) of `rows` rows of a table, starting at row `first`, and `size` columns."""
     out = np.empty((rows, size))
@@ -127,7 +127,7 @@ def weighted_square_of_rows(d, table, weights):
     return out
 
 
-@kept_apart
+@not_inlined
 def square_of_rows(a):
     """A a', exactly symmetric."""
     out = _products_of_rows(a, a, True)
@@ -137,7 +137,7 @@ def square_of_rows(a):
     return out
 
 
-@kept_apart
+@not_inlined
 def solve_rows(b, factor):
     """B (l l')^-1 for a lower triangular l: forward, then backward substitution for all rows of b at a time."""
     rows, size = b.shape

@@ -13,7 +13,7 @@ FEW, MANY = 4, 8  # choices that a message names of more than so many
 MOST_LISTED, LONG = 24, 80  # names that a message has, and characters of each
 
 
-def shown(value) -> str:
+def short_repr(value) -> str:
     """A value for an error message, on one line and not too long."""
     try:
         text = " ".join(repr(value).split())
@@ -38,7 +38,7 @@ def as_floats(value) -> np.ndarray:
             raise TypeError
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last of tensors, and of endless lists
-        raise ValueError(f"an array must be one of numbers, but got {shown(value)}") from None
+        raise ValueError(f"an array must be one of numbers, but got {short_repr(value)}") from None
 
 
 def finite(name: str, value) -> float:
@@ -48,7 +48,7 @@ def finite(name: str, value) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number, but got {shown(value)}")
+        raise ValueError(f"{name} must be a finite number, but got {short_repr(value)}")
     return number
 
 
@@ -57,7 +57,7 @@ def positive(name: str, value, *, zero_allowed: bool = False) -> float:
     number = finite(name, value)
     if number < 0 or (number == 0 and not zero_allowed):
         rule = "zero or positive" if zero_allowed else "positive"
-        raise ValueError(f"{name} must be {rule}, but got {shown(value)}")
+        raise ValueError(f"{name} must be {rule}, but got {short_repr(value)}")
     return number
 
 
@@ -65,7 +65,7 @@ def within(name: str, value, limit: float) -> float:
     """Return value as a float; raise ValueError unless it is finite and within plus and minus limit."""
     number = finite(name, value)
     if abs(number) > limit:
-        raise ValueError(f"{name} must be within plus and minus {limit:g}, but got {shown(value)}")
+        raise ValueError(f"{name} must be within plus and minus {limit:g}, but got {short_repr(value)}")
     return number
 
 
@@ -74,7 +74,7 @@ def between(name: str, value, low: float, high: float, unit: str = "") -> float:
     number = finite(name, value)
     if not low <= number <= high:
         rule = f"from {low:g} to {high:g}" + (f" {unit}" if unit else "")
-        raise ValueError(f"{name} must be {rule}, but got {shown(value)}")
+        raise ValueError(f"{name} must be {rule}, but got {short_repr(value)}")
     return number
 
 
@@ -82,16 +82,16 @@ def at_least(name: str, value, least: int, most: int | None = None) -> int:
     """Return value as an int; raise ValueError unless it is a whole number from `least` to `most`, if given."""
     number = finite(name, value)
     if number != int(number) or number < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, but got {shown(value)}")
+        raise ValueError(f"{name} must be a whole number of at least {least}, but got {short_repr(value)}")
     if most is not None and number > most:
-        raise ValueError(f"{name} must be at most {most}, but got {shown(value)}")
+        raise ValueError(f"{name} must be at most {most}, but got {short_repr(value)}")
     return int(number)
 
 
 def switch(name: str, value) -> int:
     """Return value as an int; raise ValueError unless it is 0 or 1."""
     if at_least(name, value, 0) > 1:
-        raise ValueError(f"{name} must be 0 or 1, but got {shown(value)}")
+        raise ValueError(f"{name} must be 0 or 1, but got {short_repr(value)}")
     return int(value)
 
 
@@ -100,14 +100,14 @@ def seed(value) -> int | None:
     if value is None:
         return None
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise ValueError(f"a seed must be None or a whole number of at least 0, but got {shown(value)}")
+        raise ValueError(f"a seed must be None or a whole number of at least 0, but got {short_repr(value)}")
     return int(value)
 
 
 def options(value) -> Mapping:
     """Return the options of a reset, {} for None; raise ValueError unless they are a mapping or None."""
     if value is not None and not isinstance(value, Mapping):
-        raise ValueError(f"options must be None or a mapping, but got {shown(value)}")
+        raise ValueError(f"options must be None or a mapping, but got {short_repr(value)}")
     return {} if value is None else value
 
 
@@ -121,7 +121,7 @@ def one_of(name: str, value, choices: Iterable[str], listed: str | None = None) 
         near, told = meant(value, known), ", ".join(known)
         if listed is not None and near and len(known) > MANY:
             told = f"{', '.join(known[:FEW])} and {len(known) - FEW} more ({listed} lists all)"
-        raise ValueError(f"{name} must be one of {told}, but got {shown(value)}{near}")
+        raise ValueError(f"{name} must be one of {told}, but got {short_repr(value)}{near}")
     return value
 
 
@@ -158,7 +158,7 @@ def vector(name: str, value, size: int | None = None) -> np.ndarray:
     if array.ndim != 1 or not array.size or array.size != (size or array.size) or not np.isfinite(array).all():
         count = size or array.size or "some"
         raise ValueError(
-            f"{name} must be {count} finite number{'' if count == 1 else 's'}, but got {shown(value)}"
+            f"{name} must be {count} finite number{'' if count == 1 else 's'}, but got {short_repr(value)}"
         )
     return array
 
@@ -180,18 +180,20 @@ def covariance(
     try:
         array = np.atleast_1d(as_floats(value))
     except ValueError:
-        raise ValueError(f"{rule}, but got {shown(value)}") from None
+        raise ValueError(f"{rule}, but got {short_repr(value)}") from None
     if array.shape == (size,):
         array = np.diag(array)
     if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
-        raise ValueError(f"{rule} of finite numbers, but got {shown(value)}")
+        raise ValueError(f"{rule} of finite numbers, but got {short_repr(value)}")
     if np.abs(array).max() > largest:
-        raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {shown(value)}")
+        raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {short_repr(value)}")
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -rounding * max(1e-300, abs(eigenvalues[-1])) or np.diag(array).min() < 0:
-        raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")
+        raise ValueError(
+            f"{name} must be positive semidefinite (no negative variance), but got {short_repr(value)}"
+        )
     if positive_definite and eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
-        raise ValueError(f"{name} must be positive definite, but got {shown(value)}")
+        raise ValueError(f"{name} must be positive definite, but got {short_repr(value)}")
     return (array + array.T) / 2
 
 

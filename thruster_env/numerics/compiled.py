@@ -60,7 +60,7 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
     return function
 
 
-def kept_apart(function: Callable) -> Callable:
+def not_inlined(function: Callable) -> Callable:
     """Mark a plain function that is never inlined: there is one copy of it, however many functions call it.
 
     It is meant for long loops, where the cost of a call does not matter. LLVM may still inline other functions.

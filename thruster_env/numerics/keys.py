@@ -8,7 +8,7 @@ import numpy as np
 
 from thruster_env.numerics.checks import options as checked_options
 from thruster_env.numerics.checks import seed as checked_seed
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.streams import draw_keys
 
 KEYS_AHEAD = 16  # that a copy draws at a time: a call of its generator costs more than a step
@@ -50,7 +50,7 @@ class EpisodeKeys:
         count = self.count
         if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim == 1):
             if len(seed) != count:
-                raise ValueError(f"seed must be None, a number or {count} of these, but got {shown(seed)}")
+                raise ValueError(f"seed must be None, a number or {count} of these, but got {short_repr(seed)}")
             return [checked_seed(entry) for entry in seed]
         first = checked_seed(seed)
         return [None if first is None else first + i for i in range(count)]
@@ -78,7 +78,9 @@ def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
     except ValueError:  # rows of different lengths
         given = np.empty(0)
     if given.shape != (count,) or given.dtype != np.bool_ or not given.any():
-        raise ValueError(f"reset_mask must be {count} booleans, at least one of them true, but got {shown(mask)}")
+        raise ValueError(
+            f"reset_mask must be {count} booleans, at least one of them true, but got {short_repr(mask)}"
+        )
     if not keys.seeded and not given.all():
-        raise ValueError(f"reset_mask must have all copies at the first reset, but got {shown(mask)}")
+        raise ValueError(f"reset_mask must have all copies at the first reset, but got {short_repr(mask)}")
     return given.copy()

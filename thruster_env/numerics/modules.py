@@ -81,17 +81,17 @@ def working_folder_last() -> Iterator[None]:
     if folder in sys.path or "" in sys.path:
         yield
         return
-    _BESIDE.folders.add(folder)
-    if _BESIDE not in sys.meta_path:
-        sys.meta_path.append(_BESIDE)  # after all others
-    _BESIDE.open.append(folder)
+    _USER_FOLDERS.folders.add(folder)
+    if _USER_FOLDERS not in sys.meta_path:
+        sys.meta_path.append(_USER_FOLDERS)  # after all others
+    _USER_FOLDERS.open.append(folder)
     try:
         yield
     finally:
-        _BESIDE.open.pop()
+        _USER_FOLDERS.open.pop()
 
 
-class _Beside:
+class _UserFolders:
     """Finds modules in a user's folder: within `working_folder_last`, and later for modules of the same folder."""
 
     def __init__(self):
@@ -111,7 +111,7 @@ class _Beside:
         return PathFinder.find_spec(name, [folder]) if folder is not None and folder in self.folders else None
 
 
-_BESIDE = _Beside()
+_USER_FOLDERS = _UserFolders()
 
 
 def _folder_of(name: str) -> str | None:

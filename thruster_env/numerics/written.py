@@ -30,11 +30,11 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
     names["__name__"] = __name__  # without a module, pickling for numba's cache searches all of them
     body = "".join(f"    {line}\n" for line in (*lines[:-1], f"return {lines[-1]}"))
     text = f"def {name}({arguments}):\n{body}"
-    exec(compile(text, _shown_in_tracebacks(name, text), "exec"), names)
+    exec(compile(text, _name_in_tracebacks(name, text), "exec"), names)
     return inlined(names[name], into_callers=not _loops)
 
 
-def _shown_in_tracebacks(name: str, text: str) -> str:
+def _name_in_tracebacks(name: str, text: str) -> str:
     """A file name for a text, under which `linecache` finds it.
 
     Numba finds machine code again by the function's code, of which the name is a part: so it holds a digest of the

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy import ndarray
 
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.plants.quantities import Quantity
 
 
@@ -24,7 +24,7 @@ def one_number(action, quantity: Quantity) -> float:
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
         number = math.nan
     if number != number:
-        raise ValueError(f"an action must be one {quantity.label} and not NaN, but got {shown(action)}")
+        raise ValueError(f"an action must be one {quantity.label} and not NaN, but got {short_repr(action)}")
     return number
 
 
@@ -36,7 +36,7 @@ def some_numbers(action, quantities: tuple[Quantity, ...]) -> np.ndarray:
         numbers = np.empty(0)
     if numbers.shape != (len(quantities),) or np.isnan(numbers).any():
         rule = f"{len(quantities)} numbers and not NaN ({_labels(quantities)})"
-        raise ValueError(f"an action must be {rule}, but got {shown(action)}")
+        raise ValueError(f"an action must be {rule}, but got {short_repr(action)}")
     return numbers
 
 
@@ -58,7 +58,7 @@ def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: n
     except ValueError:
         commands = np.empty(0)
     if commands.shape != (copies, p) and (p > 1 or commands.shape != (copies,)):
-        raise ValueError(f"actions must be {copies} {_rows(quantities)}, but got {shown(actions)}")
+        raise ValueError(f"actions must be {copies} {_rows(quantities)}, but got {short_repr(actions)}")
     wrong = np.isnan(commands)
     if wrong.any():
         lost = wrong.reshape(copies, -1).any(axis=1)

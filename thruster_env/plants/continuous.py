@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from thruster_env.numerics.checks import at_least, covariance, positive, shown, vector
+from thruster_env.numerics.checks import at_least, covariance, positive, short_repr, vector
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.derivatives import jacobian
 from thruster_env.numerics.integration import runge_kutta
@@ -95,8 +95,9 @@ class ContinuousModel:
         moved, own = (f(x, u, model.constants) for f in (runge_kutta(rates, n), model.transition))
         if not np.allclose(moved, own, rtol=1e-9, atol=1e-12):
             raise ValueError(
-                f"rates must be those of the model, whose step from {shown(x)} leads to {shown(own)}, but theirs "
-                f"leads to {shown(moved)}"
+                f"rates must be those of the model, whose step from {short_repr(x)} leads to {short_repr(own)}, "
+                f"but theirs "
+                f"leads to {short_repr(moved)}"
             )
         densities = densities_of(model.process_noise_cov, plain.slope, step * model.substeps)
         return dataclasses.replace(plain, densities=densities)
@@ -186,7 +187,7 @@ class AtDt:
 
 def _check_constants(constants: Any) -> None:
     if "substep" not in getattr(constants, "_fields", ()):
-        raise ValueError(f"constants must be a NamedTuple with a field substep, but got {shown(constants)}")
+        raise ValueError(f"constants must be a NamedTuple with a field substep, but got {short_repr(constants)}")
 
 
 @makes_functions

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from thruster_env.numerics.checks import as_floats, covariance, positive, shown
+from thruster_env.numerics.checks import as_floats, covariance, positive, short_repr
 
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
@@ -73,5 +73,5 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
     except ValueError:
         raise ValueError(
             "process_noise_cov must be that of white noise in continuous time (a state driven by others has part "
-            f"of their noise within a step), but got {shown(q.tolist())} for a step of {dt:g} s"
+            f"of their noise within a step), but got {short_repr(q.tolist())} for a step of {dt:g} s"
         ) from None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.modules import said
 from thruster_env.numerics.sources import as_value, is_array
 
@@ -24,7 +24,7 @@ def checked_constants(given) -> tuple:
             raise ValueError
     except (TypeError, ValueError):
         rule = "constants must be a NamedTuple or a tuple of finite numbers"
-        raise ValueError(f"{rule}, but got {shown(given)}") from None
+        raise ValueError(f"{rule}, but got {short_repr(given)}") from None
     return given if hasattr(given, "_fields") else tuple(values.tolist())
 
 
@@ -48,7 +48,7 @@ def check_functions(model) -> None:
 
 def _check_arguments(name: str, function: Callable, arguments: str) -> None:
     if not callable(function):
-        raise ValueError(f"{name} must be a function of ({arguments}), but got {shown(function)}")
+        raise ValueError(f"{name} must be a function of ({arguments}), but got {short_repr(function)}")
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # some are written in C
@@ -90,7 +90,7 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
         if found != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
         if must_be_known and np.isnan(as_floats(result)).any():
-            raise ValueError(_not_nan(name, shown(result)))
+            raise ValueError(_not_nan(name, short_repr(result)))
         return
 
 
@@ -108,10 +108,10 @@ def _shape(result) -> tuple[int, ...] | None:
 
 def _said(shape: tuple[int, ...] | None, result) -> str:
     if shape is None or len(shape) > 2:
-        return shown(result)
+        return short_repr(result)
     if len(shape) == 1:
         return _count(shape[0], "entry").replace("entrys", "entries")
-    return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {shown(result)}"
+    return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {short_repr(result)}"
 
 
 def _form(count: int) -> str:

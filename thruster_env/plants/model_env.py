@@ -8,7 +8,7 @@ from functools import cache, partial
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import positive, shown
+from thruster_env.numerics.checks import positive, short_repr
 from thruster_env.numerics.checks import seed as checked_seed
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.numerics.streams import GROUP, draw_key
@@ -55,7 +55,7 @@ class ModelEnv(gym.Env):
     ):
         """Make spaces and memory; see the class for the arguments."""
         if not isinstance(truth, StateSpaceModel):
-            raise ValueError(f"the truth of an env must be a StateSpaceModel, but it is {shown(truth)}")
+            raise ValueError(f"the truth of an env must be a StateSpaceModel, but it is {short_repr(truth)}")
         self.truth, self.dt = truth, None if dt is None else positive("dt", dt)
         assumed = truth if assumed is None else assumed
         self.state_space_model = partial(with_noise, assumed) if isinstance(assumed, StateSpaceModel) else assumed

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.disturbances.effects import Effect
 
 
@@ -47,7 +47,7 @@ def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str
     """
     for data in (then, now):
         if not isinstance(data, Mapping) or set(data) != set(entries.names):
-            raise ValueError(f"a plant's data must have {', '.join(entries.names)}, but got {shown(data)}")
+            raise ValueError(f"a plant's data must have {', '.join(entries.names)}, but got {short_repr(data)}")
     compared = [name for name in entries.names if name not in ("preset", "parameters")]
     differing = [name for name in compared if not _alike(then[name], now[name])]
     essential = [_both(name, then[name], now[name]) for name in differing if name in entries.essential]
@@ -75,7 +75,7 @@ def _both(name: str, then, now) -> str:
 
 def _words(value) -> str:
     listed = isinstance(value, list) and value and all(isinstance(part, str) for part in value)
-    return ", ".join(value) if listed else value if isinstance(value, str) else shown(value)
+    return ", ".join(value) if listed else value if isinstance(value, str) else short_repr(value)
 
 
 def _alike(one, other) -> bool:

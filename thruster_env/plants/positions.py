@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 
 
 class Positions(NamedTuple):
@@ -29,10 +29,12 @@ class Positions(NamedTuple):
         for name, part, count in (("states", states, n), ("measurements", measurements, m)):
             if part.shape != (count, states.shape[-1]) or not np.isfinite(part).all():
                 rule = f"({count}, {states.shape[-1]}) finite numbers"
-                raise ValueError(f"positions of {name} must be {rule}, but got {shown(getattr(self, name))}")
+                raise ValueError(f"positions of {name} must be {rule}, but got {short_repr(getattr(self, name))}")
         period = np.full(states.shape[1], np.inf) if self.period is None else as_floats(np.atleast_1d(self.period))
         if period.shape != states.shape[1:] or not (period > 0).all():
-            raise ValueError(f"period must be {states.shape[1]} positive numbers, but got {shown(self.period)}")
+            raise ValueError(
+                f"period must be {states.shape[1]} positive numbers, but got {short_repr(self.period)}"
+            )
         return Positions(states, measurements, period)
 
     def distances(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:

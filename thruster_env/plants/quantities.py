@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from thruster_env.numerics.characters import verbatim
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 
 LONG = 60  # characters of a name that an axis has room for
 
@@ -90,7 +90,9 @@ def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> 
     if given is None:
         return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))
     if not _are_several(given) or len(given) != count:
-        raise ValueError(f"{kind} must be {count} quantities or names, as {counted} says, but got {shown(given)}")
+        raise ValueError(
+            f"{kind} must be {count} quantities or names, as {counted} says, but got {short_repr(given)}"
+        )
     found = tuple(_quantity(kind, one) for one in given)
     symbols = [one.symbol for one in found]
     if len(set(symbols)) < count:
@@ -109,7 +111,7 @@ def _quantity(kind: str, given) -> Quantity:
         made = None
     if made is None or not _is_valid(made):
         rule = f"each of {kind} must be a name, or have name, symbol (letters, digits, _ and -), unit and angle"
-        raise ValueError(f"{rule}, and an angle the unit rad, but got {shown(given)}")
+        raise ValueError(f"{rule}, and an angle the unit rad, but got {short_repr(given)}")
     return made
 
 
@@ -122,11 +124,11 @@ def _is_valid(one: Quantity) -> bool:
 def outputs(given: Mapping[str, Output | Sequence]) -> dict[str, Output]:
     """Outputs by symbol, each an `Output` or (quantity, function); ValueError states the rule and the value."""
     if not isinstance(given, Mapping):
-        raise ValueError(f"outputs must map symbols to quantities and functions, but got {shown(given)}")
+        raise ValueError(f"outputs must map symbols to quantities and functions, but got {short_repr(given)}")
     found = {}
     for symbol, one in given.items():
         if not isinstance(one, Sequence) or len(one) != 2 or not callable(one[1]):
-            raise ValueError(f"the output {symbol!r} must be a quantity and a function, but got {shown(one)}")
+            raise ValueError(f"the output {symbol!r} must be a quantity and a function, but got {short_repr(one)}")
         found[symbol] = Output(_quantity(f"outputs, {symbol}", one[0]), one[1])
     return found
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, short_repr
 
 if TYPE_CHECKING:
     from thruster_env.plants.rendering.renderer import PlantRenderer
@@ -22,7 +22,7 @@ def checked_size(size: Sequence[int] | None) -> tuple[int, int] | None:
     if size is None:
         return None
     if not isinstance(size, (tuple, list)) or len(size) != 2:
-        raise ValueError(f"render_size must be None or (width, height) in pixels, but got {shown(size)}")
+        raise ValueError(f"render_size must be None or (width, height) in pixels, but got {short_repr(size)}")
     width, height = (
         at_least(f"the {side} of render_size", value, SMALLEST, LARGEST)
         for side, value in zip(("width", "height"), size, strict=True)

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.numerics.checks import seed as checked_seed
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import object_named, said
 from thruster_env.plants.commands import some_numbers
 from thruster_env.plants.continuous import ContinuousModel, continuous_of, in_discrete_time
@@ -137,7 +137,7 @@ def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
         return partial(offer, dt=dt) if takes_dt else offer
     raise ValueError(
         "the model of a log must be a StateSpaceModel, a function that makes one, or an object with "
-        f"state_space_model, but got {shown(offer)}"
+        f"state_space_model, but got {short_repr(offer)}"
     )
 
 
@@ -148,8 +148,10 @@ def _made(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
         raise
     except Exception as error:
         raise ValueError(
-            f"the model of a log must be made without arguments, but {shown(named)} raised {said(error)}"
+            f"the model of a log must be made without arguments, but {short_repr(named)} raised {said(error)}"
         ) from error
     if not isinstance(found, StateSpaceModel):
-        raise ValueError(f"the model of a log must be a StateSpaceModel, but {shown(named)} makes {shown(found)}")
+        raise ValueError(
+            f"the model of a log must be a StateSpaceModel, but {short_repr(named)} makes {short_repr(found)}"
+        )
     return found

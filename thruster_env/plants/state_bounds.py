@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.quantities import Quantity
 
 
@@ -30,7 +30,7 @@ def checked_bounds(given: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
         place = symbols.index(name) if name in symbols else name
         if not isinstance(place, int) or not 0 <= place < len(states) or states[place].angle:
             known = ", ".join(one.symbol for one in states if not one.angle)
-            raise ValueError(f"bounds must be of states {known}, and not of angles, but got {shown(name)}")
+            raise ValueError(f"bounds must be of states {known}, and not of angles, but got {short_repr(name)}")
         try:
             low, high = pair
             low, high = (-math.inf if low is None else float(low)), (math.inf if high is None else float(high))
@@ -38,7 +38,7 @@ def checked_bounds(given: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
             low = high = math.nan
         if not low < high or low == math.inf or high == -math.inf:
             rule = f"bounds of {symbols[place]} must be two increasing numbers, of which one may be None"
-            raise ValueError(f"{rule}, but got {shown(pair)}")
+            raise ValueError(f"{rule}, but got {short_repr(pair)}")
         if low > -math.inf or high < math.inf:
             found.append(Bound(place, low, high))
     return tuple(sorted(found))

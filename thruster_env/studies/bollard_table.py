@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 
 COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]
@@ -86,7 +86,7 @@ def _numbers(row: dict, place: str) -> list[float]:
         values = [math.nan]
     if not all(map(math.isfinite, values)):
         raise ValueError(
-            f"{place}: {', '.join(COLUMNS)} must be numbers, but are {shown([row[n] for n in COLUMNS])}"
+            f"{place}: {', '.join(COLUMNS)} must be numbers, but are {short_repr([row[n] for n in COLUMNS])}"
         )
     return values
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.logged import Shown, logged_model
+from thruster_env.logged import Recorder, logged_model
 from thruster_env.numerics.checks import at_least
 from thruster_env.numerics.markdown import table
 from thruster_env.numerics.streams import episode_keys
@@ -89,7 +89,7 @@ def record(seed: int, runs: int = 6, steps: int = 500) -> list[Log]:
 def repetition(seed: int, *, starts: int = 2, runs: int = 6, steps: int = 500) -> Identification:
     """One identification from the preset."""
     plant = make_plant(PRESET, sensors=SENSORS, max_voltage=AMPLITUDE)
-    family = ThrusterFamily(record(seed, runs, steps), plant, Shown(), tuple(TRUTH))
+    family = ThrusterFamily(record(seed, runs, steps), plant, Recorder(), tuple(TRUTH))
     return identify(family.data, family.model, family.free, starts=starts, seed=seed, against=False)
 
 

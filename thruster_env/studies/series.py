@@ -9,7 +9,7 @@ import numpy as np
 
 from filters import EnsembleKalmanFilter, KalmanFilter, run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
-from filters.looks import TRUTH, look
+from filters.plot_styles import TRUTH, plot_style
 from thruster_env.linear.figures import STATES
 from thruster_env.linear.published import SAMPLE_TIME
 from thruster_env.numerics.checks import at_least
@@ -20,8 +20,8 @@ from thruster_env.studies.published import NOISE_LEVELS, STEPS, SYSTEMS
 
 LINES = {
     "truth": TRUTH,
-    "KF": look("kf") | {"linewidth": 1.2},
-    "EnKF": look("enkf") | {"linewidth": 1.2, "linestyle": (0, (3, 2))},  # in whose gaps the other is seen
+    "KF": plot_style("kf") | {"linewidth": 1.2},
+    "EnKF": plot_style("enkf") | {"linewidth": 1.2, "linestyle": (0, (3, 2))},  # in whose gaps the other is seen
 }
 
 

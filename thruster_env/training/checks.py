@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from filters.registry import tunable_numbers
-from thruster_env.numerics.checks import at_least, one_of, positive, shown
+from thruster_env.numerics.checks import at_least, one_of, positive, short_repr
 from thruster_env.training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
 from thruster_env.training.observations import find_observation_set
 from thruster_env.training.plants.find import plant_of
@@ -26,7 +26,7 @@ def check_configuration(setup: TrainingConfiguration) -> None:
     one_of("env_id", setup.env_id, (plant.tasks[setup.task].env_id,))
     observed, algorithm = find_observation_set(setup.observe), find_algorithm(setup.algo)
     if not isinstance(setup.scenario, str):
-        raise ValueError(f"scenario must be a name, but got {shown(setup.scenario)}")
+        raise ValueError(f"scenario must be a name, but got {short_repr(setup.scenario)}")
     for name, least in (("steps", 1), ("seed", 0), ("num_envs", 1)):
         at_least(name, getattr(setup, name), least)
     if setup.controller is not None:
@@ -45,7 +45,7 @@ def check_configuration(setup: TrainingConfiguration) -> None:
 
 def _check_known(name: str, given, known: Iterable[str]) -> None:
     if not isinstance(given, Mapping):
-        raise ValueError(f"{name} must be a mapping, but got {shown(given)}")
+        raise ValueError(f"{name} must be a mapping, but got {short_repr(given)}")
     unknown = [key for key in given if key not in known]
     if unknown:
         raise ValueError(
@@ -66,4 +66,6 @@ def _check_data(name: str, value) -> None:
         _check_data(name, part)
     plain = value is None or isinstance(value, str | int | float | list | tuple | Mapping)
     if not plain or (isinstance(value, float) and not math.isfinite(value)):
-        raise ValueError(f"{name} must be data: text, finite numbers, lists and mappings, but got {shown(value)}")
+        raise ValueError(
+            f"{name} must be data: text, finite numbers, lists and mappings, but got {short_repr(value)}"
+        )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.plants.rendering.film import OnStep, Played, check_drawing, steps_a_frame, write_film
+from thruster_env.plants.rendering.video import OnStep, Played, check_drawing, steps_a_frame, write_video
 from thruster_env.training.environments import episode_steps, make_environments
 from thruster_env.training.saved import load, read_configuration
 
@@ -55,7 +55,7 @@ def play(
                 frames.append(env.render())
             on_step(steps, count)
         if video is not None:
-            write_film(video, frames, 1 / (dt * every))
+            write_video(video, frames, 1 / (dt * every))
     finally:
         venv.close()
     return Played(steps, total, steps * dt)

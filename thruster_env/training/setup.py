@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from filters.tuned_file import AUGMENTED, read_tuned_file
-from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.numerics.checks import at_least, one_of, short_repr
 from thruster_env.training.algorithms import find_algorithm
 from thruster_env.training.checks import check_configuration
 from thruster_env.training.observations import find_observation_set
@@ -179,10 +179,10 @@ def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
         if "assumed_plant" in entries:
             raise KeyError("assumed_plant")
     except (json.JSONDecodeError, RecursionError, TypeError, KeyError, AttributeError):
-        raise ValueError(f"{name} must hold the configuration of a policy, but got {shown(text)}") from None
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
     try:
         return TrainingConfiguration(**entries)
     except TypeError:  # an entry too many or too few
-        raise ValueError(f"{name} must hold the configuration of a policy, but got {shown(text)}") from None
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
     except ValueError as error:
         raise ValueError(f"{error} (in {name})") from None

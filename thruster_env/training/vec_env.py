@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.training.spaces import box_of
 
 RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"
@@ -35,7 +35,7 @@ class NativeVecEnv(VecEnv):
         """Adapt the env; see the class."""
         mode = env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
         if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
-            got = shown(env) if mode is None else f"one with autoreset mode {AutoresetMode(mode).value!r}"
+            got = short_repr(env) if mode is None else f"one with autoreset mode {AutoresetMode(mode).value!r}"
             raise ValueError(f"{RULE}, but got {got}")
         self.env = env
         self.arrays: dict[str, Any] = {}

@@ -79,7 +79,7 @@ class ShowHistory(VecEnvWrapper):
             last[i] = infos[i]["terminal_observation"]
         self._past[:, 1:] = self._past[:, :-1].copy()
         self._past[:, 0] = np.concatenate([last[:, : self._measured], self._actions], axis=1)
-        shown = self._shown(last)
+        shown = self._visible(last)
         for i in np.flatnonzero(dones):
             infos[i]["terminal_observation"] = shown[i].copy()
         return (self._begin(dones, observations) if dones.any() else shown), rewards, dones, infos
@@ -87,9 +87,9 @@ class ShowHistory(VecEnvWrapper):
     def _begin(self, which: np.ndarray, observations: np.ndarray) -> np.ndarray:
         self._past[which] = 0.0
         self._past[which, 0, : self._measured] = observations[which, : self._measured]
-        return self._shown(observations)
+        return self._visible(observations)
 
-    def _shown(self, observations: np.ndarray) -> np.ndarray:
+    def _visible(self, observations: np.ndarray) -> np.ndarray:
         appended = observations[:, self._measured :]
         return np.concatenate([self._past.reshape(self.num_envs, -1), appended], axis=1)
 

@@ -12,14 +12,14 @@ from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, short_repr
 from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
-from tuning.api.own_numbers import DEFAULT_FILTER, is_own, own_choice
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
 from tuning.api.study import Study
 from tuning.api.tune import tune
+from tuning.api.user_choice import DEFAULT_FILTER, is_own, user_choice
 from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
@@ -90,7 +90,9 @@ def compare(
     some, left_out = without_unfit(some, problems)
     if trials is not None:
         if knows is not None:
-            raise ValueError(f"knows must be left out if filters are tuned, but got {shown(knows)} and trials")
+            raise ValueError(
+                f"knows must be left out if filters are tuned, but got {short_repr(knows)} and trials"
+            )
         some = [
             tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
             for one in some
@@ -152,7 +154,7 @@ def contenders_of(
             out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
         elif is_own(one):
             label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"
-            out.append(Contender(_new(label, out), partial(own_choice, one)))
+            out.append(Contender(_new(label, out), partial(user_choice, one)))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
             chosen, suit = partial(_from_file, Path(one), size), partial(suited_to, Path(one))

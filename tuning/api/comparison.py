@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from filters.consistency.intervals import Interval, slightly
-from filters.looks import colour_of
+from filters.plot_styles import colour_of
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import panels
 from thruster_env.numerics.text_tables import plain_text

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from filters.logs.estimate import estimate as estimate_log
 from filters.logs.findings import findings
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.api.estimates import LogEstimates
+from tuning.logs.model_of_logs import model_of_logs
 from tuning.logs.problem import name_of
 from tuning.logs.read import read_named
-from tuning.logs.whose import whose_logs
 
 if TYPE_CHECKING:
     from tuning.api.study import Study
@@ -74,8 +74,10 @@ def estimate(
         ValueError: states the rule and the value.
     """
     if tuned is not None and filter is not None:
-        raise ValueError(f"give either a tuned file or a filter, but got both, {shown(tuned)} and {shown(filter)}")
-    log, model, preset = whose_logs(log, model, preset)
+        raise ValueError(
+            f"give either a tuned file or a filter, but got both, {short_repr(tuned)} and {short_repr(filter)}"
+        )
+    log, model, preset = model_of_logs(log, model, preset)
     named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
     read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
     with _as_file(tuned) as file:
@@ -90,6 +92,6 @@ def _as_file(tuned: Any) -> Iterator[str | Path | None]:
         yield tuned
         return
     if not hasattr(tuned, "save"):
-        raise ValueError(f"tuned must be a tuned file or a Study, but got {shown(tuned)}")
+        raise ValueError(f"tuned must be a tuned file or a Study, but got {short_repr(tuned)}")
     with tempfile.TemporaryDirectory() as folder:
         yield copy(tuned).save(Path(folder) / "tuned.json")  # the study itself does not remember this one

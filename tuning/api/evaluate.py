@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tuning.api.held_out import HeldOut, on_held_out
-from tuning.api.own_numbers import is_own, own_choice
 from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for
 from tuning.api.study import Study
+from tuning.api.user_choice import is_own, user_choice
 from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.augmented import constants_in, suited
@@ -77,7 +77,7 @@ def subject_of(
         if problem is None:
             raise ValueError(f"a filter or model must come with a problem, but got {type(tuned).__name__} alone")
         found = problem_of(problem, preset)
-        return own_choice(tuned, found), found, True
+        return user_choice(tuned, found), found, True
     if is_filter(tuned):
         found = problem_of(NOMINAL if problem is None else problem, preset)
         return rule_of_thumb(tuned, found), found, False

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from thruster_env.numerics.checks import at_least
 from tuning.api.evaluate import subject_of
-from tuning.api.own_numbers import is_own
 from tuning.api.problems import problem_of
 from tuning.api.study import Study
+from tuning.api.user_choice import is_own
 from tuning.exploring.bench import Bench
 
 if TYPE_CHECKING:

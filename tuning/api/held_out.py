@@ -49,7 +49,7 @@ class HeldOut:
 
     choice: Choice
     problem: Problem
-    proof: Comparison
+    comparison: Comparison
     is_tuned: bool = True
     seed: int = 0
     name: str = TUNED
@@ -63,7 +63,7 @@ class HeldOut:
     @property
     def evaluations(self) -> dict[str, Evaluation]:
         """The evaluation of each filter: "rule of thumb", "scaled default", "tuned", "oracle", if there is one."""
-        found = self.proof.evaluations
+        found = self.comparison.evaluations
         return {self._called(name): one for name, one in found.items() if self.is_tuned or name != TUNED}
 
     def _called(self, name: str) -> str:
@@ -72,14 +72,14 @@ class HeldOut:
     @property
     def evaluation(self) -> Evaluation:
         """The filter's own evaluation."""
-        return self.proof.tuned
+        return self.comparison.tuned
 
     @property
     def choices(self) -> dict[str, Choice]:
         """The parameters of each filter."""
         found = {
             self.name: self.choice,
-            **baselines(self.choice.name, self.problem, self.seed, self.proof.default),
+            **baselines(self.choice.name, self.problem, self.seed, self.comparison.default),
         }
         return {name: found[name] for name in self.evaluations}
 
@@ -91,12 +91,12 @@ class HeldOut:
     @property
     def bound(self) -> np.ndarray:
         """Bound on the standard error of each state, (n,); NaN if there is none."""
-        return self.proof.bound
+        return self.comparison.bound
 
     @property
     def seeds(self) -> range:
         """The held-out seeds; for logs the indices of the held-out blocks."""
-        return self.proof.seeds
+        return self.comparison.seeds
 
     @property
     def score(self) -> Interval:
@@ -106,16 +106,16 @@ class HeldOut:
     @property
     def ratios(self) -> dict[str, Interval]:
         """Score over that of each baseline, paired, with 95 % intervals; below 1 is better."""
-        return self.proof.ratios
+        return self.comparison.ratios
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
         """Log-likelihood of a run minus that of each baseline, paired; it needs no truth."""
-        return self.proof.likelihood_gains
+        return self.comparison.likelihood_gains
 
     def to_dict(self) -> dict[str, Any]:
         """All results as plain numbers, as in `thruster evaluate --json`."""
-        said = metrics(self.proof)
+        said = metrics(self.comparison)
         if not self.is_tuned:
             del said["tuned"]
         return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said}
@@ -145,7 +145,7 @@ class HeldOut:
         from tuning.reporting.figures import draw_comparison
 
         name = self.choice.name
-        return drawn(draw_comparison(self.proof, f"{label_of(name)} on {self.problem.name}", name))
+        return drawn(draw_comparison(self.comparison, f"{label_of(name)} on {self.problem.name}", name))
 
     def plot_run(self, place: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
@@ -159,7 +159,7 @@ class HeldOut:
         pair = {RULE: self.choice}
         if self.is_tuned:
             others = {name: one for name, one in self.choices.items() if name != self.name}
-            first = self.proof.baselines[0]
+            first = self.comparison.baselines[0]
             pair = {first: others[first], self.name: self.choice}
         filters = {name: one.filter(self.problem) for name, one in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
@@ -199,9 +199,9 @@ class HeldOut:
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         if self.is_tuned:
-            return gains(self.proof, self.problem.seed_word, self.name)
+            return gains(self.comparison, self.problem.seed_word, self.name)
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
-        return [*truth, scaling_sentence(self.proof)]
+        return [*truth, scaling_sentence(self.comparison)]
 
     def _repr_html_(self) -> str:
         truth, rows = self.evaluation.has_truth, []

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.logs.log import Log
 from tuning.api.identified import Identified
 from tuning.api.progress import console_for
@@ -20,7 +20,7 @@ from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
 from tuning.identification.validation import validate
 from tuning.logs.identify import check_offsets, family_of, split_runs
-from tuning.logs.whose import whose_logs
+from tuning.logs.model_of_logs import model_of_logs
 from tuning.problems.coordinates import Coordinates
 from tuning.problems.parameter import Parameter
 
@@ -96,7 +96,7 @@ def identify(
         KeyboardInterrupt: after Ctrl-C before there is a best so far.
     """
     names = names_of(free)
-    logs, model, preset = whose_logs(logs, model, preset)
+    logs, model, preset = model_of_logs(logs, model, preset)
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
     read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
     runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **read)
@@ -112,7 +112,8 @@ def names_of(free: Any) -> list[str]:
     names = [free] if isinstance(free, str) else list(free) if isinstance(free, list | tuple) else None
     if names is None or not all(isinstance(name, str) for name in names):
         raise ValueError(
-            f"free must be names of parameters, but got {shown(free)}: a model is given as model=..., or with the "
+            f"free must be names of parameters, "
+            f"but got {short_repr(free)}: a model is given as model=..., or with the "
             "logs as the pair (model, logs)"
         )
     return names

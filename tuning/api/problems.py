@@ -8,13 +8,13 @@ from typing import Any
 from filters.estimators.find import is_foreign
 from filters.registry import FILTERS, filter_class
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import is_code
 from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named
+from tuning.problems.plant_packages import built_in, logs_package
 from tuning.problems.problem import Problem
-from tuning.problems.rooms import built_in, room_of_logs
 
 RULE = (
     "a problem must be a name, a file that ends in .toml, 'module:object', a Problem, or a pair (model, data) of "
@@ -39,14 +39,14 @@ def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> 
     if isinstance(given, tuple) and len(given) == 2:
         return _of_logs(*given, preset, told)
     if told:
-        raise ValueError(f"{next(iter(told))} must come with a pair (model, data), but got {shown(given)}")
+        raise ValueError(f"{next(iter(told))} must come with a pair (model, data), but got {short_repr(given)}")
     if isinstance(given, str | Path):
         found = find_problem(str(given))
     elif isinstance(given, Problem):
         found = checked_problem(_told_apart(given))
     else:
-        raise ValueError(f"{RULE}, but got {shown(given)}")
-    return room_of_logs().of_preset(found, preset)
+        raise ValueError(f"{RULE}, but got {short_repr(given)}")
+    return logs_package().of_preset(found, preset)
 
 
 def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
@@ -85,7 +85,9 @@ def is_filter(given: Any) -> bool:
     if isinstance(given, str) or is_foreign(given):
         filter_class(given)  # a clear error for an unknown name
         return True
-    raise ValueError(f"a filter must be a name, a tuned file, a Study or an estimator, but got {shown(given)}")
+    raise ValueError(
+        f"a filter must be a name, a tuned file, a Study or an estimator, but got {short_repr(given)}"
+    )
 
 
 def _is_tuned_file(text: str) -> bool:
@@ -96,7 +98,7 @@ def _of_logs(model: Any, data: Any, preset: str | Path | None, options: dict[str
     if isinstance(model, str | Path) and not is_code(str(model)):
         if preset is not None:
             raise ValueError(
-                f"a pair (model, data) of a preset must come without another, but got {shown(preset)}"
+                f"a pair (model, data) of a preset must come without another, but got {short_repr(preset)}"
             )
         preset, model = model, None
     return log_problem(data, **_without_nothing({"preset": preset, "model": model}), **options)

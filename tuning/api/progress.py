@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.text import Text
 
 from filters.estimators.find import label_of
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.progress import listening
 from tuning.api.notebook import NotebookLine
 from tuning.search.interruption import STOPPING
@@ -45,7 +45,7 @@ def console_for(progress: bool | None) -> Console:
         ValueError: for anything else.
     """
     if progress not in (True, False, None):
-        raise ValueError(f"progress must be True, False or None, but got {shown(progress)}")
+        raise ValueError(f"progress must be True, False or None, but got {short_repr(progress)}")
     console = Console(stderr=True, markup=False, highlight=False)
     shown_live = console.is_terminal or console.is_jupyter
     if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich draws in notebooks

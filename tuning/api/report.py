@@ -10,17 +10,17 @@ from typing import Any
 import optuna
 from optuna.study import StudyDirection
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.files import check_target, write_whole
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.run import quiet_optuna
 from tuning.api.study import Study
-from tuning.evaluation.kept import sizes_as_data
+from tuning.evaluation.stored import sizes_as_data
 from tuning.problems.problem import Problem
-from tuning.reporting.beside import Source, write_beside
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
+from tuning.reporting.two_studies import Source, write_two_studies
 from tuning.search.sizing import SIZES
 from tuning.search.storage import open_storage
 
@@ -59,7 +59,7 @@ def report(
     several: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
     if isinstance(out, Study) or (out is not None and Path(out).suffix == ".json"):
         rule = "a page must be a file that ends in .html, or a folder for it, and two studies must be in one list"
-        raise ValueError(f"{rule}, but got out={shown(out if isinstance(out, Study) else str(out))}")
+        raise ValueError(f"{rule}, but got out={short_repr(out if isinstance(out, Study) else str(out))}")
     page = None if out is None or Path(out).suffix != ".html" else Path(out)
     if page is not None:
         check_target(page)
@@ -77,7 +77,7 @@ def report(
             one = found[0]
             made = write_report(one.name, one.storage, folder, one.problems, one.file)
         else:
-            made = write_beside(found, folder)
+            made = write_two_studies(found, folder)
         if page is None:
             return made.page
         write_whole(page, made.page.read_bytes())
@@ -89,7 +89,7 @@ def _given(source: str | Path, problem: Any, model: str | None) -> Sequence[Prob
     """What the user gives of the problems that a file or a study names."""
     if not isinstance(source, str | Path):
         raise ValueError(
-            f"a report must be of a Study, a tuned file or the name of a study, but got {shown(source)}"
+            f"a report must be of a Study, a tuned file or the name of a study, but got {short_repr(source)}"
         )
     if is_file(source) and Path(source).is_file():
         return given_for(source, problem, model)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from filters.estimators.find import label_of
-from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.numerics.checks import at_least, one_of, short_repr
 from thruster_env.numerics.files import check_target
 from tuning.api.by_way import Followed, answered, check_way, follow, way_sentence
 from tuning.api.progress import trial_bar, working
@@ -43,7 +43,7 @@ class Tuning(NamedTuple):
     study: str
     plan: Plan
     result: StudyResult
-    proofs: tuple[Comparison, ...]  # one for each scenario
+    comparisons: tuple[Comparison, ...]  # one for each scenario
     file: Path | None  # the tuned file, where one was written
     gradient: GradientResult | None = None  # where the choice is the optimum that gradients lead to ...
     rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
@@ -56,9 +56,9 @@ class Tuning(NamedTuple):
         return self.plan.scenarios[0]
 
     @property
-    def proof(self) -> Comparison:
+    def comparison(self) -> Comparison:
         """The held-out evaluation on the first scenario."""
-        return self.proofs[0]
+        return self.comparisons[0]
 
     @property
     def chosen(self) -> tuple[str, ...]:
@@ -72,7 +72,7 @@ class Tuning(NamedTuple):
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
         method = METHODS[self.gradient is not None] if self.way is None else self.way.name
-        write_tuned(file, self.plan, self.result, self.proofs, self.study, method)
+        write_tuned(file, self.plan, self.result, self.comparisons, self.study, method)
 
 
 def run_tuning(
@@ -117,7 +117,7 @@ def run_tuning(
         )
     name = name or name_of(plan, by_gradient, way)
     if not isinstance(name, str) or "/" in name:
-        raise ValueError(f"study must be a name without slashes, but got {shown(name)}")
+        raise ValueError(f"study must be a name without slashes, but got {short_repr(name)}")
     if out is not None:
         check_target(out)
     with quiet_optuna():
@@ -146,14 +146,16 @@ def run_tuning(
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
         with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
-            proofs = tuple(evaluate_held_out(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+            comparisons = tuple(
+                evaluate_held_out(result.choice, scenario, plan.seed) for scenario in plan.scenarios
+            )
     except KeyboardInterrupt:
         if storage is not None:
             console.print(
                 f"study {name!r} keeps its trials: the same command continues with the held-out evaluation"
             )
         raise
-    tuning = Tuning(name, plan, result, proofs, out, gradient, rival, way=followed)
+    tuning = Tuning(name, plan, result, comparisons, out, gradient, rival, way=followed)
     if out is not None:
         tuning.write(out)
     if gradient is not None:

@@ -71,9 +71,9 @@ class Study:
     @property
     def evaluations(self) -> tuple[HeldOut, ...]:
         """The same on each problem."""
-        pairs = zip(self.problems, self.tuning.proofs, strict=True)
+        pairs = zip(self.problems, self.tuning.comparisons, strict=True)
         seed, chosen = self.tuning.plan.seed, self.tuning.chosen
-        return tuple(HeldOut(self.choice, one, proof, seed=seed, chosen=chosen) for one, proof in pairs)
+        return tuple(HeldOut(self.choice, one, comparison, seed=seed, chosen=chosen) for one, comparison in pairs)
 
     @property
     def trials(self) -> list[FrozenTrial]:
@@ -188,9 +188,9 @@ class Study:
         result, names = self.tuning.result, ", ".join(one.name for one in self.problems)
         said = f"Study({label_of(self.choice.name)} on {names}, {result.finished} trials"
         ended = ", interrupted" if self.interrupted else ""
-        if not self.tuning.proof.tuned.has_truth:
-            return f"{said}{ended}: tuning {worth(self.tuning.proof)})"
-        return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.proof)})"
+        if not self.tuning.comparison.tuned.has_truth:
+            return f"{said}{ended}: tuning {worth(self.tuning.comparison)})"
+        return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.comparison)})"
 
     def __str__(self) -> str:
         """The choice and its reason, a summary line, and the tables of its held-out evaluations."""
@@ -203,7 +203,7 @@ class Study:
         found = self.held_out
         rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
         numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *found.choices], rows)
-        said = " ".join([*self.tuning.chosen, f"Tuning {worth(self.tuning.proof)}."])
+        said = " ".join([*self.tuning.chosen, f"Tuning {worth(self.tuning.comparison)}."])
         return numbers + found._repr_html_() + f"<p>{escape(said)}</p>"
 
 

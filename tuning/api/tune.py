@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
 from tuning.api.run import aim_of, run_tuning
@@ -119,7 +119,7 @@ def tune(
     aim = aim_of(method, None if asked is None else list(asked))
     if not isinstance(filter, str):
         raise ValueError(
-            f"filter must be a name or 'module:object', by which trials keep it, but got {shown(filter)}"
+            f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
         )
     of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
     of_logs["grid"] = None if grid else False

@@ -17,7 +17,7 @@ from auv_env.quantities import STATES
 from auv_env.simulation import simulate
 from filters.bounds import path_bound
 from filters.wrapped import wrapped_variances
-from thruster_env.numerics.checks import one_of, positive, shown, vector
+from thruster_env.numerics.checks import one_of, positive, short_repr, vector
 from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.auv.excitation import commands_of
@@ -83,7 +83,7 @@ class Scenario(BaseScenario):
             return own
         if not isinstance(given, list | tuple) or not 1 <= len(given) <= MAX_CHANNELS:
             rule = f"measurement_noise_cov must be 1 to {MAX_CHANNELS} variances, one for each channel"
-            raise ValueError(f"{rule}, but got {shown(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
         return own | {"measurement_noise_cov": [positive("measurement_noise_cov", one) for one in given]}
 
     @property

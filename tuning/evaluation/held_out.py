@@ -43,8 +43,10 @@ class Comparison(NamedTuple):
     seeds: range
     scaled: Evaluation | None = None  # the scaled default; None where there is none
     default: Scaled | None = None  # its factor, or the reason why there is none; None where it was not requested
-    kept_ratios: Mapping[str, Interval] | None = None  # given where evaluations are summaries without single runs
-    kept_gains: Mapping[str, Interval] | None = None
+    stored_ratios: Mapping[str, Interval] | None = (
+        None  # given where evaluations are summaries without single runs
+    )
+    stored_gains: Mapping[str, Interval] | None = None
     rule: str = RULE  # GIVEN where the rule of thumb is what was given, and so no row of its own: `rule_label`
     given: Evaluation | None = None  # what the model came with; None where nobody gave anything
     noise: Evaluation | None = None  # noise estimation; None where there is none
@@ -67,16 +69,16 @@ class Comparison(NamedTuple):
     @property
     def ratios(self) -> dict[str, Interval]:
         """Score of the tuned filter over that of each baseline, paired, the most important baseline first."""
-        if self.kept_ratios is not None:
-            return dict(self.kept_ratios)
+        if self.stored_ratios is not None:
+            return dict(self.stored_ratios)
         found = self.evaluations
         return {name: score_ratio(self.tuned, found[name]) for name in self.baselines}
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
         """Log-likelihood of a run of the tuned filter minus that of each baseline; it needs no truth."""
-        if self.kept_gains is not None:
-            return dict(self.kept_gains)
+        if self.stored_gains is not None:
+            return dict(self.stored_gains)
         found = self.evaluations
         return {name: likelihood_gain(self.tuned, found[name]) for name in self.baselines}
 

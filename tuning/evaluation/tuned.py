@@ -17,19 +17,19 @@ from filters.estimators.find import is_foreign, label_of
 from filters.monitoring.stored import monitor_data, monitor_for
 from filters.tuned_file import AUGMENTED, FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
-from thruster_env.numerics.checks import at_least, covariance, positive, shown
+from thruster_env.numerics.checks import at_least, covariance, positive, short_repr
 from thruster_env.numerics.files import write_whole
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.kept import ROLES, comparison_as_data, sizes_as_data
+from tuning.evaluation.stored import ROLES, comparison_as_data, sizes_as_data
 from tuning.evaluation.summary import summary
 from tuning.evaluation.versions import versions
 from tuning.problems.augmented import augmented, name_and_unknown, suited
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_given, find_problem
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
-from tuning.problems.rooms import built_in
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -204,7 +204,7 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
     if held != dict(found.held):
         raise ValueError(
             f"the model of a tuned file must be that of its scenario, {found.held.get(FACTORS, {})}, "
-            f"but {path} has {shown(given)}"
+            f"but {path} has {short_repr(given)}"
         )
     known = {*NOISE, PRIOR, *found.held, *(one.name for one in found.parameters or ())}
     if set(given) - known:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import metrics, problem_in, read_tuned
 from tuning.evaluation.versions import versions
@@ -58,7 +58,9 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
     content, (choice, _, seed) = read_tuned_file(path), read_tuned(path, problems)
     held_out = content.get("held_out")
     if not isinstance(held_out, dict) or not held_out:
-        raise ValueError(f"a tuned file must have held-out metrics to verify, but {path} has {shown(held_out)}")
+        raise ValueError(
+            f"a tuned file must have held-out metrics to verify, but {path} has {short_repr(held_out)}"
+        )
     places, differences = 0, []
     for name, stored in held_out.items():
         comparison = evaluate_held_out(
@@ -95,7 +97,7 @@ def _count(stored, path: str | Path) -> int:
     except (KeyError, TypeError, ValueError):
         raise ValueError(
             "held-out metrics of a tuned file must give their first seed and the one after the last, but "
-            f"{path} has {shown(stored)}"
+            f"{path} has {short_repr(stored)}"
         ) from None
 
 

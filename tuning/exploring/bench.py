@@ -8,7 +8,7 @@ from functools import cached_property
 
 from filters.filter import Filter
 from filters.registry import FILTERS
-from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.numerics.checks import at_least, one_of, short_repr
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.exploring.disturbed import disturbed
@@ -56,7 +56,7 @@ class Bench:
         """Check that there is such a filter of the problem."""
         one_of("filter", self.filter, FILTERS)
         if not has_search_space(self.filter):
-            raise ValueError(f"filter must be one that has a number to change, but got {shown(self.filter)}")
+            raise ValueError(f"filter must be one that has a number to change, but got {short_repr(self.filter)}")
         self._started.filter(self.problem)
 
     @property

@@ -7,14 +7,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.exploring.disturbed import AMPLIFIER, SENSORS
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.plain import plain
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
-from tuning.problems.rooms import built_in
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
@@ -71,7 +71,7 @@ def _found(base: Problem, problem: Problem) -> str:
         options = f", {_arguments(content['options'])}" if content["options"] else ""
         return f"from tuning.logs.problem import log_problem\n\nproblem = log_problem({files!r}{options})"
     if base.name not in built_in() and not base.name.endswith(".toml") and ":" not in base.name:
-        return f"\nproblem = ...  # {shown(base.name)}"
+        return f"\nproblem = ...  # {short_repr(base.name)}"
     found = f"from tuning.problems.find import find_problem\n\nproblem = find_problem({base.name!r})"
     if problem is base:
         return found

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, short_repr
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.parameter import Parameter, squared
 from tuning.search.parameters import r_name
@@ -47,7 +47,9 @@ class ModelFamily:
             self._make = partial(self._make, dt=dt)
         self.base = self._make()
         if not isinstance(self.base, StateSpaceModel):
-            raise ValueError(f"a model must be a StateSpaceModel, but {shown(make)} makes {shown(self.base)}")
+            raise ValueError(
+                f"a model must be a StateSpaceModel, but {short_repr(make)} makes {short_repr(self.base)}"
+            )
         constants = self.base.constants
         self._fields = [one for one in getattr(constants, "_fields", ()) if one not in self._arguments]
         self._noise = self._variances()
@@ -55,7 +57,7 @@ class ModelFamily:
         known = self.known
         wrong = [name for name in names if name not in known]
         if wrong:
-            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {shown(wrong[0])}")
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {short_repr(wrong[0])}")
         self.free = tuple(known[name] for name in names)
 
     @property

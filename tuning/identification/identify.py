@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from filters.starts import Starts
-from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, short_repr
 from thruster_env.numerics.streams import START_POINTS, derived_generator
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
@@ -124,7 +124,7 @@ def identify(
         if not any(math.isfinite(one.found.value) for one in ascents):
             raise ValueError(
                 "the filter must stay finite on all runs from at least one start, but it does from none of "
-                f"{shown([coordinates.named(point) for point in points[: len(ascents)]])}"
+                f"{short_repr([coordinates.named(point) for point in points[: len(ascents)]])}"
             )
         optima = tuple(
             Optimum(

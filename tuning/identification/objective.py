@@ -14,7 +14,7 @@ from filters.differentiated.runs import same_functions
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
-from thruster_env.numerics.checks import one_of, shown
+from thruster_env.numerics.checks import one_of, short_repr
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.identification.gates import kept_variance
@@ -201,7 +201,7 @@ class Objective:
 
     def _pair(self, at: np.ndarray, place: int) -> tuple[StateSpaceModel, StateSpaceModel]:
         """Models one step above and below."""
-        above, below = self.coordinates.beside(at, place, STEP)
+        above, below = self.coordinates.neighbours(at, place, STEP)
         return self.model_at(above), self.model_at(below)
 
 
@@ -228,7 +228,8 @@ def _check_runs(run: Data, model: StateSpaceModel) -> None:
     sizes = run.inputs.shape[-1], run.measurements.shape[-1]
     if sizes != (model.inputs, model.m):
         raise ValueError(
-            f"data must have the model's {model.inputs} inputs and {model.m} measurements, but got {shown(sizes)}"
+            f"data must have the model's {model.inputs} inputs and {model.m} measurements, "
+            f"but got {short_repr(sizes)}"
         )
     empty = np.isnan(run.measurements).all(axis=(0, 1))
     if empty.any():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.steps import in_steps
@@ -25,7 +25,7 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     """
     given = _listed(data)
     if not given or not all(isinstance(one, Data | Log) for one in given):
-        raise ValueError(f"data must be some of Log or Data, but got {shown(data)}")
+        raise ValueError(f"data must be some of Log or Data, but got {short_repr(data)}")
     if len(given) == 1 and isinstance(given[0], Data):
         return given[0].seen
     check_times([one for one in given if isinstance(one, Log)])

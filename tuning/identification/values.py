@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from thruster_env.numerics.checks import finite, positive, shown
+from thruster_env.numerics.checks import finite, positive, short_repr
 from thruster_env.numerics.files import write_whole
 from thruster_env.numerics.toml import as_toml, read_toml
 from thruster_env.plants.diffusion import noise_for_dt, same_dt
-from thruster_env.plants.logs.write import check_not_beside
+from thruster_env.plants.logs.write import check_not_among
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
@@ -31,7 +31,7 @@ def write_values(path: str | Path, found: Identification, logs: Sequence[str], d
     """
     if not str(path).endswith(".toml"):
         raise ValueError(f"a file of values must end in .toml, but got {str(path)!r}")
-    check_not_beside(path)
+    check_not_among(path)
     identified = {
         "logs": [Path(log).name for log in logs],
         "log_likelihood": found.log_likelihood,
@@ -52,7 +52,9 @@ def read_values(path: str | Path) -> dict[str, float]:
     content = read_toml(path, "a file of values")
     values = content.get("values")
     if not isinstance(values, dict) or not values or set(content) - set(TABLES):
-        raise ValueError(f"a file of values must have the table [values], but {path} has {shown(sorted(content))}")
+        raise ValueError(
+            f"a file of values must have the table [values], but {path} has {short_repr(sorted(content))}"
+        )
     return {name: finite(f"{name} in {path}", value) for name, value in values.items()}
 
 

@@ -155,7 +155,7 @@ class Family:
 
     def _pairs(self, point: np.ndarray) -> list[tuple[StateSpaceModel, StateSpaceModel]]:
         """Models a step above and below along each parameter."""
-        sides = (self.coordinates.beside(point, place, STEP) for place in range(len(point)))
+        sides = (self.coordinates.neighbours(point, place, STEP) for place in range(len(point)))
         return [(self._model_at(above), self._model_at(below)) for above, below in sides]
 
     def _model_at(self, point: np.ndarray) -> StateSpaceModel:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import object_named
 from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.findings import has_outliers, remarks_on
@@ -17,11 +17,11 @@ from thruster_env.plants.steps import in_any_steps
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
 from tuning.identification.values import write_values
-from tuning.logs.problem import runs_by_name, without_twins
+from tuning.logs.problem import runs_by_name, without_rescaled
 from tuning.logs.read import read_named
 from tuning.problems.log_checks import check_apart, check_times
 from tuning.problems.parameter import Parameter
-from tuning.problems.rooms import room_of_logs
+from tuning.problems.plant_packages import logs_package
 
 EVERY_THIRD = 3
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
@@ -56,7 +56,7 @@ def split_runs(
         raise ValueError("at least one log must be left to learn from, but all are held out")
     read = [read_named(runs[name], **options, name=name)[0] for name in (*learning, *validating)]
     check_times(read)
-    read = without_twins(read, validating)
+    read = without_rescaled(read, validating)
     parts = [log for log in read if log.name not in validating], [log for log in read if log.name in validating]
     check_apart(*parts)
     if hold_gaps or any(log.stamps is not None for log in read):
@@ -101,7 +101,7 @@ def family_of(
         if filter != "ekf":
             raise ValueError(f"a thruster must be identified with the ekf, but got filter {filter} (--filter)")
         whose = None if preset is None else str(preset)
-        of_preset = room_of_logs().family_of_preset(logs, whose, sensors, list(free), noise=noise)
+        of_preset = logs_package().family_of_preset(logs, whose, sensors, list(free), noise=noise)
         return AnyStepFamily(of_preset, logs) if stamped else of_preset
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
@@ -206,9 +206,9 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
         ValueError: if the path has another ending or cannot be written.
     """
     if not str(path).endswith(".toml"):
-        raise ValueError(f"a file of identified parameters must end in .toml, but got {shown(str(path))}")
+        raise ValueError(f"a file of identified parameters must end in .toml, but got {short_repr(str(path))}")
     family = family.plain if isinstance(family, AnyStepFamily) else family
     if isinstance(family, ModelFamily):
         write_values(path, found, logs, getattr(family, "dt", None))  # of a family of logs
     else:
-        room_of_logs().write_identified(path, found, family, logs)
+        logs_package().write_identified(path, found, family, logs)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import read_for
 from tuning.logs.read import read_named, texts
@@ -58,7 +58,7 @@ def log_problem(
         )
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
-    recorded = without_twins(recorded, held) if apart else recorded
+    recorded = without_rescaled(recorded, held) if apart else recorded
     runs = {log.name: runs[log.name] for log in recorded}
     model = read_for(recorded[0], pairs[0][1])[1]()
     cuts: dict[str, Any] = {"held_out": held, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
@@ -81,7 +81,7 @@ def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[
     return runs, list(dict.fromkeys(held))
 
 
-def without_twins(logs: Sequence[Log], held: Sequence[str]) -> list[Log]:
+def without_rescaled(logs: Sequence[Log], held: Sequence[str]) -> list[Log]:
     """The logs without those that are the content of a held-out one under another name.
 
     Args:
@@ -163,12 +163,12 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
                 raise TypeError
         except (KeyError, TypeError):
             raise ValueError(
-                f"logs in a tuned file must have paths and options, but {file} has {shown(content)}"
+                f"logs in a tuned file must have paths and options, but {file} has {short_repr(content)}"
             ) from None
         _check_model(options.get("model"), model, file)
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
-            said = f"logs in a tuned file must be those of {shown(name)}"
+            said = f"logs in a tuned file must be those of {short_repr(name)}"
             raise ValueError(f"{said}, but {file} has {problem.name}")
         found.append(named(problem, name))
     return found
@@ -186,10 +186,11 @@ def _check_model(named, given: str | None, file: Path) -> None:
     """Raise ValueError unless the caller gives exactly the code that a file names."""
     if named is None and given is not None:
         raise ValueError(
-            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {shown(given)}"
+            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(given)}"
         )
     if named != given:
         raise ValueError(
-            f"the model of logs must be given if it is code, but {file} only names {shown(named)}: use --model "
+            f"the model of logs must be given if it is code, "
+            f"but {file} only names {short_repr(named)}: use --model "
             f"{named}, if you trust it"
         )

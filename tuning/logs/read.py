@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, short_repr
 from thruster_env.numerics.modules import object_named
 from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import ANY_DT, read_for
-from tuning.problems.rooms import room_of_logs
+from tuning.problems.plant_packages import logs_package
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line
 
@@ -71,7 +71,7 @@ def read_named(
             offer(log.dt)  # or the values are of another sample time
             return log, offer
         return read_for(path, offer, **options)[0], offer
-    room = room_of_logs()
+    room = logs_package()
     whose = room.DEFAULT_PRESET if preset is None else str(preset)
     thruster = room.Preset(whose, sensors, ANY_DT)
     log, _ = read_for(path, thruster.state_space_model(), **options)
@@ -87,13 +87,13 @@ def pairs(option: str, given: Named) -> dict[str, Any]:
     if isinstance(given, Mapping):
         return dict(given)
     if isinstance(given, str) or not isinstance(given, Sequence | None):
-        raise ValueError(f"{option} must be a mapping by name, or texts NAME=VALUE, but got {shown(given)}")
+        raise ValueError(f"{option} must be a mapping by name, or texts NAME=VALUE, but got {short_repr(given)}")
     found: dict[str, str] = {}
     for text in given or []:
         name, equals, value = text.partition("=")
         if not (name and equals and value) or name in found:
             rule = "be given once for each name" if name in found else "have the form NAME=VALUE"
-            raise ValueError(f"{option} must {rule}, but got {shown(text)}")
+            raise ValueError(f"{option} must {rule}, but got {short_repr(text)}")
         found[name.strip()] = value.strip()
     return found
 
@@ -110,5 +110,5 @@ def _seconds(name: str, value: Any) -> float:
         return finite(f"the clock offset of {name}", value)
     except ValueError:
         raise ValueError(
-            f"clock_offset (--clock-offset) of {name} must be seconds, but got {shown(value)}"
+            f"clock_offset (--clock-offset) of {name} must be seconds, but got {short_repr(value)}"
         ) from None

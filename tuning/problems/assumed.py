@@ -15,7 +15,7 @@ import numpy as np
 
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.numerics.angles import on_one_branch
-from thruster_env.numerics.checks import at_least, positive, shown
+from thruster_env.numerics.checks import at_least, positive, short_repr
 from thruster_env.numerics.modules import said
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.check import check_data
@@ -75,7 +75,7 @@ class AssumedProblem(Problem):
         self._parameters = with_defaults(_checked_parameters(parameters), assumed, self._untuned or {})
         self._dt = None if dt is None else positive("dt", dt)
         if self._parameters is not None and isinstance(assumed, StateSpaceModel):
-            raise ValueError(f"a model with parameters must be a function of them, but got {shown(assumed)}")
+            raise ValueError(f"a model with parameters must be a function of them, but got {short_repr(assumed)}")
         self.model()
 
     @abstractmethod
@@ -212,7 +212,7 @@ class AssumedProblem(Problem):
             ) from error
         if not isinstance(model, StateSpaceModel):
             raise ValueError(
-                f"the model of problem {self.name} must be a StateSpaceModel, but it is {shown(model)}"
+                f"the model of problem {self.name} must be a StateSpaceModel, but it is {short_repr(model)}"
             )
         return model
 
@@ -249,7 +249,9 @@ def _checked_parameters(given) -> tuple[Parameter, ...] | None:
         return None
     found = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     if not found or not all(isinstance(one, Parameter) for one in found):
-        raise ValueError(f"parameters must be some of tuning.problems.parameter.Parameter, but got {shown(given)}")
+        raise ValueError(
+            f"parameters must be some of tuning.problems.parameter.Parameter, but got {short_repr(given)}"
+        )
     names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise ValueError(f"names of parameters must differ from one another, but got {', '.join(names)}")
@@ -285,5 +287,5 @@ def with_defaults(
 
 def _mapping(name: str, given) -> dict | None:
     if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"{name} must map arguments of the model to values, but got {shown(given)}")
+        raise ValueError(f"{name} must map arguments of the model to values, but got {short_repr(given)}")
     return None if given is None else dict(given)

@@ -13,7 +13,7 @@ import numpy as np
 
 from filters.augmented import Unknown, augmented_model
 from filters.tuned_file import AUGMENTED, PRIOR
-from thruster_env.numerics.checks import one_of, positive, shown
+from thruster_env.numerics.checks import one_of, positive, short_repr
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.assumed import rows_argument
 from tuning.problems.data import Data
@@ -63,7 +63,7 @@ def unknown_in(text: str) -> tuple[str, Unknown | None]:
     try:
         return name, Unknown.of_numbers(*map(float, numbers)) if numbers else None
     except (TypeError, ValueError):
-        raise ValueError(f"{RULE}, but got {shown(text)}") from None
+        raise ValueError(f"{RULE}, but got {short_repr(text)}") from None
 
 
 def unknowns_of(augment: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown | None]:

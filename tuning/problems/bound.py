@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from filters.posterior import gathering_code, posterior_variances, sequences_taken
-from thruster_env.numerics.kept_numbers import kept_numbers
+from thruster_env.numerics.number_cache import cached_numbers
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
@@ -37,4 +37,4 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
             variances, taken = np.repeat(variances, len(inputs), axis=0), np.arange(len(inputs))
         return np.sqrt(data._replace(counted=data.counted[taken]).pooled(variances))
 
-    return kept_numbers("bound", model.n, follows_from, code, compute)
+    return cached_numbers("bound", model.n, follows_from, code, compute)

@@ -7,7 +7,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.sources import as_value
 from thruster_env.plants.quantities import Quantities, Quantity
 from thruster_env.plants.state_space import StateSpaceModel
@@ -31,14 +31,14 @@ def checked_problem(problem, name: str | None = None) -> Problem:
     """
     if not isinstance(problem, Problem):
         raise ValueError(
-            f"a problem must be a tuning.problems.problem.Problem, but {shown(name)} is {shown(problem)}"
+            f"a problem must be a tuning.problems.problem.Problem, but {short_repr(name)} is {short_repr(problem)}"
         )
     name = problem.name if name is None else name
     if _CHECKED.get(id(problem)) is problem:
         return problem
     model = problem.model(**problem.untuned)
     if not isinstance(model, StateSpaceModel):
-        raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {shown(model)}")
+        raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {short_repr(model)}")
     for kind, ones, others in zip(Quantities._fields, problem.quantities, model.quantities, strict=True):
         check_quantities(kind.removesuffix("_quantities"), ones, others, f"problem {name}", "its model")
     data = problem.data(SEEDS)
@@ -167,12 +167,12 @@ def _check_scale(problem: Problem, data: Data, name: str) -> None:
     if scale.shape != data.states.shape[-1:] or not (scale > 0).all() or not np.isfinite(scale).any():
         raise ValueError(
             f"scale of problem {name} must be {data.states.shape[-1]} positive numbers, infinite for states "
-            f"that are not scored, but got {shown(problem.scale)}"
+            f"that are not scored, but got {short_repr(problem.scale)}"
         )
 
 
 def check_quantities(
-    kind: str, ones: tuple[Quantity, ...], others: tuple[Quantity, ...], whose: str, other: str
+    kind: str, ones: tuple[Quantity, ...], others: tuple[Quantity, ...], owner: str, other: str
 ) -> None:
     """Raise ValueError, with the first difference, unless two vectors have the same symbols and units.
 
@@ -180,17 +180,17 @@ def check_quantities(
         kind: what the vectors are, such as "measurements".
         ones: quantities of the first vector.
         others: those of the second.
-        whose: owner of the first vector, for messages ...
+        owner: owner of the first vector, for messages ...
         other: ... and of the second.
     """
     if len(ones) != len(others):
         raise ValueError(
-            f"{kind} of {whose} and {other} must be as many, but got {_listed(ones)} and {_listed(others)}"
+            f"{kind} of {owner} and {other} must be as many, but got {_listed(ones)} and {_listed(others)}"
         )
     for one, another in zip(ones, others, strict=True):
         if (one.symbol, one.unit, one.angle) != (another.symbol, another.unit, another.angle):
             raise ValueError(
-                f"{kind} of {whose} and {other} must have the same symbols and units, "
+                f"{kind} of {owner} and {other} must have the same symbols and units, "
                 f"but got {_said(one)} and {_said(another)}"
             )
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thruster_env.numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, short_repr
 from tuning.problems.parameter import Parameter
 
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
@@ -23,7 +23,9 @@ class Coordinates:
         self.free = tuple(free)
         self.names = tuple(one.name for one in self.free)
         if not self.free or len(set(self.names)) < len(self.names):
-            raise ValueError(f"free parameters must be some, each named once, but got {shown(list(self.names))}")
+            raise ValueError(
+                f"free parameters must be some, each named once, but got {short_repr(list(self.names))}"
+            )
         if any(one.integer for one in self.free):
             whole = ", ".join(one.name for one in self.free if one.integer)
             raise ValueError(f"free parameters must not be whole numbers, but got {whole}")
@@ -49,7 +51,7 @@ class Coordinates:
         """Derivative of each value by its coordinate, (p,)."""
         return np.where(self.log, self.values(at), 1.0) * self.units
 
-    def beside(self, at: np.ndarray, place: int, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def neighbours(self, at: np.ndarray, place: int, step: float) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates a step above and below in one place; at an end of the range both are within it."""
         middle, steps = np.array(at, dtype=np.float64), step * np.eye(len(at))[place]
         middle[place] = np.clip(middle[place], self.low[place] + step, self.high[place] - step)

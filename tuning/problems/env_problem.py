@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, covariance, shown
+from thruster_env.numerics.checks import as_floats, covariance, short_repr
 from thruster_env.numerics.global_generators import GlobalGenerators
 from thruster_env.numerics.modules import said
 from thruster_env.numerics.streams import (
@@ -223,7 +223,7 @@ class EnvProblem(AssumedProblem):
         begun = env.reset(seed=seed)
         if not isinstance(begun, tuple) or len(begun) != 2:
             rule = f"reset of the env of problem {self.name} must return (observation, info)"
-            raise ValueError(f"{rule}, but returned {shown(begun)}")
+            raise ValueError(f"{rule}, but returned {short_repr(begun)}")
         observation, info = begun
         measurements, states = [self.measured(observation, info)], [self.state(env, info)]
         choose = chooser(self.policy if given is None else given, space, seed)
@@ -273,7 +273,7 @@ class EnvProblem(AssumedProblem):
                 f"it must be possible to make the env of problem {name}, but {said(error)}"
             ) from error
         if not isinstance(made, gym.Env):
-            raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {shown(made)}")
+            raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {short_repr(made)}")
         return made
 
     def _close(self, env: gym.Env) -> None:

@@ -7,9 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
 
-from thruster_env.numerics.checks import any_case, meant, one_of, shown
+from thruster_env.numerics.checks import any_case, meant, one_of, short_repr
 from thruster_env.numerics.toml import read_toml
-from tuning.problems.rooms import ROOMS, room_of
+from tuning.problems.plant_packages import PLANT_PACKAGES, plant_package
 from tuning.problems.scenario import BaseScenario
 
 FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
@@ -21,7 +21,7 @@ S = TypeVar("S", bound=BaseScenario)
 def read_scenario(path: str | Path) -> BaseScenario:
     """A scenario from a TOML file, named by the path.
 
-    Its keys are `plant`, one of `rooms.ROOMS` ("thruster" by default); the fields of that plant's `Scenario`
+    Its keys are `plant`, one of `PLANT_PACKAGES` ("thruster" by default); the fields of that plant's `Scenario`
     without the name; and `base`, the scenario whose fields are used where the file has none of its own (the
     plant's nominal one by default). A `scale` that is not in the file is computed.
 
@@ -55,13 +55,13 @@ def read_scenario(path: str | Path) -> BaseScenario:
     return _made(make, content, path)
 
 
-def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
+def find_in(known: Mapping[str, S], kind: type[S], owner: str, name: str) -> S:
     """A scenario of one plant, by its name or from a file.
 
     Args:
         known: the plant's scenarios by name.
         kind: the class of the plant's scenarios.
-        whose: the plant in messages, such as "the thruster's".
+        owner: the plant in messages, such as "the thruster's".
         name: the name of one of them, or of a file that ends in .toml.
 
     Raises:
@@ -70,12 +70,12 @@ def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
     if isinstance(name, str) and name.endswith(".toml"):
         found = read_scenario(name)
         if not isinstance(found, kind):
-            raise ValueError(f"scenario must be {whose}, but {name} is of plant {found.plant_kind!r}")
+            raise ValueError(f"scenario must be {owner}, but {name} is of plant {found.plant_kind!r}")
         return found
     own = any_case(name, known)
     if not isinstance(own, str) or own not in known:
         rule = f"scenario must be one of {', '.join(known)}, or a file that ends in .toml"
-        raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
+        raise ValueError(f"{rule}, but got {short_repr(name)}{meant(name, known)}")
     return known[own]
 
 
@@ -95,7 +95,7 @@ def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
     known = _fields(room.Scenario)
     if not isinstance(content, Mapping) or not set(own) <= set(known):
         raise ValueError(
-            f"a scenario in a file must be a mapping of {', '.join(known)}, but {file} has {shown(content)}"
+            f"a scenario in a file must be a mapping of {', '.join(known)}, but {file} has {short_repr(content)}"
         )
     return _made(lambda: _checked(room.Scenario(name=name, **own)), own, file)
 
@@ -103,7 +103,9 @@ def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
 def _room(content: dict, path: str | Path):
     """The package of the plant of a scenario file; removes the key from the content."""
     try:
-        return room_of(one_of("plant of a scenario", content.pop(PLANT, next(iter(ROOMS))), tuple(ROOMS)))
+        return plant_package(
+            one_of("plant of a scenario", content.pop(PLANT, next(iter(PLANT_PACKAGES))), tuple(PLANT_PACKAGES))
+        )
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
 
@@ -125,5 +127,5 @@ def _made(make: Callable[[], BaseScenario], content: Mapping, path: str | Path) 
         raise ValueError(f"{error} (in {path})") from None
     except (TypeError, AttributeError) as error:  # a value of another type than the plant takes
         raise ValueError(
-            f"values of a scenario must be valid for `Scenario`, but got {shown(content)} in {path}: {error}"
+            f"values of a scenario must be valid for `Scenario`, but got {short_repr(content)} in {path}: {error}"
         ) from None

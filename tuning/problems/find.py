@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import FEW, any_case, meant, shown
+from thruster_env.numerics.checks import FEW, any_case, meant, short_repr
 from thruster_env.numerics.modules import is_code, object_named, said
 from tuning.problems.augmented import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
-from tuning.problems.rooms import built_in
 
 
 def find_problem(name: str) -> Problem:
@@ -38,7 +38,7 @@ def find_problem(name: str) -> Problem:
         return read_scenario(name)
     rule = f"problem must be one of {', '.join([*known][:FEW])} and {len(known) - FEW} more"
     rule += " (thruster tune --help lists all), a file that ends in .toml, or module:object"
-    raise ValueError(f"{rule}, but got {shown(name)}{_module_meant(name) or meant(name, known)}")
+    raise ValueError(f"{rule}, but got {short_repr(name)}{_module_meant(name) or meant(name, known)}")
 
 
 def _module_meant(name: Any) -> str:
@@ -85,7 +85,7 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
             f"{where} was tuned on {name!r}, an object of yours: pass problem=... (--problem module:object)"
         )
     raise ValueError(
-        f"a problem that is code must be given, but {where} only names {shown(name)}: "
+        f"a problem that is code must be given, but {where} only names {short_repr(name)}: "
         f"use --problem {name}, if you trust it"
     )
 

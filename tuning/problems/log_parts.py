@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, short_repr
 from thruster_env.plants.logs.log import Log
 
 LEAD = 50  # steps at the start of a block that are filtered and not scored
@@ -207,7 +207,9 @@ def _check_names(logs: Sequence[Log], held_out: Collection[str] | None) -> None:
     names = [log.name for log in logs]
     unknown = [name for name in held_out or () if name not in names]
     if unknown:
-        raise ValueError(f"runs that are held out must be among {', '.join(names)}, but got {shown(unknown[0])}")
+        raise ValueError(
+            f"runs that are held out must be among {', '.join(names)}, but got {short_repr(unknown[0])}"
+        )
 
 
 def _held(logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str] | None) -> list[bool]:

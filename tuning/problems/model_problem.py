@@ -13,7 +13,7 @@ from filters.baselines.baselines import OpenLoop
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.numerics.angles import difference
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plants.model_env import ModelEnv
 from thruster_env.plants.simulate import simulate
@@ -72,7 +72,9 @@ class ModelProblem(AssumedProblem):
     ):
         """Check that the models fit; see the class for the arguments."""
         if not isinstance(truth, StateSpaceModel):
-            raise ValueError(f"the truth of problem {name} must be a StateSpaceModel, but it is {shown(truth)}")
+            raise ValueError(
+                f"the truth of problem {name} must be a StateSpaceModel, but it is {short_repr(truth)}"
+            )
         self.truth, self.inputs = truth, _checked_inputs(inputs, truth.inputs)
         length = len(self.inputs) if isinstance(self.inputs, np.ndarray) else 500
         super().__init__(
@@ -239,5 +241,5 @@ def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Call
             raise ValueError
     except (TypeError, ValueError):
         rule = f"inputs must be finite numbers (K, {count}), an excitation, or a function of (seeds, steps)"
-        raise ValueError(f"{rule}, but got {shown(given)}") from None
+        raise ValueError(f"{rule}, but got {short_repr(given)}") from None
     return array

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from optuna.distributions import FloatDistribution, IntDistribution
 
-from thruster_env.numerics.checks import at_least, finite, shown
+from thruster_env.numerics.checks import at_least, finite, short_repr
 
 
 class Place(Protocol):
@@ -77,7 +77,7 @@ class Parameter:
     def __post_init__(self):
         """Check the range and fill in defaults."""
         if not isinstance(self.name, str) or not self.name or " " in self.name:
-            raise ValueError(f"a parameter must have a name without spaces, but got {shown(self.name)}")
+            raise ValueError(f"a parameter must have a name without spaces, but got {short_repr(self.name)}")
         check = at_least if self.integer else finite
         arguments = (-(10**9),) if self.integer else ()
         for end in ("low", "high"):

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.streams import POLICY, RANDOM_ACTIONS, derived_generator, derived_seed
 from tuning.problems.excitation import Excitation, excitation_of
 
@@ -25,7 +25,7 @@ def checked_policy(given: Policy) -> str | Excitation | Callable:
         return excitation_of(given)
     if given != RANDOM and not callable(given) and not hasattr(given, "predict"):
         rule = "policy must be 'random', a function of the observation, an object with predict, or an excitation"
-        raise ValueError(f"{rule}, but got {shown(given)}")
+        raise ValueError(f"{rule}, but got {short_repr(given)}")
     return given
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from filters.starts import PRIOR
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.plants.logs.columns import STATE
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
@@ -60,7 +60,7 @@ class RunsProblem(LogProblem):
         """Check the arrays; see the class for the arguments."""
         if not isinstance(runs, Sequence) or isinstance(runs, str) or not runs:
             raise ValueError(
-                f"runs must be a list of runs, each a mapping or a tuple of arrays, but got {shown(runs)}"
+                f"runs must be a list of runs, each a mapping or a tuple of arrays, but got {short_repr(runs)}"
             )
         made = model if isinstance(model, StateSpaceModel) else _made(model, parameters)
         logs = [log_of(run, made, dt, f"run {place}") for place, run in enumerate(runs)]
@@ -89,7 +89,9 @@ def _made(model: Any, parameters: Sequence[Parameter] | None) -> StateSpaceModel
     """The model of a function at the starts of its parameters, of which inputs and measurements are needed."""
     found = model(**{one.name: one.start for one in parameters or ()}) if callable(model) else model
     if not isinstance(found, StateSpaceModel):
-        raise ValueError(f"model must be a StateSpaceModel, or a function that makes one, but got {shown(model)}")
+        raise ValueError(
+            f"model must be a StateSpaceModel, or a function that makes one, but got {short_repr(model)}"
+        )
     return found
 
 
@@ -109,12 +111,13 @@ def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, nam
         parts = tuple(run) if isinstance(run, Sequence) and not isinstance(run, str) else ()
         if len(parts) not in (2, 3):
             raise ValueError(
-                f"{name} must be (inputs, measurements) or (inputs, measurements, states), but got {shown(run)}"
+                f"{name} must be (inputs, measurements) or (inputs, measurements, states), "
+                f"but got {short_repr(run)}"
             )
         run = dict(zip(PARTS, parts, strict=False))
     unknown = [key for key in run if key not in PARTS]
     if unknown or run.get("measurements") is None:
-        got = shown(unknown[0]) if unknown else "no measurements"
+        got = short_repr(unknown[0]) if unknown else "no measurements"
         raise ValueError(f"{name} must have measurements, and may have inputs and states, but got {got}")
     measurements = _columns("measurements", run["measurements"], model.m, name)
     given = run.get("inputs")

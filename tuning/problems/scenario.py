@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 
-from thruster_env.numerics.checks import at_least, shown, vector
+from thruster_env.numerics.checks import at_least, short_repr, vector
 from thruster_env.plants.env import as_json
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.excitation import Excitation, Steps, excitation_of
@@ -29,7 +29,7 @@ class BaseScenario(Problem):
     `make`.
 
     Attributes:
-        plant_kind: key of its plant in `rooms.ROOMS`.
+        plant_kind: key of its plant in `plant_packages.PLANT_PACKAGES`.
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
         scale: by which the score divides the error of each state, fixed numbers.
@@ -58,7 +58,7 @@ class BaseScenario(Problem):
         object.__setattr__(self, "excitation", excitation_of(self.excitation))
         for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
             if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"{name} must be {called}, but got {shown(getattr(self, name))}")
+                raise ValueError(f"{name} must be {called}, but got {short_repr(getattr(self, name))}")
         checked = self.own_checks() | {
             "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
             "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),

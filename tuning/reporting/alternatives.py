@@ -34,12 +34,12 @@ def of_history(trials: Sequence[FrozenTrial]) -> str:
     )
 
 
-def of_comparison(proof: Comparison) -> str:
+def of_comparison(comparison: Comparison) -> str:
     """RMSE of every filter, state by state, and the bound."""
     told = []
-    for i, state in enumerate(proof.tuned.states):
-        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.evaluations.items()]
-        values += [f"bound {proof.bound[i]:.3g}"] if isfinite(proof.bound[i]) else []
+    for i, state in enumerate(comparison.tuned.states):
+        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in comparison.evaluations.items()]
+        values += [f"bound {comparison.bound[i]:.3g}"] if isfinite(comparison.bound[i]) else []
         told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
     return f"Bars with whiskers. {'; '.join(told)}."
 

@@ -14,10 +14,10 @@ from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
 from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
-from filters.looks import colour_of
+from filters.plot_styles import colour_of
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import BLUE, DARK, RUST, panels, save_figure
-from tuning.reporting.panels import COLUMNS, shown_states
+from tuning.reporting.panels import COLUMNS, plotted_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,7 +56,7 @@ def draw_consistency(
     Raises:
         ValueError: if there is nothing to draw.
     """
-    places, left_out = shown_states(report.states, scored)
+    places, left_out = plotted_states(report.states, scored)
     colour = colour_of(filter_name)
     checks = _panels(report, comparison, places, colour)
     if not checks:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.looks import colour_of
+from filters.plot_styles import colour_of
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
-from tuning.reporting.panels import COLUMNS, shown_states
+from tuning.reporting.panels import COLUMNS, plotted_states
 from tuning.search.outcome import is_consistent
 
 if TYPE_CHECKING:
@@ -79,12 +79,12 @@ def limit_values(axis, values: list[float]) -> int:
     return sum(value > top for value in values)
 
 
-def comparison_figure(path: str | Path, proof: Comparison, title: str, filter_name: str = "ekf") -> Path:
+def comparison_figure(path: str | Path, comparison: Comparison, title: str, filter_name: str = "ekf") -> Path:
     """Save what `draw_comparison` draws."""
-    return save_figure(draw_comparison(proof, title, filter_name), path)
+    return save_figure(draw_comparison(comparison, title, filter_name), path)
 
 
-def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> Figure:
+def draw_comparison(comparison: Comparison, title: str, filter_name: str = "ekf") -> Figure:
     """RMSE of a tuned filter and its baselines on held-out seeds with 95 % intervals, and the bound.
 
     A panel is a state; of many some are shown. Bars of the tuned filter have the colour of the one of that name.
@@ -92,11 +92,11 @@ def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> 
     Raises:
         ValueError: if there is no truth, and so no RMSE.
     """
-    if not proof.tuned.has_truth:
+    if not comparison.tuned.has_truth:
         raise ValueError("a figure of errors needs the truth, but there is none")
     colours = {**COLOURS, TUNED: colour_of(filter_name)}
-    names, states = proof.evaluations, proof.tuned.states
-    places, left_out = shown_states(states, proof.tuned.scored)
+    names, states = comparison.evaluations, comparison.tuned.states
+    places, left_out = plotted_states(states, comparison.tuned.scored)
     width = 4.0 if len(places) > 1 else 5.2
     figure, axes = panels(len(places), COLUMNS, (width, 3.4), extra=0.6)
     for axis, i in zip(axes, places, strict=True):
@@ -105,8 +105,8 @@ def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> 
             whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
             axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=colours[name], capsize=4)
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
-        if np.isfinite(proof.bound[i]):
-            axis.axhline(proof.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
+        if np.isfinite(comparison.bound[i]):
+            axis.axhline(comparison.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
         axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names], fontsize=8)
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
         axis.margins(y=0.15)

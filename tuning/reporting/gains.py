@@ -10,15 +10,15 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.worth import scaling_sentence, sized, without_truth
 
 
-def gains(proof: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
+def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
     """The gain of tuning over each baseline, the main one first, and a description of that one."""
-    if not proof.tuned.has_truth:
-        return _likelihood_gains(proof, seed_word, name)
-    ratios = proof.ratios
+    if not comparison.tuned.has_truth:
+        return _likelihood_gains(comparison, seed_word, name)
+    ratios = comparison.ratios
     parts = [f"x {span(ratio, 3)} that of the {called(name)}" for name, ratio in ratios.items()]
-    first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out {seed_word}"
+    first, place = next(iter(ratios)), f"{len(comparison.seeds)} held-out {seed_word}"
     said = f"Score of the {_filter(name)} on {place}: {', '.join(parts)} (paired 95 % intervals)."
-    scaling = scaling_sentence(proof)
+    scaling = scaling_sentence(comparison)
     if name == TUNED:
         said += f" {_verdict(ratios[first], called(first), seed_word)}"
     return [said, *([scaling] if scaling else [])]
@@ -29,16 +29,16 @@ def _filter(name: str) -> str:
     return f"{name} filter" if name == TUNED else name
 
 
-def _likelihood_gains(proof: Comparison, seed_word: str, name: str) -> list[str]:
+def _likelihood_gains(comparison: Comparison, seed_word: str, name: str) -> list[str]:
     """The gain of tuning without truth: the increase of the log-likelihood of a run."""
-    gained = {name: found for name, found in proof.likelihood_gains.items() if not isnan(found.value)}
-    said, scaling = [without_truth("This problem")], scaling_sentence(proof)
+    gained = {name: found for name, found in comparison.likelihood_gains.items() if not isnan(found.value)}
+    said, scaling = [without_truth("This problem")], scaling_sentence(comparison)
     if gained:
         parts = [
             f"{span(sized(found), 2)} {'above' if found.value >= 0 else 'below'} that of the {called(name)}"
             for name, found in gained.items()
         ]
-        place = f"{len(proof.seeds)} held-out {seed_word}"
+        place = f"{len(comparison.seeds)} held-out {seed_word}"
         said.append(f"Log-likelihood of a run of the {_filter(name)} on {place}: {', '.join(parts)}.")
     return [*said, *([scaling] if scaling else [])]
 

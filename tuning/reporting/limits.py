@@ -43,15 +43,15 @@ def limit_errors(
             axis.tick_params(labelleft=False)
 
 
-def limit_values(axes: Sequence, shown: Sequence[np.ndarray], bands: Sequence[np.ndarray]) -> None:
+def limit_values(axes: Sequence, plotted: Sequence[np.ndarray], bands: Sequence[np.ndarray]) -> None:
     """One pair of limits for a row of estimates: everything shown, and at most as much again of the bands.
 
     Args:
         axes: of the row, a filter each.
-        shown: truth and estimates, as far as they have to be seen.
+        plotted: truth and estimates, as far as they have to be seen.
         bands: their ends.
     """
-    ends = _ends(shown)
+    ends = _ends(plotted)
     if ends is None:
         return
     low, high = ends

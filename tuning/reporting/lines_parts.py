@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tuning.problems.augmented import within
 from tuning.problems.log_problem import LogProblem
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
-from tuning.problems.rooms import built_in
 from tuning.reporting.matlab import matlab_function
 from tuning.reporting.page import Code, Section, Words
 from tuning.search.space import Choice

@@ -140,14 +140,16 @@ class Section(NamedTuple):
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
-def html_page(title: str, advice: str | Sequence[str], sections: Sequence[Section], beside: bool = False) -> str:
+def html_page(
+    title: str, advice: str | Sequence[str], sections: Sequence[Section], two_columns: bool = False
+) -> str:
     """The whole page; all text is escaped.
 
     Args:
         title: of the page.
         advice: the summary, a sentence or several.
         sections: what follows.
-        beside: whether it is wide, for two studies.
+        two_columns: whether it is wide, for two studies.
     """
     told = [advice] if isinstance(advice, str) else advice
     said = "\n".join(f'<p class="advice">{escape(one)}</p>' for one in told)
@@ -159,7 +161,7 @@ def html_page(title: str, advice: str | Sequence[str], sections: Sequence[Sectio
         for section in sections
     )
     script = f"\n<script>{SCRIPT}</script>" if "data-read=" in body or 'class="code"' in body else ""
-    kind = ' class="beside"' if beside else ""
+    kind = ' class="beside"' if two_columns else ""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -13,7 +13,7 @@ COLUMNS = 3  # of panels side by side
 LABEL_WIDTH = 18  # characters of a line beside a panel
 
 
-def shown_states(
+def plotted_states(
     states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
 ) -> tuple[list[int], str]:
     """Indices of the states that a figure shows, in their order, and a line with the number of those left out.

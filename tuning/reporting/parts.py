@@ -41,18 +41,18 @@ from tuning.search.space import AUTO, Choice
 MANY_TRIALS = 50
 
 
-def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison], chosen: Mapping | None = None) -> str:
+def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen: Mapping | None = None) -> str:
     """The choice and its reason, if `chosen` has them; the gain of tuning, N, and whether the covariance is right.
 
     The covariance is checked by the mean NEES; without truth by the mean NIS.
     """
-    places = [f" on {scenario.name}" if len(proofs) > 1 else "" for scenario in plan.scenarios]
-    gains = [f"{worth(proof)}{place}" for proof, place in zip(proofs, places, strict=True)]
+    places = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
+    gains = [f"{worth(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
     subject = "This" if chosen else "Tuning"
     parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
-    squares = [_squares(proof.tuned) for proof in proofs]
+    squares = [_squares(comparison.tuned) for comparison in comparisons]
     if not any(isnan(mean.value) for _, mean, _ in squares):
         found = [
             f"{confidence(mean, right)}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
@@ -69,20 +69,20 @@ def _squares(evaluation: Evaluation) -> tuple[str, Interval, float]:
     return "NIS", evaluation.nis, evaluation.expected_nis
 
 
-def held_out_section(book: Sketchbook, subject: Subject, proofs: Sequence[Comparison]) -> Section:
+def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[Comparison]) -> Section:
     """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
     parts: list[Part] = []
-    for scenario, proof in zip(subject.plan.scenarios, proofs, strict=True):
-        if not proof.tuned.has_truth:
-            parts += [Words([without_truth(scenario.name)]), errors_table(scenario, proof)]
+    for scenario, comparison in zip(subject.plan.scenarios, comparisons, strict=True):
+        if not comparison.tuned.has_truth:
+            parts += [Words([without_truth(scenario.name)]), errors_table(scenario, comparison)]
             continue
-        where = f"{len(proof.seeds)} held-out {scenario.seed_word} of {scenario.name}"
-        bound = ", and the bound" if isfinite(proof.bound).any() else ""
+        where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
+        bound = ", and the bound" if isfinite(comparison.bound).any() else ""
         name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
-        said = scaling_sentence(proof)
-        parts += [errors_table(scenario, proof), *([Words([said])] if said else [])]
+        said = scaling_sentence(comparison)
+        parts += [errors_table(scenario, comparison), *([Words([said])] if said else [])]
         caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
-        parts.append(book.picture(draw_comparison(proof, place, name), caption, of_comparison(proof)))
+        parts.append(book.picture(draw_comparison(comparison, place, name), caption, of_comparison(comparison)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from thruster_env.numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.kept import kept_comparison, kept_sizes
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.evaluation.stored import stored_comparison, stored_sizes
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.reporting.facts_parts import facts_section, model_section, score_section
@@ -42,7 +42,7 @@ class Pages(NamedTuple):
     advice: str
     sections: list[Section]
     tables: list[Table]  # of errors and parameters
-    proofs: list[Comparison]
+    comparisons: list[Comparison]
 
 
 def write_report(
@@ -92,15 +92,15 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     data = plan.training_data()
     sizes: Sequence[SizeRow] = []
     if has_ensemble(choice.name):
-        kept_rows = kept_sizes(subject.sizes, choice, plan)
+        kept_rows = stored_sizes(subject.sizes, choice, plan)
         sizes = ensemble_sizes(choice, plan, data, subject.consistent) if kept_rows is None else kept_rows
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
-    kept = [kept_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
-    proofs = [
-        evaluate_held_out(choice, scenario, plan.seed, subject.seeds) if proof is None else proof
-        for proof, scenario in zip(kept, plan.scenarios, strict=True)
+    kept = [stored_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
+    comparisons = [
+        evaluate_held_out(choice, scenario, plan.seed, subject.seeds) if comparison is None else comparison
+        for comparison, scenario in zip(kept, plan.scenarios, strict=True)
     ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     known = identify(choice, plan.scenarios, data, plan.space())
@@ -108,25 +108,33 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     identified += sentences(known) if known else too_many(choice, plan.space())
     nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
     numbers = [
-        numbers_table(choice, plan.scenarios[0], plan.seed, proofs[0].default),
+        numbers_table(choice, plan.scenarios[0], plan.seed, comparisons[0].default),
         *([known_table(known)] if known else []),
     ]
     book = Sketchbook(prefix)
     sections = [
-        held_out_section(book, subject, proofs),
+        held_out_section(book, subject, comparisons),
         *data_sections(plan.scenarios),
         score_section(subject),
         Section("The parameters", [*numbers, *([Words(identified)] if identified else [])]),
         model_section(choice, plan.scenarios[0]),
         search_section(book, subject),
         *([sizes_section(book, subject, sizes)] if sizes else []),
-        *run_sections(book, subject, proofs[0]),
+        *run_sections(book, subject, comparisons[0]),
         lines_section(choice, plan.scenarios[0], file),
         facts_section(subject, nis),
     ]
-    errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
+    errors = [
+        errors_table(scenario, comparison)
+        for scenario, comparison in zip(plan.scenarios, comparisons, strict=True)
+    ]
     return Pages(
-        subject, title, advice(choice, plan, proofs, subject.validation), sections, [*errors, *numbers], proofs
+        subject,
+        title,
+        advice(choice, plan, comparisons, subject.validation),
+        sections,
+        [*errors, *numbers],
+        comparisons,
     )
 
 

@@ -25,15 +25,15 @@ AXES = (
 READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
 
 
-def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[Section]:
+def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> list[Section]:
     """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
     choice, scenario = subject.choice, subject.plan.scenarios[0]
-    data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
-    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, proof.default).items()))
+    data, tuned = scenario.data(comparison.seeds), choice.filter(scenario)
+    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, comparison.default).items()))
     pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
-    where = f"{scenario.name}, held-out {word} {proof.seeds.start}"
-    has_covariance, scored = filter_class(choice.name).has_covariance, proof.tuned.scored or None
+    where = f"{scenario.name}, held-out {word} {comparison.seeds.start}"
+    has_covariance, scored = filter_class(choice.name).has_covariance, comparison.tuned.scored or None
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
     alt = of_estimates(pair, data, 0, dt)

@@ -14,7 +14,7 @@ from thruster_env.numerics.characters import verbatim
 from thruster_env.numerics.plots import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import early_trials, limit_values
-from tuning.reporting.panels import COLUMNS, shown_states
+from tuning.reporting.panels import COLUMNS, plotted_states
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.space import FILTER_TYPE
 
@@ -135,7 +135,7 @@ def draw_front(trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labe
 def draw_sizes(sizes: Sequence[SizeRow], kept: int) -> Figure:
     """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
     states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
-    places, left_out = shown_states(states, sizes[0].evaluation.scored)
+    places, left_out = plotted_states(states, sizes[0].evaluation.scored)
     width = 4.0 if len(places) > 1 else 5.2
     figure, axes = panels(len(places), COLUMNS, (width, 3.6))
     for axis, i in zip(axes, places, strict=True):

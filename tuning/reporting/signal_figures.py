@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from filters.filter import Filter
-from filters.looks import MEASURED, colour_of
+from filters.plot_styles import MEASURED, colour_of
 from thruster_env.numerics.angles import wrapped, wrapped_where
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import GREY, new_figure, thinned, tidy
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
-from tuning.reporting.panels import axis_label, shown_states
+from tuning.reporting.panels import axis_label, plotted_states
 from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, line_of, one_run
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         dt: sample time [s]; None for an axis of steps.
     """
     found, model, one = one_run(filter_, data, index, dt), filter_.model, data.one(index)
-    seen, left_out = shown_states(model.measurements)
-    given, _ = shown_states(model.input_quantities)
+    seen, left_out = plotted_states(model.measurements)
+    given, _ = plotted_states(model.input_quantities)
     figure, axes = _rows(len(seen) + len(given), 2 * WIDTH, dt)
     measured = wrapped_where(one.measurements[0], model.shape.measurement_angles)
     colour = colour_of(filter_.name)
@@ -61,7 +61,7 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
     """Innovations of every channel in the band that each filter expects; one column per filter."""
     channels = next(iter(filters.values())).model.measurements
-    seen, left_out = shown_states(channels)
+    seen, left_out = plotted_states(channels)
     figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(seen) + 0.8))
     axes = figure.subplots(len(seen), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)
@@ -99,8 +99,8 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
 def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None, scored=None) -> Figure:
     """The gain on every state, a line per channel and a column per filter, each panel with its own axis."""
     model = next(iter(filters.values())).model
-    places, left_out = shown_states(model.states, scored)
-    channels, _ = shown_states(model.measurements)
+    places, left_out = plotted_states(model.states, scored)
+    channels, _ = plotted_states(model.measurements)
     figure = new_figure((WIDTH * len(filters), HEIGHT * len(places) + 0.8))
     axes = figure.subplots(len(places), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import optuna
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, short_repr
 from tuning.evaluation.tuned import problem_in, read_tuned
 from tuning.evaluation.versions import versions
 from tuning.problems.find import find_given
@@ -20,7 +20,7 @@ from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.sizing import SIZES
 from tuning.search.space import Choice
 from tuning.search.storage import open_storage
-from tuning.search.storage_url import shown_storage
+from tuning.search.storage_url import public_url
 from tuning.search.study import chosen_of
 from tuning.search.validation import choice_from
 
@@ -92,7 +92,7 @@ def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
 def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
     study = _load(name, storage)
     if study is None:
-        where = shown_storage(storage)
+        where = public_url(storage)
         raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
     where = f"study {name!r}"
     plan = _plan(study.user_attrs.get("identity"), where, partial(find_given, given=problems, where=where))
@@ -138,5 +138,5 @@ def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
             worst=identity.get("worst", False),
         )
     except (KeyError, TypeError):
-        raise ValueError(f"a report needs the plan of the study, but {where} has {shown(identity)}") from None
+        raise ValueError(f"a report needs the plan of the study, but {where} has {short_repr(identity)}") from None
     return plan.checked()

@@ -21,56 +21,56 @@ MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one bel
 RATIO = "score of tuned over this"
 
 
-def errors_table(scenario: Problem, proof: Comparison) -> Table:
+def errors_table(scenario: Problem, comparison: Comparison) -> Table:
     """Metrics of a tuned filter and its baselines on held-out seeds, and the bound.
 
     A row is a filter; of more states than fit side by side, and of derived outputs then, a row is a state and a
     column a filter. Without truth the metrics are those of the innovations.
     """
-    seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
+    seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
     where = f"{scenario.name}, held-out {seeds}, with 95 % intervals"
-    if not proof.tuned.has_truth:
-        return _innovations_table(proof, where)
-    count = len(proof.bound) + len(proof.tuned.outputs)
-    return _errors_across(proof, where) if count <= MOST_ACROSS else _errors_below(proof, where)
+    if not comparison.tuned.has_truth:
+        return _innovations_table(comparison, where)
+    count = len(comparison.bound) + len(comparison.tuned.outputs)
+    return _errors_across(comparison, where) if count <= MOST_ACROSS else _errors_below(comparison, where)
 
 
-def _errors_across(proof: Comparison, where: str) -> Table:
-    ratios, tuned, errors = proof.ratios, proof.tuned, _errors(proof)
+def _errors_across(comparison: Comparison, where: str) -> Table:
+    ratios, tuned, errors = comparison.ratios, comparison.tuned, _errors(comparison)
     rows = [
         [name, _span(ratios.get(name, NOTHING)), _span(found.score)]
         + [*(cells[place] for _, cells, _ in errors), *map(_span, (found.nees, found.nis))]
-        for place, (name, found) in enumerate(proof.evaluations.items())
+        for place, (name, found) in enumerate(comparison.evaluations.items())
     ]
-    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows.append([_expected(proof), "", "", *(bound for *_, bound in errors), *right])
+    right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
+    rows.append([_expected(comparison), "", "", *(bound for *_, bound in errors), *right])
     columns = ["filter", RATIO, "score", *(label for label, *_ in errors), "mean NEES", "mean NIS"]
     return Table(where, columns, rows)
 
 
-def _errors_below(proof: Comparison, where: str) -> Table:
-    ratios, found, tuned = proof.ratios, proof.evaluations, proof.tuned
-    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
+def _errors_below(comparison: Comparison, where: str) -> Table:
+    ratios, found, tuned = comparison.ratios, comparison.evaluations, comparison.tuned
+    right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
     rows = [
         [RATIO, *(_span(ratios.get(name, NOTHING)) for name in found), ""],
         ["score", *(_span(e.score) for e in found.values()), ""],
-        *([label, *cells, bound] for label, cells, bound in _errors(proof)),
+        *([label, *cells, bound] for label, cells, bound in _errors(comparison)),
         ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
         ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
     ]
-    return Table(where, ["", *found, _expected(proof)], rows)
+    return Table(where, ["", *found, _expected(comparison)], rows)
 
 
-def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
+def _errors(comparison: Comparison) -> list[tuple[str, list[str], str]]:
     """RMSE of each state and output: label, a cell per filter, and the bound, all with one power of ten."""
-    found, told = proof.evaluations.values(), []
+    found, told = comparison.evaluations.values(), []
     parts = [
-        (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(proof.bound[i]))
-        for i, state in enumerate(proof.tuned.states)
+        (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(comparison.bound[i]))
+        for i, state in enumerate(comparison.tuned.states)
     ]
     parts += [
         (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in found], float("nan"))
-        for symbol, output in proof.tuned.outputs.items()
+        for symbol, output in comparison.tuned.outputs.items()
     ]
     for name, unit, values, bound in parts:
         power = power_of_ten([value.value for value in values])
@@ -81,19 +81,19 @@ def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
     return told
 
 
-def _expected(proof: Comparison) -> str:
+def _expected(comparison: Comparison) -> str:
     """The label of the row beside the metrics."""
-    return "expected" if np.isnan(proof.bound).all() else "bound; expected"
+    return "expected" if np.isnan(comparison.bound).all() else "bound; expected"
 
 
-def _innovations_table(proof: Comparison, where: str) -> Table:
-    gains = proof.likelihood_gains
+def _innovations_table(comparison: Comparison, where: str) -> Table:
+    gains = comparison.likelihood_gains
     rows = [
         [name, "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
         + [_span(gains.get(name, NOTHING)), str(e.divergences)]
-        for name, e in proof.evaluations.items()
+        for name, e in comparison.evaluations.items()
     ]
-    right = "" if isnan(proof.tuned.nis.value) else f"{proof.tuned.expected_nis:.3g}"
+    right = "" if isnan(comparison.tuned.nis.value) else f"{comparison.tuned.expected_nis:.3g}"
     rows.append(["expected", "", right, "", ""])
     columns = ["filter", "log-likelihood of a run", "mean NIS", "tuned less this", "restarts"]
     return Table(where, columns, rows)

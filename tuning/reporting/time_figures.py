@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from filters.looks import TRUTH, colour_of
+from filters.plot_styles import TRUTH, colour_of
 from thruster_env.numerics.angles import with_breaks, wrapped_where
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
@@ -19,7 +19,7 @@ from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
 from tuning.reporting.limits import limit_errors, limit_values
-from tuning.reporting.panels import axis_label, shown_states
+from tuning.reporting.panels import axis_label, plotted_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,7 +79,7 @@ def draw_estimates(
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
-    places, left_out = shown_states(states, scored)
+    places, left_out = plotted_states(states, scored)
     rows = _rows(states, places, model.measurements, data.states is not None)
     heights = [row.height for row in rows]
     unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
@@ -124,7 +124,7 @@ def _rows(
             label = axis_label(Quantity("error", "error", states[i].unit))
             rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
     if not has_truth:
-        seen, _ = shown_states(channels)
+        seen, _ = plotted_states(channels)
         rows += [
             Row(LOW, axis_label(channels[j]), partial(_innovation, j=j), partial(limit_innovations, j=j))
             for j in seen

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import one_of, shown
+from thruster_env.numerics.checks import one_of, short_repr
 from tuning.evaluation.evaluate import Evaluation, mse
 from tuning.problems.problem import Problem
 
@@ -121,13 +121,15 @@ def check_objectives(names: Iterable[str], problem: Problem) -> None:
         if TRUTH in objective.needs and problem.scale is None:
             free = ", ".join(known for known, one in OBJECTIVES.items() if TRUTH not in one.needs)
             raise ValueError(
-                f"an objective on {problem.name}, which has no truth, must be one of {free}, but got {shown(name)}"
+                f"an objective on {problem.name}, which has no truth, must be one of {free}, "
+                f"but got {short_repr(name)}"
             )
         outputs = tuple(problem.model().outputs) if objective.output else ()
         if objective.output and objective.output not in outputs:
             has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
             raise ValueError(
-                f"an objective on a derived output of {problem.name} must be one of {has}, but got {shown(name)}"
+                f"an objective on a derived output of {problem.name} must be one of {has}, "
+                f"but got {short_repr(name)}"
             )
 
 

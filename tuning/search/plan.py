@@ -13,7 +13,7 @@ from optuna.distributions import BaseDistribution
 
 from filters.estimators.find import estimator_named
 from filters.registry import filter_class
-from thruster_env.numerics.checks import positive, shown
+from thruster_env.numerics.checks import positive, short_repr
 from thruster_env.numerics.modules import is_code
 from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data
@@ -156,7 +156,7 @@ class Plan(NamedTuple):
         shapes = []
         for one in self.scenarios:
             if not isinstance(one, Problem):
-                raise ValueError(f"a study must be of tuning.problems.problem.Problem, but got {shown(one)}")
+                raise ValueError(f"a study must be of tuning.problems.problem.Problem, but got {short_repr(one)}")
             checked_problem(one)
             own = [parameter.name for parameter in one.parameters or ()]
             sizes = () if own else (len(one.quantities.states), len(one.quantities.measurements))

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from tuning.problems.parameter import Parameter
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -43,7 +43,7 @@ def relation_of(text: str) -> Relation:
     """A relation from its text; ValueError for another form."""
     found = FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None:
-        raise ValueError(f"{RULE}, but got {shown(text)}")
+        raise ValueError(f"{RULE}, but got {short_repr(text)}")
     name, of = found["name"], found["in_proportion"] or found["equal"]
     if found["value"]:
         return Relation(name, value=float(found["value"]))
@@ -69,14 +69,14 @@ def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[P
     for relation, text in zip(found, relations, strict=True):
         unknown = next((one for one in (relation.name, relation.of) if one and one not in known), None)
         if unknown is not None:
-            raise ValueError(f"relations must be among {', '.join(known)}, but got {shown(text)}")
+            raise ValueError(f"relations must be among {', '.join(known)}, but got {short_repr(text)}")
         if names.count(relation.name) > 1:
             raise ValueError(f"each parameter must have at most one relation, but {relation.name} has more")
         _check(known[relation.name], relation, text)
     bound = {one.name for one in found if one.ends is None}
     for relation, text in zip(found, relations, strict=True):
         if relation.of in bound:
-            raise ValueError(f"numbers must be in proportion to one that is free, but got {shown(text)}")
+            raise ValueError(f"numbers must be in proportion to one that is free, but got {short_repr(text)}")
     free = {one.name: one for one in parameters if one.name not in bound}
     if not free:
         raise ValueError(f"relations must leave a parameter to tune, but got {', '.join(relations)}")
@@ -100,11 +100,11 @@ def _check(one: Parameter, relation: Relation, text: str) -> None:
             continue
         if value <= least or (most is not None and value >= most):
             rule = "positive" if most is None else "within -1 and 1"
-            raise ValueError(f"{one.name} must be {rule}, but got {shown(text)}")
+            raise ValueError(f"{one.name} must be {rule}, but got {short_repr(text)}")
     if relation.of and one.place.is_variance and relation.factor <= 0:
-        raise ValueError(f"a variance must be a positive multiple, but got {shown(text)}")
+        raise ValueError(f"a variance must be a positive multiple, but got {short_repr(text)}")
     if relation.ends and not relation.ends[0] < relation.ends[1]:
-        raise ValueError(f"a range must be LOW..HIGH with LOW below HIGH, but got {shown(text)}")
+        raise ValueError(f"a range must be LOW..HIGH with LOW below HIGH, but got {short_repr(text)}")
 
 
 def obeying(choice, parameters: Sequence[Parameter]):

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import optuna
 
-from tuning.evaluation.kept import kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
+from tuning.evaluation.stored import sizes_as_data, stored_sizes
 from tuning.problems.data import Data
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, has_ensemble
@@ -21,7 +21,7 @@ def sizes_of(
     """The table of ensemble sizes of a choice, stored with the study; empty if there is none."""
     if not has_ensemble(choice.name) or len(plan.objectives) > 1:
         return []
-    kept = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
+    kept = stored_sizes(study.user_attrs.get(SIZES), choice, plan)
     if kept is None:
         kept = ensemble_sizes(choice, plan, data, consistent)
         study.set_user_attr(SIZES, sizes_as_data(kept, choice, plan))

@@ -13,7 +13,7 @@ from optuna.storages.journal import JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
-from tuning.search.storage_url import first_line, is_misspelt, shown_storage, without_secrets
+from tuning.search.storage_url import first_line, is_misspelt, public_url, without_secrets
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
@@ -41,7 +41,7 @@ def open_storage(storage: str) -> BaseStorage:
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like
             reason = without_secrets(first_line(error), storage)
             raise ValueError(
-                f"storage must be a database that can be reached, but got {shown_storage(storage)}: {reason}"
+                f"storage must be a database that can be reached, but got {public_url(storage)}: {reason}"
             ) from None
     path = Path(storage).resolve()  # one lock, whichever link leads to a journal
     try:
@@ -61,7 +61,7 @@ def open_storage(storage: str) -> BaseStorage:
         return Journal(JournalFile(path, lock))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
-            f"storage must be a journal file that can be written, but got {shown_storage(storage)}: {error}"
+            f"storage must be a journal file that can be written, but got {public_url(storage)}: {error}"
         ) from None
 
 

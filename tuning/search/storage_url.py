@@ -13,7 +13,7 @@ _MARKS = re.compile(r"[:/@?#&=;,\s]+")
 _MISSPELT = re.compile(rf"({'|'.join(DATABASES)})(\+\w+)?:(?!//)", re.IGNORECASE)
 
 
-def shown_storage(storage: str) -> str:
+def public_url(storage: str) -> str:
     """A storage for messages: a path as it is, of a URL scheme, host, port and database.
 
     For an ambiguous URL, such as one with a question mark in the password, only the scheme is shown.
@@ -46,7 +46,7 @@ def _place(rest: str) -> str | None:
 
 def without_secrets(text: str, storage: str) -> str:
     """A message of a database or its driver without the hidden parts of the storage's URL."""
-    shown = shown_storage(storage)
+    shown = public_url(storage)
     if shown == storage:
         return text
     rest = storage.partition("://")[2]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.logged import NO_BAND, Shown, lag_weights, with_shown
+from thruster_env.logged import NO_BAND, Recorder, lag_weights, with_recorder
 from thruster_env.model import model_of_plant
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant
 from thruster_env.plants.logs.grid import NEIGHBOURS
@@ -66,7 +66,9 @@ class ThrusterFamily:
         ValueError: for an unknown name; the message has the known ones.
     """
 
-    def __init__(self, logs: Sequence[Log], plant: Plant, seen: Shown, free: Sequence[str], *, noise: bool = True):
+    def __init__(
+        self, logs: Sequence[Log], plant: Plant, seen: Recorder, free: Sequence[str], *, noise: bool = True
+    ):
         """Find the parameters by name."""
         self.logs, self.plant, self.seen = tuple(logs), plant, seen
         if plant.linear is not None:
@@ -75,13 +77,13 @@ class ThrusterFamily:
         names = list(free) + [name for name in self.noise_names if noise and name not in free]
         wrong = [name for name in names if name not in known]
         if wrong:
-            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {shown(wrong[0])}")
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {short_repr(wrong[0])}")
         if "dead_band" in names and {"dead_band_low", "dead_band_high"} & set(names):
             raise ValueError("dead_band must not be free beside dead_band_low or dead_band_high")
         self.free = tuple(known[name] for name in dict.fromkeys(names))
         self._lagging = tuple(channel for channel in plant.channels if f"lag_{channel}" in names)
         base = model_of_plant(plant._replace(dead_band=NO_BAND))
-        self._base = with_shown(base, plant, self._shown({}), always=True)
+        self._base = with_recorder(base, plant, self._recorder({}), always=True)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -150,13 +152,13 @@ class ThrusterFamily:
             measurement_noise_cov=r,
         )
 
-    def shown_at(self, values: Mapping[str, float]) -> Shown:
+    def recorder_at(self, values: Mapping[str, float]) -> Recorder:
         """The recorder's parameters (dead band, bias and lag) for some values."""
-        return self._shown(values)
+        return self._recorder(values)
 
     def model(self, **values: float) -> StateSpaceModel:
         """The model for values of the free parameters without clock offsets; its ranges stay, which is fast."""
-        plant, seen = self.plant_at(values), self._shown(values)
+        plant, seen = self.plant_at(values), self._recorder(values)
         constants = plant.constants
         step, biases, lags = constants.substep, dict(seen.bias), dict(seen.lag)
         further = {"dead_band_low": seen.dead_band_low, "dead_band_high": seen.dead_band_high}
@@ -184,7 +186,7 @@ class ThrusterFamily:
             found.append(cov * np.outer(factors, factors))
         return found[0], found[1]
 
-    def _shown(self, values: Mapping[str, float]) -> Shown:
+    def _recorder(self, values: Mapping[str, float]) -> Recorder:
         known, seen = self.known, self.seen
         half = values.get("dead_band")
         low, high = seen.dead_band_low, seen.dead_band_high
@@ -196,7 +198,7 @@ class ThrusterFamily:
                 bias[channel] = values[f"bias_{channel}"]
             if channel in self._lagging:
                 lag[channel] = values.get(f"lag_{channel}", known[f"lag_{channel}"].start)
-        return Shown(low, high, tuple(bias.items()), tuple(lag.items()))
+        return Recorder(low, high, tuple(bias.items()), tuple(lag.items()))
 
 
 class ShiftedLogs:

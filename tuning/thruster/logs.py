@@ -8,7 +8,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from thruster_env.logged import NO_BAND, logged_plant, with_shown
+from thruster_env.logged import NO_BAND, logged_plant, with_recorder
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
 from thruster_env.parameters import PRESETS
@@ -41,7 +41,7 @@ class Preset(ModelledThruster):
     def state_space_model(self, **changes) -> StateSpaceModel:
         """The model of the plant with its recorder."""
         bare = self.plant._replace(dead_band=NO_BAND)
-        return with_shown(model_of_plant(bare, **changes), bare, self._seen)
+        return with_recorder(model_of_plant(bare, **changes), bare, self._seen)
 
 
 def is_preset(name: str | Path) -> bool:
@@ -121,7 +121,7 @@ def preset_of(found: Any, family: Any, logs: Sequence[str]):
     """
     from thruster_env.preset_file import PresetFile
 
-    plant, seen = family.plant_at(found.values), family.shown_at(found.values)
+    plant, seen = family.plant_at(found.values), family.recorder_at(found.values)
     offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
     offsets |= {
         name.removeprefix("clock_offset_"): value + offsets[name.removeprefix("clock_offset_")]

@@ -16,7 +16,7 @@ from thruster_env.linear.analysis import equilibrium
 from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.steady_state import state_range
 from thruster_env.model import model_of_plant
-from thruster_env.numerics.checks import positive, shown, vector
+from thruster_env.numerics.checks import positive, short_repr, vector
 from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
 from thruster_env.plant_data import check_same_plant, plant_data
@@ -80,7 +80,7 @@ class Scenario(BaseScenario):
         """Sensors, variances and scale of the thruster's two states."""
         if isinstance(self.sensors, str) or not isinstance(self.sensors, Collection) or not self.sensors:
             raise ValueError(
-                f"sensors of a scenario must be one channel or several, but got {shown(self.sensors)}"
+                f"sensors of a scenario must be one channel or several, but got {short_repr(self.sensors)}"
             )
         preset = self.preset
         return {

@@ -59,13 +59,13 @@ def triangle(a):
 
 
 @operation(lambda a, b: (a[0], a[1] + b[1]))
-def beside(a, b):
+def hstack(a, b):
     """The matrix [A, B]."""
     return np.concatenate([a, b], axis=1)
 
 
 @operation(lambda a, b: (a[0] + b[0], a[1]))
-def above(a, b):
+def vstack(a, b):
     """The matrix [A; B]."""
     return np.concatenate([a, b])
 

@@ -122,10 +122,10 @@ def given(
     *,
     symmetric: bool = False,
     member: bool = False,
-    beside: Matrix | None = None,
+    like: Matrix | None = None,
 ) -> Matrix:
-    """A matrix that is known when the others are worked out; `beside` one that it occurs together with."""
-    found = Matrix(name, (), shape, symmetric, None if beside is None else beside._made)
+    """A matrix that is known when the others are worked out; `like` one that it occurs together with."""
+    found = Matrix(name, (), shape, symmetric, None if like is None else like._made)
     found.member = member
     return found
 

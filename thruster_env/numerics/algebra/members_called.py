@@ -15,7 +15,7 @@ from thruster_env.numerics import arrays
 from thruster_env.numerics.algebra import matrices, members, operations, scalars
 from thruster_env.numerics.algebra.matrices import Matrix, Operation
 from thruster_env.numerics.angles import row_aligner
-from thruster_env.numerics.compiled import kept_apart
+from thruster_env.numerics.compiled import not_inlined
 from thruster_env.numerics.sources import Source, entrywise, is_array, written_out
 from thruster_env.numerics.tuples import column_reader, column_writer
 
@@ -75,10 +75,10 @@ def _by_entries(arguments: str, entry: str) -> Callable:
     """A function of members a (n, columns) and others that returns members, whose entries have a source."""
     loops = "for i in range(a.shape[0]):", "    for j in range(a.shape[1]):"
     lines = "out = np.empty_like(a)", *loops, f"        out[i, j] = {entry}", "out"
-    return kept_apart(written_out("by_entries", arguments, *lines, _loops=True, np=np))
+    return not_inlined(written_out("by_entries", arguments, *lines, _loops=True, np=np))
 
 
-@kept_apart
+@not_inlined
 def _means(a, size):
     out = np.zeros(a.shape[0])
     for i in range(a.shape[0]):
@@ -89,7 +89,7 @@ def _means(a, size):
     return out
 
 
-@kept_apart
+@not_inlined
 def _square(a, size):
     out = arrays.square_of_rows(arrays.deviations(a, 0, a.shape[0], _means(a, size), size))
     for i in range(out.shape[0]):
@@ -98,7 +98,7 @@ def _square(a, size):
     return out
 
 
-@kept_apart
+@not_inlined
 def _covariance(a, b, size):
     d = arrays.deviations(a, 0, a.shape[0], _means(a, size), size)
     out = arrays.product_of_rows(d, arrays.deviations(b, 0, b.shape[0], _means(b, size), size))
@@ -108,7 +108,7 @@ def _covariance(a, b, size):
     return out
 
 
-@kept_apart
+@not_inlined
 def _variances(a, size):
     means, out = _means(a, size), np.zeros(a.shape[0])
     for i in range(a.shape[0]):
@@ -119,7 +119,7 @@ def _variances(a, size):
     return out
 
 
-@kept_apart
+@not_inlined
 def _centred(a, size):
     means, factor, out = _means(a, size), (size / (size - 1.0)) ** 0.5, np.empty_like(a)
     for i in range(a.shape[0]):

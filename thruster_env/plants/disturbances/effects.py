@@ -18,7 +18,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
 from thruster_env.plants.memory import KEY_0, KEY_1, STEP
@@ -101,7 +101,9 @@ class Registry:
         if isinstance(given, (Mapping, Effect)):
             given = [given]
         if isinstance(given, str) or not hasattr(given, "__iter__"):
-            raise ValueError(f"{self.argument} must be a list of mappings with a name, but got {shown(given)}")
+            raise ValueError(
+                f"{self.argument} must be a list of mappings with a name, but got {short_repr(given)}"
+            )
         return tuple(self._make_one(one) for one in given)
 
     def _make_one(self, given) -> Effect:
@@ -111,7 +113,7 @@ class Registry:
         names = ", ".join(self.effects)
         if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
             rule = f"each entry of {self.argument} must be a mapping whose name is one of {names}"
-            raise ValueError(f"{rule}, but got {shown(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
         cls = self.effects[given["name"]]
         arguments = {key: value for key, value in given.items() if key != "name"}
         fields = [field.name for field in dataclasses.fields(cls)]
@@ -123,7 +125,7 @@ class Registry:
             return cls(**arguments)
         except TypeError:  # a field without a default is missing
             rule = f"{given['name']!r} must be given {', '.join(fields)}"
-            raise ValueError(f"{rule}, but got {shown(arguments)}") from None
+            raise ValueError(f"{rule}, but got {short_repr(arguments)}") from None
 
 
 @inlined
@@ -169,7 +171,7 @@ def _representable(effect: Effect, parameters: list[float]) -> list[float]:
     given = [abs(value) for value in np.hstack(parts) if value]
     if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
         rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
-        raise ValueError(f"{rule}, and so must what follows from them, but got {shown(effect)}")
+        raise ValueError(f"{rule}, and so must what follows from them, but got {short_repr(effect)}")
     return [float(value) for value in parameters]
 
 

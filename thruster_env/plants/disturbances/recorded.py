@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.numerics.checks import positive, shown, vector
+from thruster_env.numerics.checks import positive, short_repr, vector
 from thruster_env.numerics.compiled import inlined
 from thruster_env.plants.disturbances.effects import Context, Effect, set_field
 
@@ -79,7 +79,7 @@ class RecordedSeries(Effect):
 def _column(file: str, column: str | None) -> np.ndarray:
     path = Path(file)
     if not path.is_file() or not path.stat().st_size:
-        raise ValueError(f"file must be a CSV file that exists and is not empty, but got {shown(file)}")
+        raise ValueError(f"file must be a CSV file that exists and is not empty, but got {short_repr(file)}")
     with path.open(newline="", encoding="utf-8-sig") as lines:
         names, *rows = ([entry.strip() for entry in row] for row in csv.reader(lines) if row)
     names[0] = names[0].removeprefix("#").strip()  # headers are comments to some programs
@@ -91,4 +91,4 @@ def _column(file: str, column: str | None) -> np.ndarray:
     try:
         return np.array(entries, dtype=np.float64)
     except ValueError:
-        raise ValueError(f"values must be some finite numbers, but got {shown(entries)}") from None
+        raise ValueError(f"values must be some finite numbers, but got {short_repr(entries)}") from None

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import FEW, listed, shown
+from thruster_env.numerics.checks import FEW, listed, short_repr
 from thruster_env.plants.logs.units import parted
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.state_space import StateSpaceModel
@@ -71,7 +71,7 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
         near = get_close_matches(text, headers, n=3) if len(headers) > FEW else []
         told = f"; near it are {', '.join(near)}" if near else ""
         rule = f"the column for {what} must be one of {listed(headers)}"
-        raise ValueError(f"{rule}, but got {shown(text)} ({file}){told}")
+        raise ValueError(f"{rule}, but got {short_repr(text)} ({file}){told}")
     return Column(bare, unit or _unit(bare, units))
 
 
@@ -110,9 +110,11 @@ def find_columns(
         one = None if name == TIME else find_wanted(name, wanted)
         if one is None and name != TIME:
             known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
-            raise ValueError(f"columns must be given for some of {known}, but got {shown(name)}={text} ({file})")
+            raise ValueError(
+                f"columns must be given for some of {known}, but got {short_repr(name)}={text} ({file})"
+            )
         if not isinstance(text, str):
-            raise ValueError(f"the column for {name} must be a header, but got {shown(text)} ({file})")
+            raise ValueError(f"the column for {name} must be a header, but got {short_repr(text)} ({file})")
         key = TIME if one is None else one.key
         if key in found:
             raise ValueError(
@@ -122,7 +124,7 @@ def find_columns(
     known_headers = set(headers)
     for header in units:
         if header not in known_headers:
-            raise ValueError(f"units must be of columns {listed(headers)}, but got {shown(header)} ({file})")
+            raise ValueError(f"units must be of columns {listed(headers)}, but got {short_repr(header)} ({file})")
     _by_headers(found, wanted, headers, units)
     _check_found(found, wanted, headers, needs_time, file)
     return found

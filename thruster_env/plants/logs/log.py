@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, finite, positive, shown
+from thruster_env.numerics.checks import as_floats, finite, positive, short_repr
 from thruster_env.plants.logs.columns import INPUT, MEASUREMENT, STATE
 from thruster_env.plants.logs.findings import Finding, Recording, found_in
 from thruster_env.plants.logs.grid import Series, held, sampled
@@ -77,7 +77,7 @@ class Log:
             if array.shape != shape or np.isinf(array).any() or (name == "inputs" and np.isnan(array).any()):
                 rule = "finite" if name == "inputs" else "finite or NaN"
                 raise ValueError(
-                    f"{name} of log {self.name} must be {rule} and of shape {shape}, but got {shown(array)} "
+                    f"{name} of log {self.name} must be {rule} and of shape {shape}, but got {short_repr(array)} "
                     f"of shape {array.shape}"
                 )
             array.setflags(write=False)
@@ -164,7 +164,8 @@ class Log:
     def _known(self, channel: str) -> str:
         if channel not in self.channels:
             raise ValueError(
-                f"a channel of log {self.name} must be one of {', '.join(self.channels)}, but got {shown(channel)}"
+                f"a channel of log {self.name} must be one of {', '.join(self.channels)}, "
+                f"but got {short_repr(channel)}"
             )
         return channel
 
@@ -234,7 +235,7 @@ def _checked_stamps(given: np.ndarray, steps: int, name: str) -> np.ndarray:
     stamps = np.array(as_floats(given))
     if stamps.shape != (steps + 1,) or stamps[0] != 0.0 or not (np.diff(stamps) > 0.0).all():
         rule = f"{steps + 1} increasing times from 0 on"
-        raise ValueError(f"stamps of log {name} must be {rule}, but got {shown(stamps)}")
+        raise ValueError(f"stamps of log {name} must be {rule}, but got {short_repr(stamps)}")
     stamps.setflags(write=False)
     return stamps
 

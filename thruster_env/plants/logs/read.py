@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.checks import finite, listed, positive, shown
+from thruster_env.numerics.checks import finite, listed, positive, short_repr
 from thruster_env.numerics.toml import read_toml
 from thruster_env.plants.logs.columns import (
     INPUT,
@@ -98,7 +98,7 @@ def read_log(
     is_file = isinstance(path, (str, PathLike))
     for what, given in (("columns", columns), ("clock offsets", clock_offset)):
         if not isinstance(given, Mapping | None):
-            raise ValueError(f"{what} must be a mapping from quantities, but got {shown(given)}")
+            raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(given)}")
     beside = _described(Path(path)) if is_file else Description()
     said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
@@ -200,7 +200,7 @@ def _described(path: Path) -> Description:
         part = content.get(key, {})
         if not isinstance(part, dict) or not all(isinstance(value, kind) for value in part.values()):
             what = "texts" if kind is str else "seconds"
-            raise ValueError(f"{key} beside a log must map names to {what}, but {beside} has {shown(part)}")
+            raise ValueError(f"{key} beside a log must map names to {what}, but {beside} has {short_repr(part)}")
     return Description(**content)
 
 
@@ -255,7 +255,7 @@ def _offsets(
         one = find_wanted(name, wanted)
         if one is None or one.key not in found:
             known = ", ".join(one.quantity.symbol for one in wanted if one.key in found)
-            raise ValueError(f"clock offsets must be of channels {known}, but got {shown(name)} ({file})")
+            raise ValueError(f"clock offsets must be of channels {known}, but got {short_repr(name)} ({file})")
         offsets[one.key] = finite(f"the clock offset of {name}", seconds)
         if abs(offsets[one.key]) >= length:  # nothing of the channel would be left
             raise ValueError(

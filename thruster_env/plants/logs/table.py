@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.extras import to_install
 from thruster_env.plants.logs.stamps import MISSING as MISSING_TEXT
 from thruster_env.plants.logs.stamps import seconds_of, since_first
@@ -70,7 +70,9 @@ class Table:
             except ValueError:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
-                raise ValueError(f"{rule}, but got {shown(cells[row])} in {self.place(row, column)}") from None
+                raise ValueError(
+                    f"{rule}, but got {short_repr(cells[row])} in {self.place(row, column)}"
+                ) from None
         if np.isinf(found).any():
             row = int(np.argmax(np.isinf(found)))
             raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
@@ -94,7 +96,7 @@ class Table:
             return None
         for row, text in enumerate(texts):
             if text != MISSING_TEXT and np.isnan(found[row]):
-                raise ValueError(f"{DATES}, but got {shown(text)} in {self.place(row, column)}")
+                raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.place(row, column)}")
         return found
 
 
@@ -118,13 +120,13 @@ def read_table(path: str | Path) -> Table:
         ValueError: if the file is wrong; the message names file, line and column.
     """
     if not isinstance(path, (str, PathLike)):
-        raise ValueError(f"a log must be the path of a file, but got {shown(path)}")
+        raise ValueError(f"a log must be the path of a file, but got {short_repr(path)}")
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         from thruster_env.plants.logs.recorders.registry import ENDINGS  # which knows tables
 
         endings = ", ".join((*SUFFIXES, *ENDINGS))
-        raise ValueError(f"a log must be a file that ends in {endings}, but got {shown(str(path))}")
+        raise ValueError(f"a log must be a file that ends in {endings}, but got {short_repr(str(path))}")
     try:
         return {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}[suffix](Path(path))
     except OSError as error:
@@ -169,13 +171,13 @@ def _read_csv(path: Path) -> Table:
 def _check_header(header: Sequence[str], line: int, path: Path) -> None:
     if all(map(_is_number, header)):
         raise ValueError(
-            f"the first line must name the columns, but line {line} of {path} has numbers: {shown(header)}"
+            f"the first line must name the columns, but line {line} of {path} has numbers: {short_repr(header)}"
         )
     seen = set()
     for name in header:
         if name and name in seen:
             rule = "names of columns must differ from one another"
-            raise ValueError(f"{rule}, but line {line} of {path} has {shown(name)} twice")
+            raise ValueError(f"{rule}, but line {line} of {path} has {short_repr(name)} twice")
         seen.add(name)
 
 
@@ -219,7 +221,7 @@ def table_of(given: Any, name: str) -> Table:
         given = _with_index(given)
     if not isinstance(given, Mapping) or not all(isinstance(header, str) for header in given):
         rule = "a log must be the path of a file, a pandas.DataFrame, a mapping from headers to arrays, or a Log"
-        raise ValueError(f"{rule}, but got {shown(given)}")
+        raise ValueError(f"{rule}, but got {short_repr(given)}")
     return _of_arrays(name, {header: _unmasked(values) for header, values in given.items()})
 
 

@@ -33,7 +33,7 @@ def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, .
         _pyarrow()
 
 
-def check_not_beside(path: str | Path) -> None:
+def check_not_among(path: str | Path) -> None:
     """Raise ValueError if a file is, or would be, the description of a log, as run.toml is of run.csv."""
     path = Path(path)
     logs = [path.with_suffix(suffix) for suffix in (*SUFFIXES, *ENDINGS) if path.suffix == ".toml"]

@@ -146,7 +146,7 @@ class Charts:
             x -= 28
 
 
-def _runs(shown: np.ndarray) -> Iterator[slice]:
+def _runs(drawn: np.ndarray) -> Iterator[slice]:
     """Stretches of a boolean array that are true."""
-    edges = np.flatnonzero(np.diff(np.concatenate(((False,), shown, (False,)))))
+    edges = np.flatnonzero(np.diff(np.concatenate(((False,), drawn, (False,)))))
     return (slice(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True))

@@ -141,17 +141,17 @@ def transition_with_mount(x, u, c):
     return _step_with_mount((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], 0.0), c)
 
 
-def shown(x, c):
+def tachometer(x, c):
     """What the tachometer shows."""
     return (abs(x[1]),)
 
 
-def shown_with_load(x, c):
+def tachometer_and_load(x, c):
     """What tachometer and load cell show."""
     return (abs(x[1]), thrust(x, c))
 
 
-def shown_through_mount(x, c):
+def tachometer_and_mount(x, c):
     """What tachometer and load cell show where the mount swings."""
     return (abs(x[1]), through_mount(x, c))
 
@@ -167,7 +167,7 @@ def to_identify(ambient: bool = False, mount: bool = False) -> StateSpaceModel:
     move = transition_with_mount if mount else transition_in_flow if ambient else transition
     return StateSpaceModel(
         transition=move,
-        observe=shown_through_mount if mount else shown_with_load,
+        observe=tachometer_and_mount if mount else tachometer_and_load,
         process_noise_cov=[deviation**2 for part in PROCESS[:parts] for deviation in part],
         measurement_noise_cov=[deviation**2 for deviation in SENSORS],
         prior_mean=[0.0] * (4 + 2 * mount),
@@ -185,7 +185,7 @@ def to_identify(ambient: bool = False, mount: bool = False) -> StateSpaceModel:
 def on_line(identified: StateSpaceModel) -> StateSpaceModel:
     """An identified model as a filter has it that sees the tachometer alone."""
     r = identified.measurement_noise_cov[:1, :1]
-    return identified.replace(observe=shown, measurements=(TACHOMETER,), measurement_noise_cov=r)
+    return identified.replace(observe=tachometer, measurements=(TACHOMETER,), measurement_noise_cov=r)
 
 
 def model() -> StateSpaceModel:

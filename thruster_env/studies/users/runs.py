@@ -52,7 +52,7 @@ class Panel(NamedTuple):
 QUICK = Panel(PANEL[:2], ("ekf",), QUICK_TRIALS)
 
 
-class Beside(NamedTuple):
+class Paired(NamedTuple):
     """A tuned filter beside one baseline on the held-out seeds."""
 
     ratio: Interval  # score of the tuned filter over the baseline's, paired by run
@@ -68,7 +68,7 @@ class Case(NamedTuple):
     nis: float  # mean NIS over the number of channels
     restarts: int
     gave_way: str  # the baseline that the study took in place of its best trial; empty where it took a trial
-    baselines: Mapping[str, Beside]
+    baselines: Mapping[str, Paired]
     seconds: float
     error: str = ""
 
@@ -149,19 +149,19 @@ def tuned_case(problem: Problem, name: str, trials: int, seed: int) -> Case:
     validation = getattr(study.tuning.result, "validation", None)
     gave_way = validation.chosen if validation is not None and validation.gave_way else ""
     seconds = time.perf_counter() - started
-    return compared(name_of(problem), name, study.held_out.proof.evaluations, seconds, gave_way)
+    return compared(name_of(problem), name, study.held_out.comparison.evaluations, seconds, gave_way)
 
 
 def compared(problem: str, name: str, found: Mapping[str, Evaluation], seconds: float, gave_way: str = "") -> Case:
     """A case from the evaluations of the tuned filter and its baselines on the same held-out seeds."""
     one = found[TUNED]
-    beside = {
-        label: Beside(score_ratio(one, other), chance_if_no_worse(one, other))
+    paired = {
+        label: Paired(score_ratio(one, other), chance_if_no_worse(one, other))
         for label, other in found.items()
         if label != TUNED
     }
     nis = one.nis.value / one.expected_nis
-    return Case(problem, name, one.score.value, nis, one.divergences, gave_way, beside, seconds)
+    return Case(problem, name, one.score.value, nis, one.divergences, gave_way, paired, seconds)
 
 
 def name_of(problem: Problem) -> str:
@@ -178,11 +178,11 @@ def _read(file: Path, key: Mapping) -> Case | None:
         content = json.loads(file.read_text(encoding="utf-8"))
         if content.pop("of") != key:
             return None
-        beside = {
-            name: Beside(Interval(*map(float, ratio)), float(chance))
+        paired = {
+            name: Paired(Interval(*map(float, ratio)), float(chance))
             for name, (ratio, chance) in content.pop("baselines").items()
         }
         entries: dict[str, Any] = {name: KINDS[name](value) for name, value in content.items()}
-        return Case(baselines=beside, **entries)
+        return Case(baselines=paired, **entries)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file} must be a whole file of results, but cannot be read: {error}") from None

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from filters.consistency.intervals import slightly
 from thruster_env.numerics.markdown import table
-from thruster_env.studies.users.runs import Beside, Case
+from thruster_env.studies.users.runs import Case, Paired
 from thruster_env.studies.users.significance import LEVEL, holm
 from tuning.evaluation.baselines import ORACLE
 
@@ -24,7 +24,7 @@ class Loss(NamedTuple):
 
     case: Case
     baseline: str
-    beside: Beside
+    paired: Paired
 
 
 class Verdict(NamedTuple):
@@ -44,11 +44,11 @@ class Verdict(NamedTuple):
 def verdict_of(cases: Sequence[Case]) -> Verdict:
     """Which tuned filters are significantly worse than a baseline; the oracle's is no baseline that one has."""
     pairs = [Loss(case, name, one) for case in cases for name, one in case.baselines.items() if name != ORACLE]
-    other = [pair for pair in pairs if not pair.beside.ratio.low == pair.beside.ratio.high == 1.0]
-    worse = holm([pair.beside.chance for pair in other])
+    other = [pair for pair in pairs if not pair.paired.ratio.low == pair.paired.ratio.high == 1.0]
+    worse = holm([pair.paired.chance for pair in other])
     losses = tuple(pair for pair, is_worse in zip(other, worse, strict=True) if is_worse)
-    above = sum(pair.beside.ratio.low > 1.0 for pair in other)
-    return Verdict(len(other), losses, above, sum(pair.beside.ratio.high < 1.0 for pair in other))
+    above = sum(pair.paired.ratio.low > 1.0 for pair in other)
+    return Verdict(len(other), losses, above, sum(pair.paired.ratio.high < 1.0 for pair in other))
 
 
 def baselines_of(cases: Sequence[Case]) -> list[str]:
@@ -95,7 +95,7 @@ def sentences(cases: Sequence[Case]) -> list[str]:
         f"expect {found.by_chance:.1f} by chance.",
     ]
     for loss in found.losses:
-        ratio = loss.beside.ratio
+        ratio = loss.paired.ratio
         small = slightly(ratio)
         said.append(
             f"{loss.case.problem}, {loss.case.filter}: {ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}] "
@@ -131,7 +131,7 @@ def _article(baseline: str) -> str:
     return "what was given" if baseline == "given" else f"the {baseline}"
 
 
-def _ratio(one: Beside | None, is_worse: bool) -> str:
+def _ratio(one: Paired | None, is_worse: bool) -> str:
     if one is None:
         return "none"
     value, low, high = one.ratio

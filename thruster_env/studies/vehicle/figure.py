@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.looks import TRUTH as TRUTH_LOOK
-from filters.looks import look
+from filters.plot_styles import TRUTH as TRUTH_LOOK
+from filters.plot_styles import plot_style
 from thruster_env.numerics.checks import at_least
 from thruster_env.numerics.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from thruster_env.studies import ngatini2017, ngatini2019
@@ -20,14 +20,14 @@ from thruster_env.studies.vehicle.pose import full_pose, planar_pose
 from thruster_env.studies.vehicle.printed import DT
 
 TRUTH = "truth"
-LOOKS = {
+STYLES = {
     TRUTH: TRUTH_LOOK,
-    "EnKF8 N=50": look("enkf") | {"linewidth": 1.4},
+    "EnKF8 N=50": plot_style("enkf") | {"linewidth": 1.4},
     "EnKF8 N=100": {"color": GREEN, "linewidth": 1.2, "linestyle": (0, (6, 3))},
     "EnKF8 N=200": {"color": SKY, "linewidth": 1.2, "linestyle": (0, (3, 3))},
     "EnKF8 N=300": {"color": PLUM, "linewidth": 1.2, "linestyle": (0, (1, 2))},
     "EnKF8 N=50 by yaw alone": {"color": BLUE, "linewidth": 1.4, "linestyle": (0, (4, 2))},
-    "fuzzy 0..1": look("fuzzy") | {"linewidth": 1.2, "linestyle": (0, (1, 1))},
+    "fuzzy 0..1": plot_style("fuzzy") | {"linewidth": 1.2, "linestyle": (0, (1, 1))},
 }
 LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
 EVERY = 20  # steps between points of a line
@@ -76,7 +76,7 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
     for place, one in enumerate(runs, start=1):
         axis = figure.add_subplot(rows, columns, place, projection="3d")
         for label, line in one.positions.items():
-            axis.plot(*line.T, label=label, **LOOKS[label])
+            axis.plot(*line.T, label=label, **STYLES[label])
         _arrange(axis, np.concatenate(list(one.positions.values())))
         meaning = PATHS[one.path].meaning
         axis.set_title(one.path if one.path == meaning else f"{one.path}: {meaning}", fontsize=11, y=0.94)

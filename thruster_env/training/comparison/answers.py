@@ -11,13 +11,13 @@ from thruster_env.training.comparison.statistics import as_interval
 from thruster_env.training.comparison.tables import (
     FILTERED,
     Groups,
+    as_text,
     by_policy,
     closed,
     ends_of_gap,
     figure_of,
     name_of,
     percent,
-    shown,
 )
 
 GOAL = 0.7  # of the gap between raw and true, at medium noise
@@ -60,7 +60,7 @@ def _estimates(groups: Groups) -> Iterator[str]:
         known, usual = (figure_of(groups, VARIANT_NOISE, BEST, label) for label in (one, other))
         if known is not None and usual is not None:
             value = as_interval(known - usual)
-            yield f"With the same controller (MPC), {said} is worth {shown(value, '+.4f')}: {_verdict(value)}."
+            yield f"With the same controller (MPC), {said} is worth {as_text(value, '+.4f')}: {_verdict(value)}."
 
 
 def _learnt(groups: Groups) -> Iterator[str]:
@@ -70,7 +70,7 @@ def _learnt(groups: Groups) -> Iterator[str]:
             figure = figure_of(groups, VARIANT_NOISE, kind, observed)
             if best is not None and figure is not None:
                 value = as_interval(figure / best)
-                cost = shown(value, ".3f")
+                cost = as_text(value, ".3f")
                 yield f"{name_of(kind, observed)} costs {cost} times as much as MPC: {_near(value)}."
 
 
@@ -81,7 +81,7 @@ def _wrong(groups: Groups) -> Iterator[str]:
             figure = figure_of(groups, VARIANT_NOISE, kind, f"ekf, {variant}")
             if best is not None and figure is not None:
                 value = as_interval(figure - best)
-                said = f"{name_of(kind, f'ekf, {variant}')} returns {shown(value, '+.3f')} more than MPC"
+                said = f"{name_of(kind, f'ekf, {variant}')} returns {as_text(value, '+.3f')} more than MPC"
                 yield f"{said}: {_verdict(value)}."
 
 
@@ -94,7 +94,7 @@ def _tuned(groups: Groups) -> Iterator[str]:
         if tuned is not None and reference is not None:
             value = as_interval(tuned - reference)
             yield (
-                f"With {about}, PPO on the tuned EKF returns {shown(value, '+.3f')} more than on {called}: "
+                f"With {about}, PPO on the tuned EKF returns {as_text(value, '+.3f')} more than on {called}: "
                 f"{_verdict(value)}."
             )
 
@@ -105,7 +105,7 @@ def _wrong_model(groups: Groups) -> Iterator[str]:
             wrong = figure_of(groups, VARIANT_NOISE, kind, f"{observed}, wrong model")
             right = figure_of(groups, VARIANT_NOISE, kind, observed)
             if wrong is not None and right is not None:
-                value = shown(as_interval(wrong / right), ".3f")
+                value = as_text(as_interval(wrong / right), ".3f")
                 yield f"A wrong model multiplies the cost of {name_of(kind, observed)} by {value}."
 
 

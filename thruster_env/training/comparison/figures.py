@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.looks import colour_of
+from filters.plot_styles import colour_of
 from thruster_env.numerics.plots import DARK, new_figure, save_figure, tidy
 from thruster_env.training.comparison.plan import BEST
 from thruster_env.training.comparison.runs import Result

@@ -126,7 +126,7 @@ def closed(figure: Figure, raw: Figure, true: Figure) -> Figure:
     return combined(lambda a, low, high: (a - low) / (high - low), figure, raw, true)
 
 
-def shown(value: Interval, form: str) -> str:
+def as_text(value: Interval, form: str) -> str:
     """An estimate and its interval."""
     return f"{value.value:{form}} [{value.low:{form}}, {value.high:{form}}]"
 
@@ -134,7 +134,7 @@ def shown(value: Interval, form: str) -> str:
 def percent(value: Interval | float) -> str:
     """An estimate in per cent, with its interval if it has one."""
     if isinstance(value, Interval):
-        return shown(value, ".1%").replace("%", " %")
+        return as_text(value, ".1%").replace("%", " %")
     return f"{100 * value:.0f} %"
 
 
@@ -145,4 +145,4 @@ def _gap_cell(groups: Groups, noise: str, one: tuple[str, str]) -> str:
 
 def _ratio_cell(groups: Groups, noise: str, above: tuple[str, str], below: tuple[str, str]) -> str:
     top, bottom = (figure_of(groups, noise, *of) for of in (above, below))
-    return "" if top is None or bottom is None else shown(as_interval(top / bottom), ".3f")
+    return "" if top is None or bottom is None else as_text(as_interval(top / bottom), ".3f")

@@ -17,7 +17,7 @@ from thruster_env.numerics.files import write_whole
 _known: dict[str, tuple[float, ...]] = {}  # of this process
 
 
-def kept_numbers(
+def cached_numbers(
     name: str, count: int, follows_from: bytes, code: CompiledOrPython, compute: Callable
 ) -> np.ndarray:
     """Return the vector compute(), or what it was the last time that it followed from the same.

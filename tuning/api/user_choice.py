@@ -19,7 +19,7 @@ def is_own(given: Any) -> bool:
     return isinstance(given, Filter | StateSpaceModel)
 
 
-def own_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
+def user_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
     """The Q, R and other parameters of a filter or model, with its prior, for a problem of the same equations.
 
     A model means an extended Kalman filter on it.

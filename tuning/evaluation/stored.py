@@ -42,7 +42,7 @@ def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
     return {"digest": _digest_of_sizes(choice, plan), "rows": found}
 
 
-def kept_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
+def stored_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
     """The stored table of ensemble sizes if it belongs to this choice, otherwise None.
 
     Args:
@@ -91,7 +91,7 @@ def comparison_as_data(comparison: Comparison) -> dict:
     }
 
 
-def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
+def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
     """The held-out comparison on a problem that a tuned file stores; None if it has to be recomputed.
 
     It is recomputed if the file lacks it, or was made with other versions of packages.
@@ -123,8 +123,8 @@ def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Compa
             bound=np.array([math.nan if part is None else float(part) for part in held_out["bound"]]),
             seeds=range(first, beyond),
             default=default,
-            kept_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
-            kept_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
+            stored_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
+            stored_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
             rule=rule_label(problem),
             given=found["given"],
             noise=found["noise"],

@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import shown
+from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import is_code
 from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.logs.recorders.registry import ENDINGS
 from thruster_env.plants.logs.table import SUFFIXES
 from thruster_env.plants.state_space import StateSpaceModel
-from tuning.problems.rooms import room_of_logs
+from tuning.problems.plant_packages import logs_package
 
 
-def whose_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, Any, str | Path | None]:
+def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, Any, str | Path | None]:
     """Logs, their model (None for a thruster) and the preset, from what a user gives.
 
     Args:
@@ -28,15 +28,17 @@ def whose_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, A
     """
     if isinstance(logs, tuple) and len(logs) == 2 and _is_model(logs[0]):
         if model is not None:
-            raise ValueError(f"a pair (model, logs) must come without another model, but got {shown(model)}")
+            raise ValueError(f"a pair (model, logs) must come without another model, but got {short_repr(model)}")
         model, logs = logs
     if not isinstance(model, str | Path) or is_code(str(model)):
         return logs, model, preset
     if preset is not None:
-        raise ValueError(f"give either a model or a preset, but got both, {shown(model)} and {shown(preset)}")
-    if not room_of_logs().is_preset(model):
+        raise ValueError(
+            f"give either a model or a preset, but got both, {short_repr(model)} and {short_repr(preset)}"
+        )
+    if not logs_package().is_preset(model):
         rule = "a model must be an object, 'module:object' or a thruster's preset"
-        raise ValueError(f"{rule}, but got {shown(model)}")
+        raise ValueError(f"{rule}, but got {short_repr(model)}")
     return logs, None, model
 
 
@@ -45,7 +47,7 @@ def _is_model(one: Any) -> bool:
     if isinstance(one, str | Path):
         if Path(one).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
-        return is_code(str(one)) or room_of_logs().is_preset(one)
+        return is_code(str(one)) or logs_package().is_preset(one)
     return (
         isinstance(one, StateSpaceModel | ContinuousModel) or hasattr(one, "state_space_model") or _makes_one(one)
     )

@@ -1,13 +1,13 @@
 """Colours and dashes of filters: one each, none twice, all legible on white and on dark paper."""
 
-from filters.looks import LOOKS, TRUTH, colour_of, look
+from filters.plot_styles import STYLES, TRUTH, colour_of, plot_style
 from filters.registry import FILTERS
 from tuning.reporting.svg import luminance, on_dark
 
 
 def test_every_filter_has_a_look_of_its_own():
-    assert set(LOOKS) == set(FILTERS)
-    looks = [tuple(look(name).values()) for name in (*FILTERS, "somebody:Estimator")]
+    assert set(STYLES) == set(FILTERS)
+    looks = [tuple(plot_style(name).values()) for name in (*FILTERS, "somebody:Estimator")]
     assert len(set(looks)) == len(looks)
     assert TRUTH["color"] not in {colour for colour, _ in looks}
 
@@ -23,5 +23,5 @@ def test_filters_that_are_drawn_together_differ_in_hue():
 
 
 def test_colours_are_legible_on_white_and_on_dark_paper():
-    for colour, _ in LOOKS.values():
+    for colour, _ in STYLES.values():
         assert luminance(colour) < 0.45 and luminance(on_dark(colour)) > 0.2

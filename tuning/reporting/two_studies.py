@@ -27,7 +27,7 @@ class Source(NamedTuple):
     file: str | None = None  # what the page calls the tuned file, as in `write_report`
 
 
-def write_beside(sources: Sequence[Source], out: str | Path | None = None) -> Report:
+def write_two_studies(sources: Sequence[Source], out: str | Path | None = None) -> Report:
     """Write a page, A-beside-B.html, and its tables, A-beside-B.md, on two tuned files or studies.
 
     If both are of the same problem, a table has the ratio of their scores, paired on the same held-out seeds.
@@ -58,7 +58,7 @@ def write_beside(sources: Sequence[Source], out: str | Path | None = None) -> Re
     told = [f"{name}: {one.advice}" for name, one in zip(names, found, strict=True)]
     table, said = _summary(names, found)
     sections = [Section("Side by side", [table, *([Words([said])] if said else [])]), *_paired(names, found)]
-    write_whole(page, html_page(title, told, sections, beside=True))
+    write_whole(page, html_page(title, told, sections, two_columns=True))
     every = [table, *found[0].tables, *found[1].tables]
     write_whole(tables, markdown_page(title, "\n".join(told), every))
     return Report(page, tables, "\n".join(told))
@@ -77,7 +77,7 @@ def _paired(names: Sequence[str], found: Sequence[Pages]) -> list[Section]:
 def _summary(names: Sequence[str], found: Sequence[Pages]) -> tuple[Table, str]:
     """Held-out metrics of both tuned filters, and the paired ratio if the problem is the same."""
     choices = [one.subject.choice for one in found]
-    tuned = [one.proofs[0].tuned for one in found]
+    tuned = [one.comparisons[0].tuned for one in found]
     rows = [
         ["filter", *(choice.name for choice in choices)],
         ["problem", *(one.subject.plan.scenarios[0].name for one in found)],
@@ -98,7 +98,7 @@ def _summary(names: Sequence[str], found: Sequence[Pages]) -> tuple[Table, str]:
 def _ratio(names: Sequence[str], found: Sequence[Pages]) -> str:
     """The ratio of both scores, or the difference of likelihoods, paired; empty where problems differ."""
     problems = [one.subject.plan.scenarios[0] for one in found]
-    seeds = [one.proofs[0].seeds for one in found]
+    seeds = [one.comparisons[0].seeds for one in found]
     if problems[0].digest != problems[1].digest or seeds[0] != seeds[1]:
         return "The two have different problems or held-out data, so their scores are not paired."
     data = problems[0].data(seeds[0])

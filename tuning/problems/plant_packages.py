@@ -7,20 +7,20 @@ from types import ModuleType
 
 # Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
 # computed_scale(scenario, sequences).
-ROOMS = {"thruster": "tuning.thruster.find", "auv": "tuning.auv.find"}
+PLANT_PACKAGES = {"thruster": "tuning.thruster.find", "auv": "tuning.auv.find"}
 LOGS = "tuning.thruster.logs"
 
 
-def room_of(plant: str) -> ModuleType:
-    """The package of a plant by its key in `ROOMS`."""
-    return importlib.import_module(ROOMS[plant])
+def plant_package(plant: str) -> ModuleType:
+    """The package of a plant by its key in `PLANT_PACKAGES`."""
+    return importlib.import_module(PLANT_PACKAGES[plant])
 
 
-def room_of_logs() -> ModuleType:
+def logs_package() -> ModuleType:
     """The package of the plant of logs without a model, `tuning.thruster.logs`."""
     return importlib.import_module(LOGS)
 
 
 def built_in() -> dict[str, ModuleType]:
     """Names of the built-in problems, and the package of each."""
-    return {name: room for room in map(room_of, ROOMS) for name in room.NAMES}
+    return {name: room for room in map(plant_package, PLANT_PACKAGES) for name in room.NAMES}

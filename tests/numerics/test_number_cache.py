@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from thruster_env.numerics import kept_numbers as module
-from thruster_env.numerics.kept_numbers import kept_numbers
+from thruster_env.numerics import number_cache as module
+from thruster_env.numerics.number_cache import cached_numbers
 
 
 class Code:
@@ -30,7 +30,7 @@ def ask(monkeypatch, tmp_path):
             ask.computed += 1
             return np.array(value)
 
-        return kept_numbers("bound", 2, follows_from, Code(folder), compute)
+        return cached_numbers("bound", 2, follows_from, Code(folder), compute)
 
     ask.computed = 0
     return ask

@@ -8,10 +8,10 @@ import pytest
 from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
-from tuning.evaluation import kept
+from tuning.evaluation import stored
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.kept import kept_comparison, kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow
+from tuning.evaluation.stored import sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, worth
 from tuning.reporting import report as reports
@@ -29,7 +29,7 @@ def test_a_comparison_reads_as_it_was(tmp_path, scenario):
     path = write_untuned(tmp_path / "ekf.json", scenario, seeds=3)
     choice, problem, _ = read_tuned(path)
     content, fresh = read_tuned_file(path), evaluate_held_out(choice, problem, 0, 3)
-    found = kept_comparison(content, choice, problem)
+    found = stored_comparison(content, choice, problem)
     assert metrics(found) == metrics(fresh) and found.ratios == fresh.ratios
     assert errors_table(problem, found) == errors_table(problem, fresh)
     assert numbers_table(choice, problem, 0, found.default) == numbers_table(choice, problem, 0)
@@ -48,7 +48,7 @@ def test_what_other_packages_made_or_what_is_bent_is_computed_anew(tmp_path):
     ):
         content = json.loads(path.read_text())
         change(content)
-        assert kept_comparison(content, choice, NOMINAL) is None
+        assert stored_comparison(content, choice, NOMINAL) is None
 
 
 @pytest.mark.slow
@@ -69,13 +69,15 @@ def test_ensemble_sizes_read_as_they_were_of_the_same_choice_alone(monkeypatch):
     evaluation = evaluate_held_out(choice, NOMINAL, 0, 2).tuned
     rows = [SizeRow(n, evaluation, Interval(1.1, 1.0, 1.2), 0.5, 8) for n in (5, 30)]
     data = json.loads(json.dumps(sizes_as_data(rows, choice, plan), allow_nan=False))
-    found = kept_sizes(data, choice.with_size(5), plan)
+    found = stored_sizes(data, choice.with_size(5), plan)
     assert [row._replace(evaluation=None) for row in found] == [row._replace(evaluation=None) for row in rows]
     assert found[0].evaluation.rmse == evaluation.rmse and found[0].evaluation.scored == evaluation.scored
     assert found[0].evaluation.has_truth and math.isnan(found[0].evaluation.median_nees)
     other = choice._replace(model={**choice.model, "measurement_noise_cov": 0.3})
     assert (
-        kept_sizes(data, other, plan) is kept_sizes(data, choice.with_size(7), plan) is kept_sizes(3, choice, plan)
+        stored_sizes(data, other, plan)
+        is stored_sizes(data, choice.with_size(7), plan)
+        is stored_sizes(3, choice, plan)
     )
-    monkeypatch.setattr(kept, "versions", lambda: {"numpy": "0.1"})
-    assert kept_sizes(data, choice, plan) is None
+    monkeypatch.setattr(stored, "versions", lambda: {"numpy": "0.1"})
+    assert stored_sizes(data, choice, plan) is None

@@ -17,7 +17,7 @@ SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.
 TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
 MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}
 OTHER = (GREEN, DOTTED)  # an estimator of one's own
-LOOKS: dict[str, tuple[str, Any]] = {
+STYLES: dict[str, tuple[str, Any]] = {
     "kf": (PLUM, SOLID),
     "kf-steady": (PLUM, DOTTED),
     "ekf": (BLUE, SOLID),
@@ -50,12 +50,12 @@ LOOKS: dict[str, tuple[str, Any]] = {
 }
 
 
-def look(name: str) -> dict[str, Any]:
+def plot_style(name: str) -> dict[str, Any]:
     """Colour and dash of a filter by name, as matplotlib takes them; all estimators of one's own share one."""
-    colour, dashes = LOOKS.get(name, OTHER)
+    colour, dashes = STYLES.get(name, OTHER)
     return {"color": colour, "linestyle": dashes}
 
 
 def colour_of(name: str) -> str:
     """Colour of a filter by name."""
-    return LOOKS.get(name, OTHER)[0]
+    return STYLES.get(name, OTHER)[0]
