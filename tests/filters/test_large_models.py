@@ -105,18 +105,15 @@ def everything(model_name):
     return found
 
 
-@pytest.fixture(scope="module")
-def both():
-    """The same twice: by tuples, and by arrays."""
+QUICK = "thruster", "angles"  # a filter's arrays, and the angles among them
+
+
+@pytest.mark.parametrize("model", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in MODELS])
+def test_loops_over_arrays_are_what_is_written_out_for_tuples(model):
     with interpreted():
-        tuples = {name: everything(name) for name in MODELS}
+        tuples = everything(model)
         with arrays_only():
-            return tuples, {name: everything(name) for name in MODELS}
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_loops_over_arrays_are_what_is_written_out_for_tuples(both, model):
-    tuples, arrays = (form[model] for form in both)
+            arrays = everything(model)
     assert list(tuples) == list(arrays) and len(arrays) > 25
     for name, expected in tuples.items():
         for one, other in zip(expected, arrays[name], strict=True):

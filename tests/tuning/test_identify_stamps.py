@@ -91,7 +91,9 @@ def switched():
         ),
     ],
 )
-def test_rows_with_step_ratios_have_the_numbers_of_live(name, make):
+def test_rows_with_step_ratios_have_the_numbers_of_live(name, make, request):
+    if name != "ekf":  # which is compiled
+        request.getfixturevalue("as_python")
     model = make()
     log, u, z = rows_of(model)
     assert len(u[0]) > log.steps and u[0, :, 1].max() <= 1.0 + 1e-6

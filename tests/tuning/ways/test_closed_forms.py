@@ -170,12 +170,12 @@ def test_als_has_the_scatter_of_the_toolboxs_example():
     truth = motivating(0.5, 0.1)
     problem = ModelProblem(truth, motivating, steps=1000, parameters=free, scale=(1.0,) * 3, name="motivating")
     found = []
-    for repetition in range(60):
+    for repetition in range(30):
         task = Task("kf", problem, problem.data([repetition]))
         find_way("als").run("als", task)
         found.append([task.kept[1].choice.model[name] for name in ("q", "r")])  # with the gain of the example
     means, deviations = np.mean(found, axis=0), np.std(found, axis=0)
-    errors = np.array([0.135, 0.033]) / np.sqrt(60)
+    errors = np.array([0.135, 0.033]) / np.sqrt(30)
     assert (abs(means - [0.495, 0.100]) < 4 * errors).all(), (means, deviations)
     np.testing.assert_allclose(deviations, [0.135, 0.033], rtol=0.4)
 
