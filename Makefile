@@ -27,7 +27,7 @@ endif
 endif
 TIDY := $(BIN)/python -m thruster_env.numerics.leftovers
 
-.PHONY: help demo test test-slow bench docs fuzz lint clean
+.PHONY: help demo test test-slow test-all bench docs fuzz lint clean
 .NOTPARALLEL:
 
 help: ## this list
@@ -41,6 +41,9 @@ test: $(TEST) ## install what tests need (once) and run all but the slow tests; 
 
 test-slow: $(TEST) ## run the slow tests: whole studies, whole pages, the benchmark
 	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+test-all: $(TEST) ## run all tests in one go, as continuous integration does
+	@$(BIN)/python -m pytest $(ARGS)
 
 bench: $(BENCH) ## install what benchmarks need (once) and time it against other packages, side by side
 	@$(BIN)/python -m benchmarks $(ARGS)

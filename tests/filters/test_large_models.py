@@ -108,7 +108,9 @@ def everything(model_name):
 QUICK = "thruster", "angles"  # a filter's arrays, and the angles among them
 
 
-@pytest.mark.parametrize("model", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in MODELS])
+@pytest.mark.parametrize(
+    "model", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in MODELS]
+)
 def test_loops_over_arrays_are_what_is_written_out_for_tuples(model):
     with interpreted():
         tuples = everything(model)
