@@ -5,7 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # The versions to install: make CONSTRAINTS=constraints-oldest.txt test, or none, make CONSTRAINTS= test, for the newest.
 CONSTRAINTS := constraints.txt
-PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq $(addprefix -c ,$(CONSTRAINTS))
+# Python compiles a module when it is first imported; most of torch, scipy and others never are, and it is half of an install.
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile $(addprefix -c ,$(CONSTRAINTS))
 TEST_EXTRAS := rl,render,peers,db,samplers,nuts,parquet,recorders,units,frames,explore,dev,torch
 BENCH_EXTRAS := rl,peers,bench
 DOCS_EXTRAS := docs,rl,frames
