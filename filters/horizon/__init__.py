@@ -1,0 +1,1 @@
+"""Moving-horizon estimation: the states of a window, estimated together at each step."""

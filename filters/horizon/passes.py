@@ -1,0 +1,185 @@
+"""Kernels of moving-horizon estimation: passes of a smoother over a window, until its states settle."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.horizon.limits import limits
+from filters.horizon.window import kept_places, scratch_places, window_works
+from filters.pages.kernels import nothing_to_summarise, page_kernels
+from filters.particles.weighted import anything_measured
+from thruster_env.numerics.compiled import inlined, kept_apart
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
+from thruster_env.plants.state_bounds import Bound
+
+MOST_PASSES = 40  # beyond those that are asked for, until bounds settle
+PATIENCE = 3  # passes without fewer wrong bounds, after which these change one by one
+
+
+@lru_cache(maxsize=64)
+def horizon_kernels(
+    functions: Functions,
+    shape: Shape,
+    *,
+    horizon: int,
+    iterations: int,
+    loss: str,
+    bounds: tuple[Bound, ...],
+    limited: bool,
+) -> Kernels:
+    """Kernels for model functions and sizes; extras: the number of steps, arrival mean and P, the steps."""
+    n, m, inputs = shape.n, shape.m, shape.inputs
+    places, kept, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
+    end, width, square = kept.end, at.end, n * n
+    arrival = places.extras + 1
+    steps = arrival + n + square
+    scratch = steps + (horizon + 1) * end
+    mean, cov, number = places.mean, places.cov, places.extras
+    sigma_place, substeps = own_place(shape) + 1, number_places(n, m).substeps
+    works = window_works(functions, shape, loss)
+    tell, centre, linearise, substep, disturb, move, correct, estimate, descend, find = works
+    clip, hold_state, hold_disturbance, push_state, judge_state, judge_disturbance = limits(shape, bounds, limited)
+    plain = page_kernels(ExtendedKalmanFilter.page, functions, shape)
+    begin, predict_belief = plain.start, plain.predict
+    has_bounds = bool(bounds) or limited
+    most = iterations + (MOST_PASSES if has_bounds else 0)
+
+    @kept_apart
+    def forwards(row, numbers, count, free):
+        """The pass forwards over the first steps, with components held at their bounds or all free."""
+        for i in range(n):
+            row[scratch + at.d + i] = row[arrival + i]
+        for i in range(square):
+            row[scratch + at.cov + i] = row[arrival + n + i]
+        centre(row[scratch : scratch + width], row[steps : steps + end], numbers)
+        for j in range(count):
+            rows = row[scratch + j * width : scratch + (j + 2) * width]
+            given = row[steps + j * end : steps + (j + 2) * end]
+            for i in range(m):
+                rows[at.z + i] = given[kept.z + i] if given[kept.z + i] < math.inf else math.nan
+            correct(rows, given, numbers)
+            if not free:
+                hold_state(rows, given)
+            if j < count - 1:
+                linearise(rows, given, numbers)
+                for _ in range(int(numbers[substeps])):
+                    substep(rows, given, numbers)
+                disturb(rows, given, numbers)
+                if not free:
+                    hold_disturbance(rows, given, numbers[sigma_place])
+                move(rows, given, numbers)
+
+    @kept_apart
+    def backwards(row, numbers, count, single):
+        """The pass backwards, which moves the window's states; returns how many bounds were not the right ones."""
+        wrong = 0
+        for j in range(count - 1, -1, -1):
+            rows = row[scratch + j * width : scratch + (j + 2) * width]
+            given = row[steps + j * end : steps + (j + 2) * end]
+            if j < count - 1:
+                if limited:
+                    find(rows, given, numbers)
+                    wrong = judge_disturbance(rows, given, numbers[sigma_place], wrong, single)
+                descend(rows, given, numbers)
+            else:
+                for i in range(n):
+                    rows[at.after + i] = 0.0
+            wrong = push_state(rows, given, wrong, single)
+            estimate(rows, given, numbers)
+            wrong = judge_state(rows, given, wrong, single)
+            for i in range(n):
+                given[kept.x + i] = rows[at.found + i]
+                given[kept.adjoint + i] = rows[at.before + i]
+            given[kept.fresh] = 0.0
+            clip(given, kept.x)
+        return wrong
+
+    @inlined
+    def begin_step(row, count):
+        """A step without a measurement, behind the others; its state is the belief's mean."""
+        clip(row, mean)
+        first = steps + count * end
+        for i in range(end):
+            row[first + i] = 0.0
+        for i in range(n):
+            row[first + kept.x + i] = row[mean + i]
+        for i in range(m):
+            row[first + kept.z + i] = math.inf
+        row[first + kept.fresh] = 1.0
+        row[number] = count + 1.0
+
+    @inlined
+    def leave_first(row, numbers, count):
+        """Leave out the first step: what it said of the second becomes the arrival cost of that."""
+        forwards(row, numbers, 2, True)
+        second, found = scratch + width + at.cov, steps + end
+        for i in range(n):
+            expected = row[found + kept.x + i]
+            for k in range(n):
+                row[arrival + n + i * n + k] = row[second + i * n + k]
+                expected -= row[second + i * n + k] * row[found + kept.adjoint + k]
+            row[arrival + i] = expected
+        for i in range(steps, steps + (count - 1) * end):
+            row[i] = row[i + end]
+        row[number] = count - 1.0
+
+    @inlined
+    def start(memory, numbers, size):
+        row, _, _ = memory
+        begin(memory, numbers, size)
+        for i in range(number, scratch):
+            row[i] = 0.0
+        for i in range(n):
+            row[arrival + i] = row[mean + i]
+        for i in range(square):
+            row[arrival + n + i] = row[cov + i]
+        begin_step(row, 0)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        count = int(row[number])
+        for i in range(inputs):
+            row[steps + (count - 1) * end + kept.u + i] = u[i]
+        predict_belief(memory, u, numbers, size)
+        begin_step(row, count)
+        if count == horizon:
+            leave_first(row, numbers, count + 1)
+
+    @inlined
+    def settle(row, numbers, count):
+        """Pass over the window until all iterations are done and the right bounds hold, then once for P alone."""
+        fewest, patience, settled = 1 << 30, PATIENCE, False
+        for k in range(most + 1):
+            forwards(row, numbers, count, settled)
+            if settled:
+                break
+            wrong = backwards(row, numbers, count, patience < 0)
+            fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
+            settled = k + 1 == most or (k + 1 >= iterations and wrong == 0)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        count = int(row[number])
+        newest = steps + (count - 1) * end
+        tell(row, z, numbers)
+        for i in range(m):
+            row[newest + kept.z + i] = z[i] if z[i] == z[i] else math.inf
+        if has_bounds or anything_measured(z):
+            settle(row, numbers, count)
+            for i in range(n):
+                row[mean + i] = row[newest + kept.x + i]
+            for i in range(square):
+                row[cov + i] = row[scratch + (count - 1) * width + at.updated_cov + i]
+
+    return Kernels(
+        *(n, m, n, 0, start, predict, update, nothing_to_summarise),
+        extras=scratch - number,
+        scratch=(horizon + 1) * width,
+    )

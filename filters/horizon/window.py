@@ -1,0 +1,178 @@
+"""The window of a moving-horizon estimate in memory, and what is computed of each of its steps.
+
+All is in deviations d_j = x_j - X_j from the estimate X of the window, about which the model is linear:
+
+    forwards:   d_{j+1} = F_j d_j + f(X_j) - X_{j+1},  P_{j+1} = F_j P_j F_j' + Q,  then the update with z_j
+    backwards:  l = g + (I - K H)' l,  g = H' S^-1 (z_j - h(X_j) - H d_j),  x_j = X_j + d_j + P_j l,  l = F_{j-1}' l
+
+with d_j and P_j before the update in the last line. The adjoint l needs neither P^-1 nor Q^-1, so that both may be
+singular. Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+from filters.engine.layout import memory_places
+from filters.gaussian import extended
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.page import Page
+from filters.pages.programs import programs_of, stored
+from filters.pages.stages import Stage
+from filters.smoothers.rts import advance, begin
+from thruster_env.numerics.algebra.densities import dot, log_density
+from thruster_env.numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.scalars import choose, constant, count, exceeds, power, ratio
+from thruster_env.plants.layout import starts_of
+from thruster_env.plants.shape import Functions, Shape
+
+HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
+OWN = ("threshold", ()), ("disturbance_limit", ())  # numbers of the filter that programs read
+
+
+class Kept(NamedTuple):
+    """Places of what a belief holds of a step."""
+
+    u: int  # (p,), from this step to the next one; the first, as in `given` of other programs
+    x: int  # (n,), X
+    z: int  # (m,), infinite where missing: a belief must not be NaN
+    adjoint: int  # (n,), l before the update
+    fresh: int  # 1 until it was once a part of a pass
+    held: int  # (2 n,), which bounds hold the state and the disturbance after it: -1, 0 or 1
+    end: int
+
+
+class Scratch(NamedTuple):
+    """Places of what is computed of a step."""
+
+    d: int  # (n,), before the update
+    cov: int  # (n, n)
+    updated_d: int
+    updated_cov: int
+    z: int  # (m,), NaN where missing
+    mean: int  # (n,), f(X)
+    slope: int  # (n, n), F
+    without: int  # (n, n), I - K H
+    pull: int  # (n,), g
+    after: int  # (n,), l after the update, then after the bounds
+    before: int  # (n,), l before the update
+    found: int  # (n,), the new X
+    noise: int  # (n,), mean of the disturbance after this step
+    noise_cov: int  # (n, n), of it
+    disturbance: int  # (n,), estimate of it
+    spread: int  # (n,), its standard deviations
+    holds: int  # (2 n, n + 2), gain, variance and jump of each bound that holds
+    end: int
+
+
+@cache
+def kept_places(shape: Shape) -> Kept:
+    """Places of what a belief holds of a step, for some sizes."""
+    n = shape.n
+    return Kept(*starts_of(shape.inputs, n, shape.m, n, 1, 2 * n))
+
+
+@cache
+def scratch_places(shape: Shape) -> Scratch:
+    """Places of what is computed of a step, for some sizes."""
+    n, m, square = shape.n, shape.m, shape.n * shape.n
+    return Scratch(
+        *starts_of(n, square, n, square, m, n, square, square, n, n, n, n, n, square, n, n, 2 * n * (n + 2))
+    )
+
+
+class Works(NamedTuple):
+    """Functions (rows, given, numbers): `tell` of a filter's row and z, others of scratch and of what is kept."""
+
+    tell: Callable  # innovation, its covariance and log-likelihood, of the prediction
+    centre: Callable  # d -= X
+    linearise: Callable  # X and the identity
+    substep: Callable
+    disturb: Callable  # zero and Q, the disturbance after this step
+    move: Callable  # from the updated d and P to those of the next step
+    correct: Callable
+    estimate: Callable  # l before the update, and x
+    descend: Callable  # l of this step, from that of the next one
+    find: Callable  # the disturbance after this step
+
+
+def tell(model, x, P, z):
+    """Innovation, its covariance and log density, as the extended filter's; channels that are NaN are missing."""
+    return extended.update(model, x, P, z)[2:]
+
+
+def correct(model, x, d, P, z, fresh, loss):
+    """The updated d and P, I - K H, and g; of the residual at x, once there is one, follows its weight."""
+    seen = present(z)
+    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
+    residual = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    v = residual - H @ d
+    if loss != QUADRATIC:
+        S = sym(H @ P @ H.T + R)
+        square = choose(exceeds(fresh, 0.5), dot(v, divide(v, S)), dot(residual, divide(residual, R)))
+        R = ratio(R, weight(square, seen, model.own.threshold, loss))
+    S = sym(H @ P @ H.T + R)
+    K = divide(P @ H.T, S)
+    return d + K @ v, joseph(P, K, H, R), eye(P) - K @ H, H.T @ divide(v, S)
+
+
+def weight(square, seen, threshold, loss):
+    """What the precision of a measurement is multiplied by, given v' R^-1 v."""
+    limit = threshold * threshold
+    if loss == STUDENT:
+        return ratio(limit + count(seen), limit + square)
+    far = ratio(square, limit)
+    return power(choose(exceeds(far, 1.0), far, constant(1.0, far)), -0.5)
+
+
+@lru_cache(maxsize=64)
+def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
+    """What is computed of the steps of a window, for a model's functions and sizes, and a loss."""
+    n, m = shape.n, shape.m
+    kept, at, row = kept_places(shape), scratch_places(shape), memory_places(n, m)
+    told = row.innovation, row.innovation_cov, row.log_likelihood
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        angles = model.state_angles
+        x, fresh = memory.beside("given", kept.x, n), memory.beside("given", kept.fresh)
+        next_x = memory.beside("given", kept.end + kept.x, n)
+
+        def vector(place):
+            return memory.beside("rows", place, n)
+
+        def square(place, *, symmetric=False):
+            return memory.beside("rows", place, n, n, symmetric=symmetric)
+
+        d, P = vector(at.d), square(at.cov, symmetric=True)
+        updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
+        z, after, before = memory.beside("rows", at.z, m), vector(at.after), vector(at.before)
+        next_before, noise, noise_cov = vector(at.end + at.before), vector(at.noise), square(at.noise_cov, symmetric=True)
+        mean, F, without = vector(at.mean), square(at.slope), square(at.without)
+        next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
+        adjoint = vector(at.pull) + without.T @ after
+        return [
+            stored(tell(model, memory.x, memory.P, memory.z), told),
+            stored((wrap(d - x, angles),), (d,)),
+            stored(begin(model, x, P), (mean, F)),
+            stored(advance(model, mean, F, memory.u), (mean, F)),
+            stored((noise * 0.0, model.Q), (noise, noise_cov)),
+            stored(
+                (
+                    F @ updated_d + wrap(mean - next_x, angles) + noise,
+                    sym(F @ updated_P @ F.T) + noise_cov,
+                ),
+                (next_d, next_P),
+            ),
+            stored(
+                correct(model, x, d, P, z, fresh, loss), (updated_d, updated_P, without, vector(at.pull))
+            ),
+            stored((adjoint, wrap(x + d + P @ adjoint, angles)), (before, vector(at.found))),
+            stored((F.T @ next_before,), (after,)),
+            stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
+        ]
+
+    page = Page(extended.advance, extended.settle, extended.update, own=OWN)
+    return Works(*programs_of(page, functions, shape, stages).works)
