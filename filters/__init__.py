@@ -26,6 +26,7 @@ from filters.gaussian.multiple_models import InteractingMultipleModelFilter, Mul
 from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.registry import FILTERS, make_filter
@@ -65,6 +66,7 @@ __all__ = [
     "KalmanFilter",
     "LocalEnsembleTransformFilter",
     "LowPass",
+    "MovingHorizonFilter",
     "MultipleModelAdaptiveEstimator",
     "OpenLoop",
     "ParticleFilter",

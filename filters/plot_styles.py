@@ -24,6 +24,7 @@ STYLES: dict[str, tuple[str, Any]] = {
     "iekf": (MUSTARD, DASHED),
     "ukf": (SKY, BOTH),
     "ckf": (WINE, DOTTED),
+    "mhe": (BLUE, BOTH),
     "enkf": (RUST, SOLID),
     "etkf": (SKY, DASHED),
     "letkf": (SKY, TWO_DOTS),

@@ -30,6 +30,7 @@ from filters.gaussian.multiple_models import InteractingMultipleModelFilter, Mul
 from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from thruster_env.numerics.checks import one_of
@@ -46,6 +47,7 @@ FILTERS: dict[str, type[Filter]] = {
         IteratedExtendedKalmanFilter,
         UnscentedKalmanFilter,
         CubatureKalmanFilter,
+        MovingHorizonFilter,
         FadingMemoryFilter,
         HInfinityFilter,
         SchmidtKalmanFilter,

@@ -5,8 +5,8 @@ A component i of a Gaussian d, P that is held at a value has, as any exact measu
     d += k v,  P -= k s k',  k = P e_i/s,  s = P_ii,  v = value - d_i
 
 and backwards the multiplier v/s - k' l, which is added to the adjoint l_i: the force with which the bound pushes.
-A component is released if its bound would have to pull, and held at a bound if its estimate lies beyond. All change
-at once; where that does not settle, one by one, which does if the problem is linear.
+A component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
+change at once; where that does not settle, one by one, which does if the problem is linear.
 
 Source: Judice, Pires (1994), "A block principal pivoting algorithm for large-scale strictly monotone linear
 complementarity problems", Computers & Operations Research 21(5).
@@ -33,7 +33,7 @@ class Limits(NamedTuple):
     clip: Callable  # clip(row, place): put the state that lies there within the bounds
     hold_state: Callable  # hold_state(rows, given)
     hold_disturbance: Callable  # hold_disturbance(rows, given, sigma)
-    push_state: Callable  # push_state(rows, given, wrong, single), with l after the update; returns how many are wrong
+    push_state: Callable  # push_state(rows, given, wrong, single), of l after the update; how many are wrong
     judge_state: Callable  # judge_state(rows, given, wrong, single), of the estimate
     judge_disturbance: Callable  # judge_disturbance(rows, given, sigma, wrong, single), of the estimate
 

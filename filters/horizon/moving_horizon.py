@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -20,17 +19,48 @@ MOST_STEPS, MOST_ITERATIONS = 200, 50
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingHorizonFilter(Filter):
-    """Moving-horizon estimation.
+    """Moving-horizon estimation: Gauss and Newton's method for the most probable states of the last L steps.
+
+        minimise  1/2 (x_1 - m)' P^-1 (x_1 - m) + 1/2 sum w_j' Q^-1 w_j + sum rho(r_j),
+                  w_j = x_{j+1} - f(x_j, u_j),  r_j^2 = v_j' R^-1 v_j,  v_j = z_j - h(x_j),
+        so that   low <= x_j <= high,  |w_j| <= limit sqrt(diag Q)
+
+    over x_1 ... x_L, of which x_L is the estimate. An iteration is a pass of the extended filter forwards and of its
+    smoother backwards, both linearised along the states of the pass before; the first begins with the states of the
+    last update and the prediction. Where a step leaves the window, what it says of the next one becomes the arrival
+    cost of that: P = F P F' + Q by the extended filter along the estimate, and m so that the estimate stays where
+    it is. The losses are
+
+        quadratic  rho = r^2/2;  in a linear model without bounds the estimate is the Kalman filter's for any L
+        huber      rho = r^2/2 up to the threshold k, from there on k r - k^2/2
+        student    rho = (k^2 + m)/2 log(1 + r^2/k^2), of Student's t with k^2 degrees of freedom
+
+    The latter two divide R by a weight rho'(r)/r, which each pass computes anew. Bounds of states are the model's
+    `bounds`; its `bounded_by` has no meaning here. Components that are at a bound are found by an active set.
+
+    The covariance is that of x_L by the last linearisation and weights, of a problem without bounds: it does not
+    vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
+    R itself. Steps are full ones, without a line search.
+
+    `Belief.extras` holds the number of steps, m, P, and of each step u, x, z and multipliers; `window` reads x.
 
     Attributes:
-        horizon: L, 1 to 200.
+        horizon: L, 1 to 200; with 1 it is an iterated extended filter.
+        iterations: passes in an update, 1 to 50; with bounds up to 40 more until the right ones hold.
+        loss: "huber", "student" or "quadratic".
+        threshold: k of the loss, in standard deviations.
+        disturbance_limit: of each w in its standard deviations; infinite for none.
 
     Raises:
-        ValueError: if a parameter is out of its range.
+        ValueError: if a parameter is out of its range, or the loss unknown.
+
+    Source: Rao, Rawlings, Mayne (2003), "Constrained state estimation for nonlinear discrete-time systems", IEEE
+    Trans. Automatic Control 48(2); a smoother's passes as iterations: Bell (1994), "The iterated Kalman smoother as
+    a Gauss-Newton method", SIAM J. Optimization 4(3).
     """
 
     name: ClassVar[str] = "mhe"
-    varying_noise: ClassVar[bool] = False
+    varying_noise: ClassVar[bool] = False  # a window has one Q and one R
     horizon: int = 10
     iterations: int = 2
     loss: str = "huber"
@@ -64,7 +94,7 @@ class MovingHorizonFilter(Filter):
         )
 
     def window(self, belief: Belief) -> np.ndarray:
-        """The states (at most L, n) of the window as last estimated, the oldest first."""
+        """The states (at most L, n) of the window as they were last estimated, the oldest first."""
         places, n = kept_places(self.kernel_model.shape), self.model.n
         steps = belief.extras[1 + n + n * n :].reshape(self.horizon + 1, places.end)
         return steps[: int(belief.extras[0]), places.x : places.x + n].copy()

@@ -3,10 +3,11 @@
 All is in deviations d_j = x_j - X_j from the estimate X of the window, about which the model is linear:
 
     forwards:   d_{j+1} = F_j d_j + f(X_j) - X_{j+1},  P_{j+1} = F_j P_j F_j' + Q,  then the update with z_j
-    backwards:  l = g + (I - K H)' l,  g = H' S^-1 (z_j - h(X_j) - H d_j),  x_j = X_j + d_j + P_j l,  l = F_{j-1}' l
+    backwards:  l = g + (I - K H)' l,  g = H' S^-1 (z_j - h(X_j) - H d_j),  x_j = X_j + d_j + P_j l,
+                l = F_{j-1}' l
 
-with d_j and P_j before the update in the last line. The adjoint l needs neither P^-1 nor Q^-1, so that both may be
-singular. Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
+with d_j and P_j before the update in the last line. The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may
+be singular. Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from filters.pages.page import Page
 from filters.pages.programs import programs_of, stored
 from filters.pages.stages import Stage
 from filters.smoothers.rts import advance, begin
-from thruster_env.numerics.algebra.densities import dot, log_density
+from thruster_env.numerics.algebra.densities import dot
 from thruster_env.numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.scalars import choose, constant, count, exceeds, power, ratio
 from thruster_env.plants.layout import starts_of
@@ -149,7 +150,8 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         d, P = vector(at.d), square(at.cov, symmetric=True)
         updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
         z, after, before = memory.beside("rows", at.z, m), vector(at.after), vector(at.before)
-        next_before, noise, noise_cov = vector(at.end + at.before), vector(at.noise), square(at.noise_cov, symmetric=True)
+        next_before, noise = vector(at.end + at.before), vector(at.noise)
+        noise_cov = square(at.noise_cov, symmetric=True)
         mean, F, without = vector(at.mean), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
@@ -166,9 +168,7 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
                 ),
                 (next_d, next_P),
             ),
-            stored(
-                correct(model, x, d, P, z, fresh, loss), (updated_d, updated_P, without, vector(at.pull))
-            ),
+            stored(correct(model, x, d, P, z, fresh, loss), (updated_d, updated_P, without, vector(at.pull))),
             stored((adjoint, wrap(x + d + P @ adjoint, angles)), (before, vector(at.found))),
             stored((F.T @ next_before,), (after,)),
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),

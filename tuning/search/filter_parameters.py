@@ -51,6 +51,8 @@ FILTER_PARAMETERS = {
         _own("stay", 0.0, 0.999),
         _own("outlier_scale", 3.0, 1e4, log=True),
         _own("outlier_rate", 0.001, 0.5, log=True),
+        _own("horizon", 5, 50, log=True, integer=True),
+        _own("threshold", 1.0, 10.0, log=True),
     )
 }
 
