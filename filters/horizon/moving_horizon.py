@@ -25,11 +25,11 @@ class MovingHorizonFilter(Filter):
                   w_j = x_{j+1} - f(x_j, u_j),  r_j^2 = v_j' R^-1 v_j,  v_j = z_j - h(x_j),
         so that   low <= x_j <= high,  |w_j| <= limit sqrt(diag Q)
 
-    over x_1 ... x_L, of which x_L is the estimate. An iteration is a pass of the extended filter forwards and of its
-    smoother backwards, both linearised along the states of the pass before; the first begins with the states of the
-    last update and the prediction. Where a step leaves the window, what it says of the next one becomes the arrival
-    cost of that: P = F P F' + Q by the extended filter along the estimate, and m so that the estimate stays where
-    it is. The losses are
+    over x_1 ... x_L, of which x_L is the estimate. An iteration is a pass of the extended filter forwards and of
+    its smoother backwards, both linearised along the states of the pass before; the first begins with the states
+    of the last update and the prediction. Where a step leaves the window, what it says of the next one becomes the
+    arrival cost of that: P = F P F' + Q by the extended filter along the estimate, and m so that the estimate
+    stays where it is. The losses are
 
         quadratic  rho = r^2/2;  in a linear model without bounds the estimate is the Kalman filter's for any L
         huber      rho = r^2/2 up to the threshold k, from there on k r - k^2/2
@@ -55,8 +55,8 @@ class MovingHorizonFilter(Filter):
         ValueError: if a parameter is out of its range, or the loss unknown.
 
     Source: Rao, Rawlings, Mayne (2003), "Constrained state estimation for nonlinear discrete-time systems", IEEE
-    Trans. Automatic Control 48(2); a smoother's passes as iterations: Bell (1994), "The iterated Kalman smoother as
-    a Gauss-Newton method", SIAM J. Optimization 4(3).
+    Trans. Automatic Control 48(2); a smoother's passes as iterations: Bell (1994), "The iterated Kalman smoother
+    as a Gauss-Newton method", SIAM J. Optimization 4(3).
     """
 
     name: ClassVar[str] = "mhe"
