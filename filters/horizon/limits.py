@@ -1,8 +1,8 @@
 """Bounds within a pass over a window: components that lie at a bound are conditioned on it, or released.
 
-A component i of a Gaussian d, P that is held at a value has, as any exact measurement of it,
+A component i of a Gaussian d, P that is held at a value has, as any accurate measurement of it,
 
-    d += k v,  P -= k s k',  k = P e_i/s,  s = P_ii,  v = value - d_i
+    d += k v,  P -= k s k',  k = P e_i/s,  s = (1 + 1e-9) P_ii,  v = value - d_i
 
 and backwards the multiplier v/s - k' l, which is added to the adjoint l_i: the force with which the bound pushes.
 A component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
@@ -25,6 +25,7 @@ from thruster_env.plants.shape import Shape
 from thruster_env.plants.state_bounds import Bound
 
 ENOUGH = 1e-9  # beyond a bound, and of a force, in standard deviations: rounding
+SLACK = 1e-9  # of a variance that a bound leaves, so that bounds which contradict each other show as forces
 
 
 class Limits(NamedTuple):
@@ -41,8 +42,8 @@ class Limits(NamedTuple):
 @inlined
 def hold(rows, mean, cov, n, i, value, at):
     """Condition the Gaussian that lies at `mean` and `cov` on component i; k, s and v go to places from `at`."""
-    s = rows[cov + i * n + i]
-    v = value - rows[mean + i] if s > 0.0 else 0.0
+    s = (1.0 + SLACK) * rows[cov + i * n + i]
+    v = value - rows[mean + i]
     for k in range(n):
         rows[at + k] = rows[cov + k * n + i] / s if s > 0.0 else 0.0
     rows[at + n], rows[at + n + 1] = s, v
@@ -50,9 +51,10 @@ def hold(rows, mean, cov, n, i, value, at):
         rows[mean + k] += rows[at + k] * v
         for j in range(n):
             rows[cov + k * n + j] -= rows[at + k] * s * rows[at + j]
-    for k in range(n):
-        rows[cov + k * n + i] = 0.0
-        rows[cov + i * n + k] = 0.0
+    for k in range(n):  # what P_ii - P_ii^2/s and the like are, without cancellation
+        left = rows[at + k] * s * (SLACK / (1.0 + SLACK))
+        rows[cov + k * n + i] = left
+        rows[cov + i * n + k] = left
         rows[cov + k * n + k] = max(rows[cov + k * n + k], 0.0)
 
 

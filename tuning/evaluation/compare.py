@@ -160,7 +160,8 @@ def contender(
 
     unknown = unknown or {}
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(name).untuned))] if has_ensemble(name) else []
-    others = [f"{key} {value:g}" for key, value in numbers.items() if key != "ensemble_size"]
+    texts = {key: value if isinstance(value, str) else f"{value:g}" for key, value in numbers.items()}
+    others = [f"{key} {text}" for key, text in texts.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     return Contender(
         " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown, knows
