@@ -46,7 +46,7 @@ class MovingHorizonFilter(Filter):
 
     Attributes:
         horizon: L, 1 to 200; with 1 it is an iterated extended filter.
-        iterations: passes in an update, 1 to 50; with bounds up to 40 more until the right ones hold.
+        iterations: passes in an update, 1 to 50; with bounds up to 100 more until the right ones hold.
         loss: "student", "huber" or "quadratic".
         threshold: k of the loss, in standard deviations.
         disturbance_limit: of each w in its standard deviations; infinite for none.

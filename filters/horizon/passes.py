@@ -17,7 +17,7 @@ from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Functions, Shape
 from thruster_env.plants.state_bounds import Bound
 
-MOST_PASSES = 40  # beyond those that are asked for, until bounds settle
+MOST_PASSES = 100  # beyond those that are asked for, until bounds settle
 PATIENCE = 3  # passes without fewer wrong bounds, after which these change one by one
 
 
