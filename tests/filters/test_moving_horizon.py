@@ -1,4 +1,4 @@
-"""Moving-horizon estimation: the Kalman filter if nothing is nonlinear, the minimum of its cost if something is."""
+"""Moving-horizon estimation: the Kalman filter of a linear model, of others the minimum of its cost."""
 
 import math
 
@@ -142,13 +142,11 @@ def least(start, *arguments, bounds=None, limit=None):
     """The states where the cost is least, near others."""
     inputs, deviation = arguments[0], np.sqrt(np.diag(Q))
     rooms = [] if limit is None else [-1.0, 1.0]
-    held = [
-        {
-            "type": "ineq",
-            "fun": lambda x, s=s: (limit + s * disturbances(x.reshape(-1, 2), inputs) / deviation).ravel(),
-        }
-        for s in rooms
-    ]
+
+    def room(x, side):
+        return (limit - side * disturbances(x.reshape(-1, 2), inputs) / deviation).ravel()
+
+    held = [{"type": "ineq", "fun": room, "args": (side,)} for side in rooms]
     found = minimize(
         cost,
         start.ravel(),
@@ -269,7 +267,7 @@ def reactor(**changes):
 
 
 def test_in_a_batch_reactor_it_keeps_a_pressure_positive_that_the_ekf_takes_below_zero():
-    """Haseltine, Rawlings (2005), "Critical evaluation of extended Kalman filtering and moving-horizon estimation"."""
+    """The example of Haseltine and Rawlings (2005), Industrial & Engineering Chemistry Research 44(8)."""
     rng, x, states = np.random.default_rng(0), np.array([3.0, 1.0]), []
     model = reactor(bounds={0: (0.0, None), 1: (0.0, None)})
     for _ in range(41):
