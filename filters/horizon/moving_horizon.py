@@ -11,7 +11,7 @@ import numpy as np
 from filters.engine.belief import Belief, Kernels
 from filters.filter import Filter
 from filters.horizon.passes import horizon_kernels
-from filters.horizon.window import LOSSES, STUDENT, kept_places
+from filters.horizon.window import HUBER, LOSSES, kept_places
 from thruster_env.numerics.checks import at_least, one_of, positive
 
 MOST_STEPS, MOST_ITERATIONS = 200, 50
@@ -47,7 +47,7 @@ class MovingHorizonFilter(Filter):
     Attributes:
         horizon: L, 1 to 200; with 1 it is an iterated extended filter.
         iterations: passes in an update, 1 to 50; with bounds up to 100 more until the right ones hold.
-        loss: "student", "huber" or "quadratic".
+        loss: "huber", "student" or "quadratic"; that of Student has several minima, the others one if f and h are affine.
         threshold: k of the loss, in standard deviations.
         disturbance_limit: of each w in its standard deviations; infinite for none.
 
@@ -63,7 +63,7 @@ class MovingHorizonFilter(Filter):
     varying_noise: ClassVar[bool] = False  # a window has one Q and one R
     horizon: int = 10
     iterations: int = 3
-    loss: str = STUDENT
+    loss: str = HUBER
     threshold: float = 2.0
     disturbance_limit: float = math.inf
 

@@ -30,7 +30,7 @@ from thruster_env.numerics.algebra.scalars import choose, constant, count, excee
 from thruster_env.plants.layout import starts_of
 from thruster_env.plants.shape import Functions, Shape
 
-STUDENT, HUBER, QUADRATIC = LOSSES = "student", "huber", "quadratic"
+HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
 OWN = ("threshold", ()), ("disturbance_limit", ())  # numbers of the filter that programs read
 
 

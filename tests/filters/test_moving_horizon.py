@@ -287,5 +287,5 @@ def test_arguments_are_checked():
     for number, value in (("horizon", 0), ("iterations", 51), ("threshold", 0.0), ("disturbance_limit", -1.0)):
         with pytest.raises(ValueError, match=f"{number} must be"):
             MovingHorizonFilter(model=model, **{number: value})
-    with pytest.raises(ValueError, match="loss must be one of student, huber, quadratic, but got 'cauchy'"):
+    with pytest.raises(ValueError, match="loss must be one of huber, student, quadratic, but got 'cauchy'"):
         MovingHorizonFilter(model=model, loss="cauchy")

@@ -95,7 +95,13 @@ def test_counts_have_limits():
     refused(lambda: compare("tunnel", 0.5, runs=HUGE), "runs must be at most 100000, but got")
     refused(lambda: command(out=Path("x.csv"), steps=HUGE), "steps must be at most 10000000")
     model = thruster_model()
-    of_filters = ("gsf", "parts"), ("vb", "iterations"), ("ienkf", "iterations"), ("kf", "schedule"), ("mhe", "horizon")
+    of_filters = (
+        ("gsf", "parts"),
+        ("vb", "iterations"),
+        ("ienkf", "iterations"),
+        ("kf", "schedule"),
+        ("mhe", "horizon"),
+    )
     for name, number in of_filters:
         refused(lambda: make_filter(name, model, **{number: HUGE}), f"{number} must be at most")  # noqa: B023
 

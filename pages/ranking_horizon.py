@@ -1,0 +1,115 @@
+"""Make the tables of docs/ranking.md on moving-horizon estimation: where it is the right filter, and where not.
+
+python -m pages.ranking_horizon [PAGE] [--table NAME]...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from filters import StateSpaceModel, make_filter, run
+from filters.filter import Filter
+from pages.page import digits, table
+from pages.ranking_tables import EKF, IEKF, ROBUST, SEEDS, leaderboard, main, ratio_cell
+from thruster_env.numerics.streams import episode_keys, filter_keys
+from thruster_env.plants.simulate import simulate
+from tuning.evaluation.compare import contender
+from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
+
+STEPS, SETTLED = 100, 20  # of a batch, of which errors count from a step on
+POSITIVE = {0: (0.0, None), 1: (0.0, None)}
+
+
+def react(x, u, c):
+    """Partial pressures of A and B after 0.1 of a time unit of 2 A -> B at k = 0.16, solved exactly."""
+    left = x[0] / (1.0 + 0.032 * x[0])
+    return left, x[1] + 0.5 * (x[0] - left)
+
+
+def total_pressure(x, c):
+    """The sum of the pressures, which is measured."""
+    return (x[0] + x[1],)
+
+
+def reactor(prior_mean: Sequence[float], prior_cov: Sequence[float], **changes) -> StateSpaceModel:
+    """A batch reactor, as its operator believes it to begin.
+
+    Source: Haseltine, Rawlings (2005), "Critical evaluation of extended Kalman filtering and moving-horizon
+    estimation", Industrial & Engineering Chemistry Research 44(8), section 4.1.
+    """
+    return StateSpaceModel(
+        transition=react,
+        observe=total_pressure,
+        process_noise_cov=[1e-6, 1e-6],
+        measurement_noise_cov=[0.01],
+        prior_mean=prior_mean,
+        prior_cov=prior_cov,
+        inputs=0,
+        **changes,
+    )
+
+
+def batch_reactor() -> str:
+    """A batch reactor whose initial pressures are far from what the filters assume."""
+    seeds = held_out_seeds(0, SEEDS)
+    truth = simulate(reactor([3.0, 1.0], [0.0, 0.0]), episode_keys(seeds), np.zeros((SEEDS, STEPS, 0)))
+    rows = []
+    for label, filter_ in _of_reactor().items():
+        found = run(filter_, filter_keys(seeds), np.zeros((SEEDS, STEPS, 0)), truth.measurements)
+        errors = found.means - truth.states
+        rmse = np.sqrt(np.square(errors[:, SETTLED:]).mean(axis=(0, 1)))
+        lost = (np.abs(errors[:, -1]).max(axis=1) > 0.5).sum()
+        row = [label, *map(digits, rmse), digits(found.means[:, 1:, 0].min()), f"{lost} of {SEEDS}"]
+        rows.append(row)
+    return table(["filter", "p_A", "p_B", "least p_A", "lost"], rows)
+
+
+def _of_reactor() -> dict[str, Filter]:
+    def assumed(**changes) -> StateSpaceModel:
+        return reactor([0.1, 4.5], [36.0, 36.0], **changes)
+
+    within = {by: assumed(bounds=POSITIVE, bounded_by=by) for by in ("truncation", "projection")}
+    found: dict[str, Filter] = {
+        name: make_filter(name, assumed(), **numbers)
+        for name, numbers in (("ekf", {}), ("iekf", {}), ("ukf", {}), ("enkf", {"ensemble_size": 100}))
+    }
+    found |= {
+        f"{name}, bounded by {by}": make_filter(name, one) for by, one in within.items() for name in ("ekf", "ukf")
+    }
+    found["mhe without bounds"] = make_filter("mhe", assumed())
+    for horizon in (5, 10, 30):
+        found[f"mhe, L = {horizon}"] = make_filter("mhe", within["projection"], horizon=horizon)
+    return found
+
+
+def horizon() -> str:
+    """Scenarios of the thruster, where a window of past states tells little."""
+    filters = [
+        EKF,
+        IEKF,
+        ROBUST,
+        contender("mhe"),
+        contender("mhe", loss="huber"),
+        contender("mhe", loss="quadratic"),
+    ]
+    rows = []
+    for name in ("outliers", "deadband", "startup", "published_noise", "nominal"):
+        board = leaderboard(find_scenario(name), filters)
+        for row in board.rows:
+            first = row is board.rows[0]
+            motor, flow = (
+                f"{one.value:.{places}f}" for one, places in zip(row.evaluation.rmse, (3, 4), strict=True)
+            )
+            cells = [f"`{name}`" if first else "", row.label, motor, flow, "" if first else ratio_cell(row)]
+            rows.append([*cells, f"{row.nees:.3g}"])
+    return table(["scenario", "filter", "omega_m [rad/s]", "U_a [m/s]", "score over ekf", "NEES"], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (batch_reactor, horizon)}
+
+
+if __name__ == "__main__":
+    main(None, TABLES, "pages.ranking_horizon", __doc__)
