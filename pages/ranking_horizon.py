@@ -11,6 +11,7 @@ import numpy as np
 
 from filters import StateSpaceModel, make_filter, run
 from filters.filter import Filter
+from filters.horizon.window import LOSSES, STUDENT
 from pages.page import digits, table
 from pages.ranking_tables import EKF, IEKF, ROBUST, SEEDS, leaderboard, main, ratio_cell
 from thruster_env.numerics.streams import episode_keys, filter_keys
@@ -76,35 +77,26 @@ def _of_reactor() -> dict[str, Filter]:
         name: make_filter(name, assumed(), **numbers)
         for name, numbers in (("ekf", {}), ("iekf", {}), ("ukf", {}), ("enkf", {"ensemble_size": 100}))
     }
-    found |= {
-        f"{name}, bounded by {by}": make_filter(name, one) for by, one in within.items() for name in ("ekf", "ukf")
-    }
+    for by, one in within.items():
+        found |= {f"{name}, bounded by {by}": make_filter(name, one) for name in ("ekf", "ukf")}
     found["mhe without bounds"] = make_filter("mhe", assumed())
-    for horizon in (5, 10, 30):
-        found[f"mhe, L = {horizon}"] = make_filter("mhe", within["projection"], horizon=horizon)
+    for length in (5, 10, 30):
+        found[f"mhe, L = {length}"] = make_filter("mhe", within["projection"], horizon=length)
+    found["mhe, L = 30, Student's loss"] = make_filter("mhe", within["projection"], horizon=30, loss=STUDENT)
     return found
 
 
 def horizon() -> str:
     """Scenarios of the thruster, where a window of past states tells little."""
-    filters = [
-        EKF,
-        IEKF,
-        ROBUST,
-        contender("mhe"),
-        contender("mhe", loss="huber"),
-        contender("mhe", loss="quadratic"),
-    ]
+    filters = [EKF, IEKF, ROBUST, *(contender("mhe", loss=loss) for loss in LOSSES)]
     rows = []
     for name in ("outliers", "deadband", "startup", "published_noise", "nominal"):
         board = leaderboard(find_scenario(name), filters)
         for row in board.rows:
             first = row is board.rows[0]
-            motor, flow = (
-                f"{one.value:.{places}f}" for one, places in zip(row.evaluation.rmse, (3, 4), strict=True)
-            )
-            cells = [f"`{name}`" if first else "", row.label, motor, flow, "" if first else ratio_cell(row)]
-            rows.append([*cells, f"{row.nees:.3g}"])
+            errors = (digits(one.value) for one in row.evaluation.rmse)
+            cells = [f"`{name}`" if first else "", row.label, *errors, "" if first else ratio_cell(row)]
+            rows.append([*cells, digits(row.nees)])
     return table(["scenario", "filter", "omega_m [rad/s]", "U_a [m/s]", "score over ekf", "NEES"], rows)
 
 

@@ -47,7 +47,7 @@ class MovingHorizonFilter(Filter):
     Attributes:
         horizon: L, 1 to 200; with 1 it is an iterated extended filter.
         iterations: passes in an update, 1 to 50; with bounds up to 100 more until the right ones hold.
-        loss: "huber", "student" or "quadratic"; that of Student has several minima, the others one if f and h are affine.
+        loss: "huber", "student" or "quadratic"; Student's may have several minima in a linear model, too.
         threshold: k of the loss, in standard deviations.
         disturbance_limit: of each w in its standard deviations; infinite for none.
 
