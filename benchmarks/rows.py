@@ -13,7 +13,7 @@ from benchmarks.rates import vector_bits
 from benchmarks.timing import Timing
 
 COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
-PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "stable_baselines3", "torch")
+PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "do_mpc", "stable_baselines3", "torch")
 
 
 class Row(NamedTuple):
