@@ -1,4 +1,4 @@
-"""A step of moving-horizon estimation through Gymnasium, beside do-mpc's estimator of the same model and window."""
+"""A step of moving-horizon estimation through Gymnasium, beside do-mpc's of the same model and window."""
 
 from __future__ import annotations
 

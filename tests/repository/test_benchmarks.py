@@ -21,7 +21,7 @@ from thruster_env.plant import make_plant
 
 PARTS = (
     *("vectors", "steps", "vector_filters", "batches", "vehicles", "trajectories", "studies", "assimilation"),
-    *("policies", "processes", "c_code"),
+    *("policies", "processes", "c_code", "horizon"),
 )
 
 
