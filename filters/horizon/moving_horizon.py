@@ -40,7 +40,7 @@ class MovingHorizonFilter(Filter):
 
     The covariance is that of x_L by the last linearisation and weights, of a problem without bounds: it does not
     vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
-    R itself. Steps are full ones, without a line search.
+    R itself. A step that costs more than it gains is halved.
 
     `Belief.extras` holds the number of steps, m, P, and of each step u, x, z and multipliers; `window` reads x.
 

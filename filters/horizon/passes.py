@@ -18,6 +18,8 @@ from thruster_env.plants.shape import Functions, Shape
 from thruster_env.plants.state_bounds import Bound
 
 MOST_PASSES = 100  # beyond those that are asked for, until bounds settle
+HALVINGS = 6  # of a step that costs more, where bounds do not change
+ROUNDING = 1e-9  # of a cost
 PATIENCE = 3  # passes without fewer wrong bounds, after which these change one by one
 
 
@@ -42,7 +44,7 @@ def horizon_kernels(
     mean, cov, number = places.mean, places.cov, places.extras
     sigma_place, substeps = own_place(shape) + 1, number_places(n, m).substeps
     works = window_works(functions, shape, loss)
-    tell, centre, linearise, substep, disturb, move, correct, estimate, descend, find = works
+    tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
     clip, hold_state, hold_disturbance, push_state, judge_state, judge_disturbance = limits(shape, bounds, limited)
     plain = page_kernels(ExtendedKalmanFilter.page, functions, shape)
     begin, predict_belief = plain.start, plain.predict
@@ -51,18 +53,20 @@ def horizon_kernels(
 
     @kept_apart
     def forwards(row, numbers, count, free):
-        """The pass forwards over the first steps, with components held at their bounds or all free."""
+        """The pass forwards over the first steps, components at bounds held or free; returns the cost of X."""
         for i in range(n):
             row[scratch + at.d + i] = row[arrival + i]
         for i in range(square):
             row[scratch + at.cov + i] = row[arrival + n + i]
         centre(row[scratch : scratch + width], row[steps : steps + end], numbers)
+        cost = row[scratch + at.seen_cost]
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
             given = row[steps + j * end : steps + (j + 2) * end]
             for i in range(m):
                 rows[at.z + i] = given[kept.z + i] if given[kept.z + i] < math.inf else math.nan
             correct(rows, given, numbers)
+            cost += rows[at.seen_cost]
             if not free:
                 hold_state(rows, given)
             if j < count - 1:
@@ -73,6 +77,8 @@ def horizon_kernels(
                 if not free:
                     hold_disturbance(rows, given, numbers[sigma_place])
                 move(rows, given, numbers)
+                cost += rows[at.moved_cost]
+        return cost
 
     @kept_apart
     def backwards(row, numbers, count, single):
@@ -97,7 +103,19 @@ def horizon_kernels(
                 given[kept.adjoint + i] = rows[at.before + i]
             given[kept.fresh] = 0.0
             clip(given, kept.x)
+            for i in range(n):
+                rows[at.step + i] += given[kept.x + i] - rows[at.found + i]
         return wrong
+
+    @kept_apart
+    def halve(row, numbers, count):
+        """Go half of the last step back."""
+        for j in range(count):
+            rows = row[scratch + j * width : scratch + (j + 2) * width]
+            given = row[steps + j * end : steps + (j + 2) * end]
+            back_off(rows, given, numbers)
+            for i in range(n):
+                given[kept.x + i] = rows[at.found + i]
 
     @inlined
     def begin_step(row, count):
@@ -154,9 +172,15 @@ def horizon_kernels(
     @inlined
     def settle(row, numbers, count):
         """Pass over the window until all iterations are done and the right bounds hold, then once for P alone."""
-        fewest, patience, settled = 1 << 30, PATIENCE, False
+        fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
         for k in range(most + 1):
-            forwards(row, numbers, count, settled)
+            cost = forwards(row, numbers, count, settled)
+            for _ in range(HALVINGS):
+                if k == 0 or wrong > 0 or cost <= least + ROUNDING * (1.0 + abs(least)):
+                    break
+                halve(row, numbers, count)
+                cost = forwards(row, numbers, count, settled)
+            least = cost if wrong == 0 else math.inf  # what passes a bound may cost less
             if settled:
                 break
             wrong = backwards(row, numbers, count, patience < 0)

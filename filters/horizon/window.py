@@ -24,9 +24,29 @@ from filters.pages.page import Page
 from filters.pages.programs import programs_of, stored
 from filters.pages.stages import Stage
 from filters.smoothers.rts import advance, begin
+from thruster_env.numerics.algebra.blocks import careful
 from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import choose, constant, count, exceeds, power, ratio
+from thruster_env.numerics.algebra.operations import (
+    divide,
+    eye,
+    joseph,
+    only,
+    present,
+    quotient,
+    sym,
+    uncorrelated,
+    wrap,
+)
+from thruster_env.numerics.algebra.scalars import (
+    choose,
+    constant,
+    count,
+    exceeds,
+    logarithm,
+    power,
+    ratio,
+    shifted,
+)
 from thruster_env.plants.layout import starts_of
 from thruster_env.plants.shape import Functions, Shape
 
@@ -61,6 +81,9 @@ class Scratch(NamedTuple):
     after: int  # (n,), l after the update, then after the bounds
     before: int  # (n,), l before the update
     found: int  # (n,), the new X
+    step: int  # (n,), from the X before
+    seen_cost: int  # of the measurement, and of the arrival in the first step
+    moved_cost: int  # of the disturbance after this step
     noise: int  # (n,), mean of the disturbance after this step
     noise_cov: int  # (n, n), of it
     disturbance: int  # (n,), estimate of it
@@ -81,7 +104,9 @@ def scratch_places(shape: Shape) -> Scratch:
     """Places of what is computed of a step, for some sizes."""
     n, m, square = shape.n, shape.m, shape.n * shape.n
     return Scratch(
-        *starts_of(n, square, n, square, m, n, square, square, n, n, n, n, n, square, n, n, 2 * n * (n + 2))
+        *starts_of(
+            n, square, n, square, m, n, square, square, n, n, n, n, n, 1, 1, n, square, n, n, 2 * n * (n + 2)
+        )
     )
 
 
@@ -89,13 +114,14 @@ class Works(NamedTuple):
     """Functions (rows, given, numbers): `tell` of a filter's row and z, others of scratch and of what is kept."""
 
     tell: Callable  # innovation, its covariance and log-likelihood, of the prediction
-    centre: Callable  # d -= X
+    centre: Callable  # d -= X, and what that costs
     linearise: Callable  # X and the identity
     substep: Callable
     disturb: Callable  # zero and Q, the disturbance after this step
     move: Callable  # from the updated d and P to those of the next step
     correct: Callable
-    estimate: Callable  # l before the update, and x
+    estimate: Callable  # l before the update, x, and the step to it
+    back_off: Callable  # half of the last step
     descend: Callable  # l of this step, from that of the next one
     find: Callable  # the disturbance after this step
 
@@ -106,27 +132,49 @@ def tell(model, x, P, z):
 
 
 def correct(model, x, d, P, z, fresh, loss):
-    """The updated d and P, I - K H, and g; of the residual at x, once there is one, follows its weight."""
+    """The updated d and P, I - K H, g, and the loss at x.
+
+    The weight follows from the residual at x; before there is an estimate, from the innovation.
+    """
     seen = present(z)
     H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
     residual = only(seen, wrap(z - model.h(x), model.measurement_angles))
-    v = residual - H @ d
+    v, square, limit = (
+        residual - H @ d,
+        dot(residual, divide(residual, R)),
+        model.own.threshold * model.own.threshold,
+    )
+    cost = loss_of(square, seen, limit, loss)
     if loss != QUADRATIC:
         S = sym(H @ P @ H.T + R)
-        square = choose(exceeds(fresh, 0.5), dot(v, divide(v, S)), dot(residual, divide(residual, R)))
-        R = ratio(R, weight(square, seen, model.own.threshold, loss))
+        square = choose(exceeds(fresh, 0.5), dot(v, divide(v, S)), square)
+        R = ratio(R, weight_of(square, seen, limit, loss))
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
-    return d + K @ v, joseph(P, K, H, R), eye(P) - K @ H, H.T @ divide(v, S)
+    return d + K @ v, joseph(P, K, H, R), eye(P) - K @ H, H.T @ divide(v, S), cost
 
 
-def weight(square, seen, threshold, loss):
-    """What the precision of a measurement is multiplied by, given v' R^-1 v."""
-    limit = threshold * threshold
+def loss_of(square, seen, limit, loss):
+    """The loss rho of v' R^-1 v, with the square of the threshold."""
+    if loss == QUADRATIC:
+        return square * 0.5
+    far = ratio(square, limit)
+    if loss == STUDENT:
+        return (limit + count(seen)) * logarithm(shifted(far, 1.0)) * 0.5
+    return choose(exceeds(far, 1.0), limit * shifted(power(far, 0.5), -0.5), square * 0.5)
+
+
+def weight_of(square, seen, limit, loss):
+    """What the precision of a measurement is multiplied by: rho'(r)/r."""
     if loss == STUDENT:
         return ratio(limit + count(seen), limit + square)
     far = ratio(square, limit)
     return power(choose(exceeds(far, 1.0), far, constant(1.0, far)), -0.5)
+
+
+def cost_of(v, cov):
+    """The cost v' cov^-1 v/2; without components that a singular covariance leaves no room."""
+    return dot(v, quotient(v, careful(cov))) * 0.5
 
 
 @lru_cache(maxsize=64)
@@ -155,21 +203,28 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         mean, F, without = vector(at.mean), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
+        found, step, moved = vector(at.found), vector(at.step), d + P @ adjoint
+        half, jump, centred = step * 0.5, wrap(mean - next_x, angles), wrap(d - x, angles)
         return [
             stored(tell(model, memory.x, memory.P, memory.z), told),
-            stored((wrap(d - x, angles),), (d,)),
+            stored((centred, cost_of(centred, P)), (d, at.seen_cost)),
             stored(begin(model, x, P), (mean, F)),
             stored(advance(model, mean, F, memory.u), (mean, F)),
             stored((noise * 0.0, model.Q), (noise, noise_cov)),
             stored(
                 (
-                    F @ updated_d + wrap(mean - next_x, angles) + noise,
+                    F @ updated_d + jump + noise,
                     sym(F @ updated_P @ F.T) + noise_cov,
+                    cost_of(jump, model.Q),
                 ),
-                (next_d, next_P),
+                (next_d, next_P, at.moved_cost),
             ),
-            stored(correct(model, x, d, P, z, fresh, loss), (updated_d, updated_P, without, vector(at.pull))),
-            stored((adjoint, wrap(x + d + P @ adjoint, angles)), (before, vector(at.found))),
+            stored(
+                correct(model, x, d, P, z, fresh, loss),
+                (updated_d, updated_P, without, vector(at.pull), at.seen_cost),
+            ),
+            stored((adjoint, wrap(x + moved, angles), moved), (before, found, step)),
+            stored((wrap(x - half, angles), half), (found, step)),
             stored((F.T @ next_before,), (after,)),
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
         ]

@@ -69,6 +69,12 @@ def exponential(v):
     return np.exp(v)
 
 
+@operation(lambda a: ())
+def logarithm(a):
+    """The natural logarithm of a number."""
+    return np.log(a)
+
+
 @operation(lambda v, value: v)
 def at_most(v, value):
     """Entries of a vector, none of which is larger than a number that is known now."""
@@ -113,6 +119,11 @@ def _of_reciprocal(result, arguments, slopes):
 def _of_power(result, arguments, slopes):
     a, exponent = arguments
     return through(lambda slope: slope * power(a, exponent - 1.0) * exponent, slopes[0])
+
+
+@logarithm.derivative
+def _of_logarithm(result, arguments, slopes):
+    return through(lambda slope: ratio(slope, arguments[0]), slopes[0])
 
 
 @exponential.derivative
