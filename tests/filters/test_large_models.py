@@ -145,6 +145,7 @@ GAUSSIAN = {
     "sage-husa": ("sage-husa", {"forgetting_factor": 1.0}),
     "ekf-robust": ("ekf-robust", {"degrees_of_freedom": 1e12}),
     "vb": ("vb", {"forgetting_factor": 1.0, "prior_weight": 1e12}),
+    "mhe": ("mhe", {"loss": "quadratic"}),
 }
 
 

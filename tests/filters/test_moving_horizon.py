@@ -238,6 +238,21 @@ def test_the_covariance_is_the_last_block_of_the_inverse_hessian_without_bounds(
     np.testing.assert_allclose(belief.cov, np.linalg.inv(hessian)[-2:, -2:], rtol=1e-6)
 
 
+@pytest.mark.parametrize("loss", ["huber", "student"])
+def test_of_functions_that_cannot_be_traced_it_is_the_same(loss):
+    def decides(x, u, c):
+        return transition(x, u, c) if x[0] < 1e9 else x
+
+    inputs, measurements = curved_data()
+    data = KEYS, inputs[None], measurements[None]
+    found, expected = (
+        run(MovingHorizonFilter(model=model, horizon=3, loss=loss), *data)
+        for model in (curved_model().replace(transition=decides), curved_model())
+    )
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+
+
 def test_with_a_horizon_of_one_it_is_the_iterated_filter():
     inputs, measurements = curved_data()
     data = KEYS, inputs[None], measurements[None]

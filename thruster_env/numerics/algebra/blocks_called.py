@@ -60,6 +60,7 @@ FUNCTIONS: dict[Operation, Callable] = {
     scalars.choose: _chosen,
     scalars.trace: _trace,
     scalars.exponential: _exponential,
+    scalars.logarithm: lambda result, a: written_out("logarithm", "a", "log(a)", log=np.log),
     scalars.entries_product: lambda result, a, b: entrywise(
         "product", "a, b", a, lambda *at: "a[{0}] * b[{0}]".format("][".join(map(str, at))), a=a, b=b
     ),
