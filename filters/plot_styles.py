@@ -24,7 +24,7 @@ STYLES: dict[str, tuple[str, Any]] = {
     "iekf": (MUSTARD, DASHED),
     "ukf": (SKY, BOTH),
     "ckf": (WINE, DOTTED),
-    "mhe": (BLUE, BOTH),
+    "mhe": (WINE, TWO_DOTS),
     "enkf": (RUST, SOLID),
     "etkf": (SKY, DASHED),
     "letkf": (SKY, TWO_DOTS),

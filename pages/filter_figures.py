@@ -10,13 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pages import filter_fuzzy, filter_gaussian, filter_models, filter_noise, filter_sampled, filter_tables
+from pages import (
+    filter_fuzzy,
+    filter_gaussian,
+    filter_horizon,
+    filter_models,
+    filter_noise,
+    filter_sampled,
+    filter_tables,
+)
 from pages.page import make_page
 
 FIGURES = {
     "filters_kalman.png": filter_gaussian.kalman,
     "filters_update.png": filter_gaussian.one_update,
     "filters_points.png": filter_gaussian.sigma_points,
+    "filters_horizon.png": filter_horizon.reactor,
     "filters_ensembles.png": filter_sampled.ensembles,
     "filters_modes.png": filter_sampled.modes,
     "filters_weighted.png": filter_models.weighted,

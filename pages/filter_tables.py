@@ -115,6 +115,8 @@ def calls(name: str) -> str:
     )
     with interpreted():
         belief, _ = filter_.update(filter_.init(), [0.1])
+        for _ in range(getattr(filter_, "horizon", 0)):  # until its window is full
+            belief, _ = filter_.update(filter_.predict(belief, [12.0]), [0.1])
         count.clear()
         filter_.update(filter_.predict(belief, [12.0]), [0.1])
     if not count:

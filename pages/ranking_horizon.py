@@ -53,14 +53,25 @@ def reactor(prior_mean: Sequence[float], prior_cov: Sequence[float], **changes) 
     )
 
 
+def assumed(**changes) -> StateSpaceModel:
+    """The reactor as filters assume it."""
+    return reactor([0.1, 4.5], [36.0, 36.0], **changes)
+
+
+def batches(count: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """What `filters.run` takes of batches, and their states (count, K + 1, 2)."""
+    seeds, inputs = held_out_seeds(0, count), np.zeros((count, STEPS, 0))
+    truth = simulate(reactor([3.0, 1.0], [0.0, 0.0]), episode_keys(seeds), inputs)
+    return (filter_keys(seeds), inputs, truth.measurements), truth.states
+
+
 def batch_reactor() -> str:
     """A batch reactor whose initial pressures are far from what the filters assume."""
-    seeds = held_out_seeds(0, SEEDS)
-    truth = simulate(reactor([3.0, 1.0], [0.0, 0.0]), episode_keys(seeds), np.zeros((SEEDS, STEPS, 0)))
+    given, states = batches(SEEDS)
     rows = []
     for label, filter_ in _of_reactor().items():
-        found = run(filter_, filter_keys(seeds), np.zeros((SEEDS, STEPS, 0)), truth.measurements)
-        errors = found.means - truth.states
+        found = run(filter_, *given)
+        errors = found.means - states
         rmse = np.sqrt(np.square(errors[:, SETTLED:]).mean(axis=(0, 1)))
         lost = (np.abs(errors[:, -1]).max(axis=1) > 0.5).sum()
         row = [label, *map(digits, rmse), digits(found.means[:, 1:, 0].min()), f"{lost} of {SEEDS}"]
@@ -69,9 +80,6 @@ def batch_reactor() -> str:
 
 
 def _of_reactor() -> dict[str, Filter]:
-    def assumed(**changes) -> StateSpaceModel:
-        return reactor([0.1, 4.5], [36.0, 36.0], **changes)
-
     within = {by: assumed(bounds=POSITIVE, bounded_by=by) for by in ("truncation", "projection")}
     found: dict[str, Filter] = {
         name: make_filter(name, assumed(), **numbers)

@@ -171,7 +171,7 @@ def test_an_example_of_a_filter_runs(code, capsys, tmp_path, monkeypatch):
 def test_every_family_of_filters_has_an_example_and_a_picture():
     sections = re.split(r"^## ", FILTER_PAGE.partition("## All filters")[2], flags=re.MULTILINE)[1:]
     families = sections[: [section.startswith("With an env") for section in sections].index(True)]
-    assert len(families) == 13
+    assert len(families) == 14
     for section in families:
         assert "```python" in section and "](filters_" in section, section.partition("\n")[0]
         assert "*Works" in section and "*Fails" in section, section.partition("\n")[0]
