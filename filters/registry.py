@@ -33,6 +33,7 @@ from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
+from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
 from thruster_env.numerics.checks import one_of
 from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.plants.steps import AnyStepModel
@@ -61,6 +62,7 @@ FILTERS: dict[str, type[Filter]] = {
         RankHistogramFilter,
         ParticleFilter,
         AuxiliaryParticleFilter,
+        RaoBlackwellisedParticleFilter,
         GaussianSumFilter,
         InteractingMultipleModelFilter,
         MultipleModelAdaptiveEstimator,

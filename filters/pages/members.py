@@ -109,7 +109,7 @@ def _is_large(stage: Stage) -> bool:
 
 def _work_of(traced: Stage, called: Stage, model: Equations, readers: dict, first: int) -> Works:
     try:
-        return _as_program(traced, first)
+        return of_members(traced, first)
     except TooLarge:
         raise
     except TypeError:  # a function that cannot be traced
@@ -122,7 +122,12 @@ def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool):
     return memory, model, stages_of(page, memory, model)
 
 
-def _as_program(stage: Stage, first: int) -> Works:
+def of_members(stage: Stage, first: int) -> Works:
+    """A stage as a program, which keeps numbers of members in rows of the table from `first` on.
+
+    Raises:
+        TypeError: if a function cannot be traced, or there are too many operations.
+    """
     program = as_programs(stage, 0, MOST).values
     work = callable_of(program, LANES, OF_MEMBERS, first)
     return Works(work, cut(program, first).rows, any(place.array == "draws" for place, _ in program.reads))

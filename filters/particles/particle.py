@@ -10,9 +10,8 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.particles.motion import ensemble_motion
 from filters.particles.regularisation import kernel_spreader
-from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
+from filters.particles.weighted import ResampledFilter, anything_measured, particle_parts
 from filters.particles.weights import read_weights, systematic_resampler
-from thruster_env.numerics.checks import finite
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.streams import FILTER_MEASUREMENT, uniform_block
 from thruster_env.numerics.tuples import column_reader, matrix_reader
@@ -74,7 +73,7 @@ def particle_kernels(functions: Functions, shape: Shape, regularised: bool) -> K
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ParticleFilter(WeightedFilter):
+class ParticleFilter(ResampledFilter):
     """Bootstrap particle filter: importance sampling from the prediction, with systematic resampling.
 
         predict: if ESS < threshold N, resample the particles by weight (systematic), and all w_j = 1/N;
@@ -93,11 +92,7 @@ class ParticleFilter(WeightedFilter):
 
     `Belief.members` is (n + 1, N), its last row the log weights; `Belief.extras` holds the ESS.
 
-    Attributes:
-        resampling_threshold: fraction of N; an effective sample size (ESS) below it triggers resampling; from 0
-            (never) to 1.
-
-    The other attributes are those of `WeightedFilter`, c its regularisation.
+    Attributes are those of `ResampledFilter`, c its regularisation.
 
     Raises:
         ValueError: if a parameter is out of its range.
@@ -108,20 +103,6 @@ class ParticleFilter(WeightedFilter):
     """
 
     name: ClassVar[str] = "pf"
-    resampling_threshold: float = 0.5
-
-    def __post_init__(self):
-        """Check size and threshold; raise ValueError that states the rule and the value."""
-        super().__post_init__()
-        threshold = finite("resampling_threshold", self.resampling_threshold)
-        if not 0.0 <= threshold <= 1.0:
-            raise ValueError(f"resampling_threshold must be from 0 to 1, but got {threshold}")
-        object.__setattr__(self, "resampling_threshold", threshold)
-
-    @property
-    def own_parameters(self) -> tuple[float, ...]:
-        """The factor on the kernel's width, and the threshold."""
-        return *super().own_parameters, self.resampling_threshold
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""

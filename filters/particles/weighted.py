@@ -16,7 +16,7 @@ from filters.particles.motion import silencer
 from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
 from thruster_env.numerics import matrices
 from thruster_env.numerics.angles import row_aligner
-from thruster_env.numerics.checks import at_least, positive
+from thruster_env.numerics.checks import at_least, finite, positive
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
 from thruster_env.plants.layout import constants_reader, number_places
@@ -175,3 +175,28 @@ class WeightedFilter(Filter):
     def effective_sample_size(belief: Belief) -> float:
         """The effective number of equally weighted particles, from 1 to N."""
         return float(belief.extras[0])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ResampledFilter(WeightedFilter):
+    """Base of the particle filters that resample when few particles have most of the weight.
+
+    Attributes:
+        resampling_threshold: fraction of N; an effective sample size (ESS) below it triggers resampling; from 0
+            (never) to 1.
+    """
+
+    resampling_threshold: float = 0.5
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        threshold = finite("resampling_threshold", self.resampling_threshold)
+        if not 0.0 <= threshold <= 1.0:
+            raise ValueError(f"resampling_threshold must be from 0 to 1, but got {threshold}")
+        object.__setattr__(self, "resampling_threshold", threshold)
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The factor on the kernel's width, and the threshold."""
+        return *super().own_numbers, self.resampling_threshold

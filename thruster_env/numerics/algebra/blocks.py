@@ -76,6 +76,14 @@ def part(a, top, left, rows, columns):
     return a[top : top + rows, left : left + columns]
 
 
+@operation(
+    lambda a, rows, columns: (len(rows), len(columns)), lambda a, rows, columns: a.symmetric and rows == columns
+)
+def pick(a, rows, columns):
+    """These rows and columns of a matrix, in this order."""
+    return a[np.ix_(rows, columns)]
+
+
 @operation(lambda a, *shape: shape)
 def zeros(a, *shape):
     """A matrix or vector of zeros, beside another one."""

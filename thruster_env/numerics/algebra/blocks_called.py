@@ -9,7 +9,7 @@ import numpy as np
 from thruster_env.numerics import matrices as made
 from thruster_env.numerics.algebra import blocks, scalars
 from thruster_env.numerics.algebra.matrices import Operation
-from thruster_env.numerics.sources import Source, entrywise, written_out
+from thruster_env.numerics.sources import Source, entrywise, is_array, matrix_of, written_out
 from thruster_env.numerics.tuples import assembled, part_of, zeros_of
 
 
@@ -52,6 +52,19 @@ def _diagonal(result: tuple, v: tuple) -> Callable:
     return source.function(source.matrix(v[0], v[0], lambda i, j: source.if_same(i, j, f"v[{i}]", "0.0")))
 
 
+def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tuple) -> Callable:
+    if not is_array(*result):
+        return written_out("pick", "a", matrix_of(*result, lambda i, j: f"a[{rows[i]}][{columns[j]}]"))
+    lines = (
+        f"out = np.empty({result})",
+        f"for i in range({result[0]}):",
+        f"    for j in range({result[1]}):",
+        "        out[i, j] = a[rows[i], columns[j]]",
+        "out",
+    )
+    return written_out("pick", "a", *lines, _loops=True, np=np, rows=rows, columns=columns)
+
+
 FUNCTIONS: dict[Operation, Callable] = {
     scalars.reciprocal: lambda result, a: _number("1.0 / a", "a"),
     scalars.power: lambda result, exponent, a: _number(f"a ** {exponent!r}", "a"),
@@ -77,6 +90,7 @@ FUNCTIONS: dict[Operation, Callable] = {
     blocks.hstack: _together,
     blocks.vstack: _together,
     blocks.part: lambda result, top, left, rows, columns, a: part_of(rows, columns, a, top, left),
+    blocks.pick: _pick,
     blocks.zeros: lambda result, *others: written_out("zeros", "a", "zero()", zero=zeros_of(*result)),
     blocks.forward_quotient: lambda result, lower, v: made.forward_solver(*v),
     blocks.triangle_quotient: lambda result, a, lower: made.triangle_divider(*a),
