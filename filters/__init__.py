@@ -29,6 +29,7 @@ from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
+from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
 from filters.smoothers.modes import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
@@ -71,6 +72,7 @@ __all__ = [
     "OpenLoop",
     "ParticleFilter",
     "RankHistogramFilter",
+    "RaoBlackwellisedParticleFilter",
     "RobustExtendedKalmanFilter",
     "SageHusaFilter",
     "SchmidtKalmanFilter",

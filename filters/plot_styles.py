@@ -35,6 +35,7 @@ STYLES: dict[str, tuple[str, Any]] = {
     "rhf": (RUST, TWO_DOTS),
     "pf": (GREEN, SOLID),
     "apf": (GREEN, DASHED),
+    "rbpf": (MUSTARD, TWO_DOTS),
     "gsf": (PLUM, DASHED),
     "fading": (RUST, DOTTED),
     "h-infinity": (RUST, DASHED),

@@ -55,6 +55,12 @@ WORDS = {
     "rhf": Words("states follow what is measured linearly", "N members", "60", "few members; many channels: slow"),
     "pf": Words("none on shape", "N weighted particles", "400", "few particles: one takes all the weight"),
     "apf": Words("none on shape", "N weighted particles", "600", "as `pf`, later"),
+    "rbpf": Words(
+        "linear where the sampled states are known",
+        "N weighted Gaussians",
+        "200",
+        "few particles; others nonlinear",
+    ),
     "gsf": Words(
         "h nonlinear in one component of the state", "mean, P between updates", "20", "nonlinearity in others"
     ),

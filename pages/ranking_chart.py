@@ -32,6 +32,7 @@ STEPS = (
     Step("Does the plant switch between models?", ("imm",), "probabilities of the models"),
     Step("Is it one of several models, but which?", ("mmae",), "the same, without switching"),
     Step("Could the state be in two places at once?", ("pf", "gsf"), "a mean and P cannot say that"),
+    Step("Is it linear where a few states are known?", ("rbpf",), "particles for those few alone"),
     Step("Is it strongly curved within its uncertainty?", ("iekf", "ukf", "gsf"), "one tangent is not enough"),
     Step("Does the noise of the sensor change?", ("vb", "sage-husa"), "they estimate R as they run"),
     Step("More states than you can afford members?", ("letkf",), "localised by distance"),

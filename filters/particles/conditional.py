@@ -67,12 +67,13 @@ def stages_of(memory: ParticlesMemory, model: Equations, sampled: tuple[int, ...
     """What is done with each particle: at the start, in each substep, at the end of a step, in an update."""
     x, P, e, m = memory.x, memory.P, memory.e, memory.shape.m
     *updated, v, S, level = extended.update(model, x, P, memory.z)
-    seen = [Place(memory.array, memory.seen + k) for k in (0, m, m + m * m)]
+    y, cov, density = (Place(memory.array, memory.seen + k) for k in (0, m, m + m * m))
+    predicted_x, predicted_P = extended.settle(model, x, P)
     return {
         "start": stored(sample(model.prior_mean, memory.prior_cov, e, sampled), (x, P)),
         "advance": stored(extended.advance(model, x, P, memory.u), (x, P)),
-        "settle": stored(sample(*extended.settle(model, x, P), e, sampled), (x, P)),
-        "update": stored((*updated, v, S, level), (x, P, *seen)),
+        "settle": stored(sample(predicted_x, predicted_P, e, sampled), (x, P)),
+        "update": Stage({**stored(tuple(updated), (x, P)).values, y: v, cov: S, density: level}, {}),
     }
 
 

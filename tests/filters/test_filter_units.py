@@ -9,7 +9,7 @@ from thruster_env.numerics.compiled import interpreted
 
 KEYS = np.array([KEY])
 UNIT_FREE = ["kf", "kf-steady", "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "ensrf", "denkf", "ienkf"]
-UNIT_FREE += ["enkf-n", "rhf", "pf", "apf", "sage-husa", "vb", "ekf-robust", "mhe", "open-loop"]
+UNIT_FREE += ["enkf-n", "rhf", "pf", "apf", "rbpf", "sage-husa", "vb", "ekf-robust", "mhe", "open-loop"]
 
 
 # A power of two is exact; 1000 and 0.01 are what units do.

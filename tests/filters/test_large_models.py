@@ -49,6 +49,7 @@ FORMS = {
     "enkf, centred": ("enkf", {"centred_perturbations": 1}),
     "pf, regularised": ("pf", {"regularisation": 1.0, "resampling_threshold": 1.0}),
     "apf, regularised": ("apf", {"regularisation": 1.0}),
+    "rbpf, the last state": ("rbpf", {"sampled": [-1], "regularisation": 1.0, "resampling_threshold": 1.0}),
 }
 CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
 

@@ -25,11 +25,11 @@ def test_a_choice_survives_its_trial_parameters(name):
     assert choice.filter(NOMINAL).name == name
 
 
-@pytest.mark.parametrize(("name", "size"), [("enkf", 30), ("ienkf", 30), ("pf", 1000), ("apf", 1000)])
+@pytest.mark.parametrize(("name", "size"), [("enkf", 30), ("ienkf", 30), ("pf", 1000), ("rbpf", 100)])
 def test_particle_filters_have_sizes_of_their_own(name, size):
     assert untuned_choice(name, NOMINAL).numbers["ensemble_size"] == size
     ladder = size_ladder(name)
-    assert (ladder[0], ladder[-1]) == ((5, 200) if size == 30 else (200, 5000)) and size in ladder
+    assert (ladder[0], ladder[-1]) == {30: (5, 200), 100: (20, 1000), 1000: (200, 5000)}[size] and size in ladder
 
 
 @pytest.mark.parametrize("name", ["pf", "apf"])

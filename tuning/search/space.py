@@ -12,6 +12,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 
 from filters.estimators.find import is_foreign
 from filters.filter import Filter
+from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
 from tuning.problems.parameter import Parameter
@@ -39,7 +40,7 @@ class Sizes(NamedTuple):
 
 
 # The members of a Kalman ensemble represent a mean and a covariance, those of a particle filter a distribution.
-KALMAN_SIZES, PARTICLE_SIZES = Sizes(30, 5, 200), Sizes(1000, 200, 5000)
+KALMAN_SIZES, PARTICLE_SIZES, GAUSSIANS = Sizes(30, 5, 200), Sizes(1000, 200, 5000), Sizes(100, 20, 1000)
 
 
 class Choice(NamedTuple):
@@ -80,7 +81,10 @@ def has_ensemble(name: str) -> bool:
 
 def ensemble_sizes_of(name: str) -> Sizes:
     """Ensemble sizes of a filter that has an ensemble."""
-    return PARTICLE_SIZES if issubclass(filter_class(name), WeightedFilter) else KALMAN_SIZES
+    kind = filter_class(name)
+    if issubclass(kind, RaoBlackwellisedParticleFilter):
+        return GAUSSIANS
+    return PARTICLE_SIZES if issubclass(kind, WeightedFilter) else KALMAN_SIZES
 
 
 def size_ladder(name: str) -> tuple[int, ...]:

@@ -54,7 +54,9 @@ def _diagonal(result: tuple, v: tuple) -> Callable:
 
 def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tuple) -> Callable:
     if not is_array(*result):
-        return written_out("pick", "a", matrix_of(*result, lambda i, j: f"a[{rows[i]}][{columns[j]}]"))
+        return written_out(
+            "pick", "a", matrix_of(len(rows), len(columns), lambda i, j: f"a[{rows[i]}][{columns[j]}]")
+        )
     lines = (
         f"out = np.empty({result})",
         f"for i in range({result[0]}):",

@@ -1,0 +1,55 @@
+"""Make the tables of docs/ranking.md on kinds of particles: fewer states sampled, or sampled better.
+
+    python -m pages.ranking_particles [PAGE] [--table NAME]...
+
+All take a minute or two on two cores. Every run gives the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import chi2
+
+from filters import make_filter, run
+from filters.consistency.intervals import rmse_intervals
+from pages.page import DOCS, table
+from pages.ranking_tables import main
+from thruster_env.studies import mixed_linear
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.seeds import held_out_seeds
+
+SEEDS = 200
+Numbers = dict[str, object]
+
+
+def conditional() -> str:
+    """A model that is linear where one state is known."""
+    filters: list[tuple[str, Numbers]] = [("ekf", {}), ("ukf", {})]
+    filters += [("pf", {"ensemble_size": size}) for size in (100, 300, 1000, 10_000)]
+    filters += [("rbpf", {"ensemble_size": size}) for size in (30, 100, 1000)]
+    return errors_of(mixed_linear.problem, filters)
+
+
+def errors_of(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
+    """RMSE by state, the median NEES and the log-likelihood, a row per filter."""
+    data, model = problem.data(held_out_seeds(0, SEEDS)), problem.model()
+    symbols = [one.symbol for one in model.states]
+    rows = []
+    for name, numbers in filters:
+        found = run(make_filter(name, model, **numbers), data.filter_keys, data.inputs, data.measurements)
+        errors, covs = (found.means - data.states)[:, data.late], found.covs[:, data.late]
+        parts = rmse_intervals(np.square(errors).mean(axis=1))
+        nees = np.median((errors * np.linalg.solve(covs, errors[..., None])[..., 0]).sum(axis=-1))
+        level = found.log_likelihoods[:, data.late].sum(axis=1).mean()
+        label = " ".join([name, *(str(one).replace("ensemble_size", "") for one in numbers.values())])
+        cells = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in parts]
+        rows.append([label, *cells, f"{nees / chi2.median(model.n):.2f}", f"{level:.1f}"])
+    return table(["filter", *symbols, "NEES", "log L"], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (conditional,)}
+
+if __name__ == "__main__":
+    main(None, TABLES, "pages.ranking_particles", __doc__, DOCS / "ranking.md")
