@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.baselines.baselines import place_of
+from filters.baselines.baselines import places_of
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.checks import short_repr
 
 
 def update(model, x, P, z):
@@ -54,10 +52,7 @@ class SchmidtKalmanFilter(PageFilter):
 
     def __post_init__(self):
         """Check the indices; raise ValueError that states the rule and the value."""
-        n, given = self.model.n, self.considered
-        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
-            raise ValueError(f"considered must be a list of indices, but got {short_repr(given)}")
-        places = tuple(sorted({place_of("considered", one, n) for one in given}))
+        places = places_of("considered", self.considered, self.model.n)
         object.__setattr__(self, "considered", places)
 
     @cached_property

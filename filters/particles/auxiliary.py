@@ -58,7 +58,7 @@ def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> 
     means, covariances, spread = (
         weighted_means(0, n, weights),
         weighted_covariances(0, n, weights),
-        kernel_spreader(shape),
+        kernel_spreader(shape, places.extras + 1),
     )
 
     @inlined

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.baselines.baselines import place_of
+from filters.baselines.baselines import places_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.pages.kernels import nothing_to_summarise
@@ -26,7 +25,6 @@ from filters.particles.weights import (
 )
 from thruster_env.numerics import matrices
 from thruster_env.numerics.angles import row_aligner
-from thruster_env.numerics.checks import shown
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, uniform_block
 from thruster_env.numerics.tuples import matrix_reader, zeros_of
@@ -186,10 +184,9 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
-        n, given = self.model.n, self.sampled
-        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or not len(given):
-            raise ValueError(f"sampled must be a list of indices, at least one, but got {shown(given)}")
-        places = tuple(sorted({place_of("sampled", one, n) for one in given}))
+        places = places_of("sampled", self.sampled, self.model.n)
+        if not places:
+            raise ValueError("sampled must be a list of indices, at least one, but got none")
         object.__setattr__(self, "sampled", places)
 
     def kernels(self) -> Kernels:

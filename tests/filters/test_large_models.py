@@ -48,6 +48,8 @@ FORMS = {
     "enkf, inflated": ("enkf", {"inflation": 1.1, "relaxation": 0.3}),
     "enkf, centred": ("enkf", {"centred_perturbations": 1}),
     "pf, regularised": ("pf", {"regularisation": 1.0, "resampling_threshold": 1.0}),
+    "pf, optimal": ("pf", {"proposal": "optimal", "regularisation": 0.5, "smoothed": [-1]}),
+    "pf, gaussian": ("pf", {"resampling": "gaussian", "resampling_threshold": 1.0}),
     "apf, regularised": ("apf", {"regularisation": 1.0}),
     "rbpf, the last state": ("rbpf", {"sampled": [-1], "regularisation": 1.0, "resampling_threshold": 1.0}),
 }

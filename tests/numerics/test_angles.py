@@ -166,6 +166,9 @@ OTHERS = [
     ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
     ("etkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
     ("ensrf", {"ensemble_size": 12, "rotations": 1}),
+    ("pf", {"ensemble_size": 12, "proposal": "optimal"}),
+    ("pf", {"ensemble_size": 12, "resampling": "gaussian"}),
+    ("pf", {"ensemble_size": 12, "smoothed": [1], "regularisation": 0.5}),
     ("sage-husa", {"process_forgetting_factor": 0.9}),
 ]
 

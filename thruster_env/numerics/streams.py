@@ -20,6 +20,7 @@ from thruster_env.numerics.trigonometry import cosine_and_sine_of_turns
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
 DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION, FILTER_KERNEL = range(8, 14)
 ADDED_NOISE = 14  # of a problem, to measurements whose own noise an env may have drawn from the same key
+FILTER_PROPOSAL = 24  # behind the spawn keys
 
 # Spawn keys: what a generator of a seed is for. An env's own is that without one, `default_rng(seed)`, and so is
 # that of the list [seed, 0]. They go on where streams end, for the keys of filters have the number of theirs.

@@ -1,0 +1,209 @@
+"""The optimal proposal, Gaussian particles and smoothed constants against naive ones and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from filters import ParticleFilter, StateSpaceModel, Unknown, augmented_model, make_filter, run
+from tests.filters.test_particle import (
+    CYCLES,
+    assert_belief,
+    assert_innovation,
+    densities,
+    resampled,
+    root,
+    weighted_covariance,
+)
+from tests.models import KEY, line_model, plane_model, scalar_model, simulated
+from tests.oracles import assert_normal, normals
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
+
+
+@pytest.mark.usefixtures("as_python")
+def test_with_linear_h_the_optimal_weight_is_how_well_the_parent_predicted():
+    """Doucet, Godsill, Andrieu (2000), equation (17): p(z | x_before), where the bootstrap filter has p(z | x)."""
+    model, size = plane_model(), 13
+    a, b, offset, c, shift = model.matrices()
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    filter_ = ParticleFilter(model=model, ensemble_size=size, proposal="optimal")
+    belief = filter_.init(KEY)
+    x = model.prior_mean[:, None] + root(model.prior_cov) @ normals(FILTER_PRIOR, 0, 2, size)
+    w, times = np.full(size, 1.0 / size), 0
+    for step, (u, z) in enumerate([*CYCLES, (0.5, [1.0, np.nan]), (1.0, [6.0, -4.0])]):
+        if 1.0 / (w**2).sum() < 0.5 * size:
+            x, w, times = x[:, resampled(w, step)], np.full(size, 1.0 / size), times + 1
+        mu = a @ x + b * u + offset[:, None]
+        noise = root(q) @ normals(FILTER_PROCESS, step + 1, 2, size)
+        belief = filter_.predict(belief, [u])
+        np.testing.assert_allclose(belief.members[:2], mu + noise, rtol=1e-12, atol=1e-12)
+
+        there = ~np.isnan(z)
+        h, z_there = c[there], np.array(z)[there]
+        s = h @ q @ h.T + r[np.ix_(there, there)]
+        k = q @ h.T @ np.linalg.inv(s)
+        y = (c @ (mu + noise) + shift[:, None])[there]
+        perturbed = y + (root(r) @ normals(FILTER_PROPOSAL, step + 1, 2, size))[there]
+        x = mu + noise + k @ (z_there[:, None] - perturbed)
+        belief, innovation = filter_.update(belief, z)
+        if there.all():
+            assert_innovation(innovation, model, z, y, w)
+        w = w * densities(z_there, (c @ mu + shift[:, None])[there], s)
+        assert innovation.log_likelihood == pytest.approx(math.log(w.sum()), rel=1e-9)
+        w = w / w.sum()
+        assert_belief(filter_, belief, x, w)
+        np.testing.assert_array_equal(belief.members[3:], 0.0)
+    assert times > 0
+
+
+@pytest.mark.usefixtures("as_python")
+def test_with_linear_h_the_optimal_proposal_is_the_kalman_update_of_each_parent():
+    model, size, z = plane_model(prior_cov=np.zeros((2, 2))), 4000, [2.0, -1.0]
+    a, b, offset, c, shift = model.matrices()
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    filter_ = ParticleFilter(model=model, ensemble_size=size, proposal="optimal")
+    belief, innovation = filter_.update(filter_.predict(filter_.init(KEY), [0.5]), z)
+    mu, s = a @ model.prior_mean + b[:, 0] * 0.5 + offset, c @ q @ c.T + r
+    gain = q @ c.T @ np.linalg.inv(s)
+    assert_normal(belief.members[:2], q - gain @ c @ q, mu + gain @ (z - c @ mu - shift))
+    np.testing.assert_allclose(np.exp(belief.members[2]), 1.0 / size, rtol=1e-9)  # one parent, one weight
+    assert innovation.log_likelihood == pytest.approx(
+        math.log(densities(np.array(z), (c @ mu + shift)[:, None], s)[0])
+    )
+
+
+def bent(x, c):
+    return (x[0] + 0.3 * x[0] * abs(x[0]),)
+
+
+def bent_by_branches(x, c):
+    return (x[0] + 0.3 * x[0] * (x[0] if x[0] > 0.0 else -x[0]),)
+
+
+def bent_model(observe):
+    return StateSpaceModel(
+        transition=lambda x, u, c: (0.9 * x[0],),
+        observe=observe,
+        process_noise_cov=[0.5],
+        measurement_noise_cov=[0.04],
+        prior_mean=[0.4],
+        prior_cov=[0.0],
+        inputs=0,
+    )
+
+
+@pytest.mark.usefixtures("as_python")
+def test_with_nonlinear_h_the_weights_correct_the_proposal():
+    """Mean, variance, likelihood are those of p(x | z), by quadrature; a function that is called does the same."""
+    grid = np.linspace(-6.0, 6.0, 200_001)
+    density = norm.pdf(grid, 0.36, math.sqrt(0.5)) * norm.pdf(1.9, bent([grid], None)[0], 0.2)
+    total = np.trapezoid(density, grid)
+    mean = np.trapezoid(grid * density, grid) / total
+    variance = np.trapezoid((grid - mean) ** 2 * density, grid) / total
+    found = []
+    for observe, size in ((bent, 20_000), (bent, 50), (bent_by_branches, 50)):
+        filter_ = make_filter("pf", bent_model(observe), ensemble_size=size, proposal="optimal")
+        belief, innovation = filter_.update(filter_.predict(filter_.init(KEY), []), [1.9])
+        found.append((belief.mean[0], belief.cov[0, 0], innovation.log_likelihood))
+    assert found[0][0] == pytest.approx(mean, abs=4 * math.sqrt(variance / 15_000))
+    assert found[0][1] == pytest.approx(variance, rel=0.06)
+    assert found[0][2] == pytest.approx(math.log(total), abs=0.03)
+    np.testing.assert_allclose(found[2], found[1], rtol=1e-7)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_gaussian_particles_are_drawn_from_the_belief():
+    model, size = plane_model(), 13
+    a, b, offset, _, _ = model.matrices()
+    filter_ = ParticleFilter(model=model, ensemble_size=size, resampling="gaussian", resampling_threshold=1.0)
+    belief, _ = filter_.update(filter_.init(KEY), [2.0, -1.0])
+    x = belief.mean[:, None] + root(belief.cov) @ normals(FILTER_KERNEL, 0, 2, size)
+    x = a @ x + b * 0.5 + offset[:, None] + root(model.process_noise_cov) @ normals(FILTER_PROCESS, 1, 2, size)
+    assert_belief(filter_, filter_.predict(belief, [0.5]), x, np.full(size, 1.0 / size))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("smoothed", [(1,), (0, 1)])
+def test_smoothed_constants_are_shrunk_and_spread_as_liu_and_west_have_it(smoothed):
+    model, size = line_model(), 13
+    a, b, offset, _, _ = model.matrices()
+    numbers = {"regularisation": 0.9, "resampling_threshold": 1.0}
+    filter_ = ParticleFilter(model=model, ensemble_size=size, smoothed=smoothed, **numbers)
+    belief, _ = filter_.update(filter_.init(KEY), [2.0])
+    x, w, at = belief.members[:2], np.exp(belief.members[2]), list(smoothed)
+    count = len(at)
+    width = 0.9 * (4.0 / (count + 2)) ** (1 / (count + 4)) * size ** (-1 / (count + 4))
+    chosen, cov = x[:, resampled(w, 0)], weighted_covariance(x, w)[np.ix_(at, at)]
+    middle = chosen[at].mean(axis=1, keepdims=True)
+    kernel = width * root(cov) @ normals(FILTER_KERNEL, 0, 2, size)[at]
+    chosen[at] = middle + math.sqrt(1.0 - width**2) * (chosen[at] - middle) + kernel
+    moved = a @ chosen + b * 0.5 + offset[:, None]
+    moved += root(model.process_noise_cov) @ normals(FILTER_PROCESS, 1, 2, size)
+    found = filter_.predict(belief, [0.5])
+    np.testing.assert_allclose(found.members[:2], moved, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_smoothed_constant_goes_on_being_learnt():
+    """Few values of a constant that is measured are soon one; smoothed, they stay about the exact mean."""
+    model = augmented_model(slope_model(), {0: Unknown(std=10.0)})
+    data = filter_keys(range(8)), np.zeros((8, 100, 0)), np.repeat(slope_measurements(steps=100), 8, axis=0)
+    exact = run(make_filter("ekf", model), *data)  # all is affine
+    squares, copies = [], []
+    for numbers in ({}, {"smoothed": [-1], "regularisation": 1.0}):
+        found = run(make_filter("pf", model, ensemble_size=60, **numbers), *data)
+        squares.append(((found.means - exact.means)[:, -1, 1] ** 2 / exact.covs[:, -1, 1, 1]).mean())
+        copies.append((found.covs / exact.covs)[:, -1, 1, 1].min())
+    assert squares[0] > 3.0 and copies[0] < 1e-3
+    assert squares[1] < 1.0 and copies[1] > 0.1
+
+
+def slope_model():
+    """z = x + theta + v of a slow x: affine also where theta is a state."""
+    return StateSpaceModel(
+        transition=lambda x, u, c: (0.5 * x[0],),
+        observe=lambda x, c: (x[0] + c[0],),
+        process_noise_cov=[0.1],
+        measurement_noise_cov=[0.5],
+        prior_mean=[0.0],
+        prior_cov=[0.1],
+        inputs=0,
+        constants=(0.0,),
+    )
+
+
+def slope_measurements(steps):
+    rng, x, found = np.random.default_rng(4), 0.0, []
+    for _ in range(steps + 1):
+        found.append(x + 0.8 + math.sqrt(0.5) * rng.normal())
+        x = 0.5 * x + math.sqrt(0.1) * rng.normal()
+    return np.array(found)[None, :, None]
+
+
+def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_the_optimal_proposal():
+    model = scalar_model(measurement_noise_cov=[1e-4])
+    inputs, z = simulated(model, 60, missing=0.1)
+    exact = run(make_filter("kf", model), [KEY], inputs, z)
+    numbers = {"ensemble_size": 20, "resampling": "gaussian", "resampling_threshold": 0.9}
+    filter_ = make_filter("pf", model, proposal="optimal", **numbers)
+    found = run(filter_, [KEY], inputs, z)
+    with interpreted():
+        same, plain = run(filter_, [KEY], inputs, z), run(make_filter("pf", model, **numbers), [KEY], inputs, z)
+    for one, other in zip(found, same, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    there = ~np.isnan(z)
+    optimal, prior = (np.abs((one.means - exact.means)[there]).mean() for one in (found, plain))
+    assert optimal < 0.2 * prior
+
+
+def test_what_the_kinds_may_not_be():
+    with pytest.raises(ValueError, match="proposal must be one of prior, optimal, but got 'best'"):
+        make_filter("pf", scalar_model(), proposal="best")
+    with pytest.raises(ValueError, match="resampling must be one of systematic, gaussian, but got 1"):
+        make_filter("pf", scalar_model(), resampling=1)
+    with pytest.raises(ValueError, match="smoothed must be a whole number from -1 to 0, but got 1"):
+        make_filter("pf", scalar_model(), smoothed=[1])
+    with pytest.raises(ValueError, match="must have no regularisation"):
+        make_filter("pf", scalar_model(), resampling="gaussian", regularisation=0.5)
