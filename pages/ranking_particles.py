@@ -12,16 +12,24 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import chi2
 
-from filters import make_filter, run
+from filters import Unknown, make_filter, run
 from filters.consistency.intervals import rmse_intervals
+from filters.consistency.nees import whitened
 from pages.page import DOCS, table
-from pages.ranking_tables import main
+from pages.ranking_tables import leaderboard, main, table_of
 from thruster_env.studies import mixed_linear
+from tuning.evaluation.compare import contender
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 SEEDS = 200
 Numbers = dict[str, object]
+KINDS: list[tuple[str, Numbers]] = [
+    ("pf", {"ensemble_size": 100, "proposal": "optimal"}),
+    ("pf", {"ensemble_size": 1000, "proposal": "optimal"}),
+    ("pf", {"ensemble_size": 1000, "resampling": "gaussian", "resampling_threshold": 1.0}),
+]
 
 
 def conditional() -> str:
@@ -29,7 +37,26 @@ def conditional() -> str:
     filters: list[tuple[str, Numbers]] = [("ekf", {}), ("ukf", {})]
     filters += [("pf", {"ensemble_size": size}) for size in (100, 300, 1000, 10_000)]
     filters += [("rbpf", {"ensemble_size": size}) for size in (30, 100, 1000)]
-    return errors_of(mixed_linear.problem, filters)
+    return errors_of(mixed_linear.problem, [*filters, *KINDS])
+
+
+def accurate() -> str:
+    """The same with accurate sensors."""
+    filters: list[tuple[str, Numbers]] = [("ekf", {}), ("ukf", {}), ("enkf", {"ensemble_size": 100})]
+    filters += [("pf", {"ensemble_size": size}) for size in (100, 1000, 10_000)]
+    filters += [("apf", {"ensemble_size": 1000}), *KINDS, ("rbpf", {"ensemble_size": 100})]
+    return errors_of(mixed_linear.problem_of(mixed_linear.model(1e-3)), filters)
+
+
+def constants() -> str:
+    """A flow that is a further state, constant, for particles whose copies stay together or are smoothed."""
+    known = {"ambient_velocity": Unknown(std=1.0)}
+    filters = [contender("ekf", unknown=known), contender("enkf", unknown=known, ensemble_size=100)]
+    for size in (300, 1000):
+        filters.append(contender("pf", unknown=known, ensemble_size=size))
+        smoothed = contender("pf", unknown=known, ensemble_size=size, smoothed=(-1,), regularisation=1.0)
+        filters.append(smoothed._replace(label=f"pf {size} smoothed + U_0"))
+    return table_of(leaderboard(find_scenario("ambient"), filters))
 
 
 def errors_of(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
@@ -41,15 +68,16 @@ def errors_of(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
         found = run(make_filter(name, model, **numbers), data.filter_keys, data.inputs, data.measurements)
         errors, covs = (found.means - data.states)[:, data.late], found.covs[:, data.late]
         parts = rmse_intervals(np.square(errors).mean(axis=1))
-        nees = np.median((errors * np.linalg.solve(covs, errors[..., None])[..., 0]).sum(axis=-1))
+        squares = np.square(whitened(errors, covs)).sum(axis=-1)
+        nees = np.median(np.where(np.isnan(squares), np.inf, squares))  # of a singular P: no error is within it
         level = found.log_likelihoods[:, data.late].sum(axis=1).mean()
-        label = " ".join([name, *(str(one).replace("ensemble_size", "") for one in numbers.values())])
+        label = " ".join([name, *(str(one) for key, one in numbers.items() if key != "resampling_threshold")])
         cells = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in parts]
         rows.append([label, *cells, f"{nees / chi2.median(model.n):.2f}", f"{level:.1f}"])
     return table(["filter", *symbols, "NEES", "log L"], rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (conditional,)}
+TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (conditional, accurate, constants)}
 
 if __name__ == "__main__":
     main(None, TABLES, "pages.ranking_particles", __doc__, DOCS / "ranking.md")

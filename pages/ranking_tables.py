@@ -41,7 +41,9 @@ COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS"
 def speed() -> str:
     """|speed| at slow crossings and dwells."""
     by_speed = contender("gsf", component=0)  # the sum is split along omega_m
-    return table_of(leaderboard(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, RANKED, PF, MANY]))
+    marginal = [contender("rbpf", sampled=(place,)) for place in (0, 1)]
+    filters = [EKF, UKF, by_speed, ENKF, RANKED, PF, MANY, *marginal]
+    return table_of(leaderboard(find_scenario("speed_magnitude"), filters))
 
 
 def fast() -> str:

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from filters import ParticleFilter, StateSpaceModel, Unknown, augmented_model, make_filter, run
+from tests.filters.test_filter_paths import assert_paths_agree
 from tests.filters.test_particle import (
     CYCLES,
     assert_belief,
@@ -196,6 +197,15 @@ def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_th
     there = ~np.isnan(z)
     optimal, prior = (np.abs((one.means - exact.means)[there]).mean() for one in (found, plain))
     assert optimal < 0.2 * prior
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(
+    "numbers", [{"proposal": "optimal"}, {"resampling": "gaussian", "resampling_threshold": 1.0}]
+)
+def test_they_are_the_same_on_every_path(numbers):
+    inputs, z = simulated(plane_model(), 20, missing=0.2)
+    assert_paths_agree(make_filter("pf", plane_model(), ensemble_size=10, **numbers), KEY, inputs, z)
 
 
 def test_what_the_kinds_may_not_be():

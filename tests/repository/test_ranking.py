@@ -88,6 +88,11 @@ def upper(cell):
     return value + half_width
 
 
+def center(cell):
+    """The value of "value ± half width"."""
+    return float(cell.split(" ± ")[0])
+
+
 def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     made = {*TABLES, *ranking_estimators.TABLES, *ranking_particles.TABLES, *ranking_horizon.TABLES}
     assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == made
@@ -101,6 +106,10 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert upper(table("reference")["pf 1000"][3]) < 1.02
     elsewhere = table("network_elsewhere")
     assert all(float(cell) > 5 for cell in elsewhere["`dropout`"]) and "**" in elsewhere["`mismatch`"][0]
+    conditional, accurate = table("conditional"), table("accurate")
+    assert all(center(conditional["rbpf 100"][i]) < 1.01 * center(conditional["pf 1000"][i]) for i in range(4))
+    assert all(center(accurate["pf 1000 optimal"][i]) <= center(accurate["pf 10000"][i]) for i in range(4))
+    assert upper(table("constants")["pf 300 smoothed + U_0"][3]) < center(table("constants")["pf 300 + U_0"][3])
     assert len(table("scores")) == len(SCENARIOS)
     assert upper(table("network_mismatch")["gru 32"][1]) < 0.3
     rows = table("network_outliers")

@@ -61,6 +61,8 @@ def test_an_augmented_filter_is_judged_by_the_plant_s_states():
     ambient = find_scenario("ambient")
     plain, joint = contender("ekf"), contender("ekf", unknown={"ambient_velocity": Unknown(0.5, 0.02)})
     assert joint.label == "ekf + U_0" and contender("enkf", inflation=1.1).label == "enkf 30 inflation 1.1"
+    assert contender("rbpf", sampled=(0, 1)).label == "rbpf 100 sampled 0, 1"
+    assert contender("pf", ensemble_size=9, proposal="optimal").label == "pf 9 proposal optimal"
     model = joint.filter(ambient).model
     assert model.n == 3 and model.prior_cov[2, 2] == 0.25 and model.process_noise_cov[2, 2] == pytest.approx(4e-4)
     (board,), _ = compare([plain, joint], [ambient], SEEDS)

@@ -160,12 +160,18 @@ def contender(
 
     unknown = unknown or {}
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(name).untuned))] if has_ensemble(name) else []
-    texts = {key: value if isinstance(value, str) else f"{value:g}" for key, value in numbers.items()}
-    others = [f"{key} {text}" for key, text in texts.items() if key != "ensemble_size"]
+    others = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     return Contender(
         " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown, knows
     )
+
+
+def _said(value) -> str:
+    """A parameter's value: a word, a number, or several."""
+    if isinstance(value, str):
+        return value
+    return ", ".join(f"{one:g}" for one in np.ravel(value))
 
 
 def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
