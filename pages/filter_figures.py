@@ -16,6 +16,7 @@ from pages import (
     filter_horizon,
     filter_models,
     filter_noise,
+    filter_particles,
     filter_sampled,
     filter_tables,
 )
@@ -28,6 +29,7 @@ FIGURES = {
     "filters_horizon.png": filter_horizon.reactor,
     "filters_ensembles.png": filter_sampled.ensembles,
     "filters_modes.png": filter_sampled.modes,
+    "filters_particles.png": filter_particles.kinds,
     "filters_weighted.png": filter_models.weighted,
     "filters_several.png": filter_models.several,
     "filters_fuzzy.png": filter_fuzzy.picture,
