@@ -16,7 +16,7 @@ from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
 from thruster_env.numerics.angles import wrapped
-from thruster_env.numerics.checks import at_least, positive, shown
+from thruster_env.numerics.checks import at_least, positive, short_repr
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.tuples import vector_reader, vector_writer, zeros_of
 from thruster_env.plants.layout import constants_reader, number_places
@@ -231,5 +231,5 @@ def place_of(name: str, value, count: int) -> int:
 def places_of(name: str, given, count: int) -> tuple[int, ...]:
     """Return places 0 ... count - 1 in order, each once, of a list of such; raise ValueError for anything else."""
     if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
-        raise ValueError(f"{name} must be a list of indices, but got {shown(given)}")
+        raise ValueError(f"{name} must be a list of indices, but got {short_repr(given)}")
     return tuple(sorted({place_of(name, one, count) for one in given}))

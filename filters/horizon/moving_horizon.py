@@ -77,7 +77,7 @@ class MovingHorizonFilter(Filter):
             object.__setattr__(self, "disturbance_limit", positive("disturbance_limit", self.disturbance_limit))
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The threshold, and the limit of disturbances."""
         return self.threshold, self.disturbance_limit
 

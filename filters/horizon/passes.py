@@ -12,7 +12,7 @@ from filters.horizon.limits import limits
 from filters.horizon.window import kept_places, scratch_places, window_works
 from filters.pages.kernels import nothing_to_summarise, page_kernels
 from filters.particles.weighted import anything_measured
-from thruster_env.numerics.compiled import inlined, kept_apart
+from thruster_env.numerics.compiled import inlined, not_inlined
 from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Functions, Shape
 from thruster_env.plants.state_bounds import Bound
@@ -51,7 +51,7 @@ def horizon_kernels(
     has_bounds = bool(bounds) or limited
     most = iterations + (MOST_PASSES if has_bounds else 0)
 
-    @kept_apart
+    @not_inlined
     def forwards(row, numbers, count, free):
         """The pass forwards over the first steps, components at bounds held or free; returns the cost of X."""
         for i in range(n):
@@ -80,7 +80,7 @@ def horizon_kernels(
                 cost += rows[at.moved_cost]
         return cost
 
-    @kept_apart
+    @not_inlined
     def backwards(row, numbers, count, single):
         """The pass backwards, which moves the window's states; returns how many bounds were not the right ones."""
         wrong = 0
@@ -107,7 +107,7 @@ def horizon_kernels(
                 rows[at.step + i] += given[kept.x + i] - rows[at.found + i]
         return wrong
 
-    @kept_apart
+    @not_inlined
     def halve(row, numbers, count):
         """Go half of the last step back."""
         for j in range(count):

@@ -186,18 +186,18 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
         angles = model.state_angles
-        x, fresh = memory.beside("given", kept.x, n), memory.beside("given", kept.fresh)
-        next_x = memory.beside("given", kept.end + kept.x, n)
+        x, fresh = memory.read("given", kept.x, n), memory.read("given", kept.fresh)
+        next_x = memory.read("given", kept.end + kept.x, n)
 
         def vector(place):
-            return memory.beside("rows", place, n)
+            return memory.read("rows", place, n)
 
         def square(place, *, symmetric=False):
-            return memory.beside("rows", place, n, n, symmetric=symmetric)
+            return memory.read("rows", place, n, n, symmetric=symmetric)
 
         d, P = vector(at.d), square(at.cov, symmetric=True)
         updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
-        z, after, before = memory.beside("rows", at.z, m), vector(at.after), vector(at.before)
+        z, after, before = memory.read("rows", at.z, m), vector(at.after), vector(at.before)
         next_before, noise = vector(at.end + at.before), vector(at.noise)
         noise_cov = square(at.noise_cov, symmetric=True)
         mean, F, without = vector(at.mean), square(at.slope), square(at.without)

@@ -34,9 +34,9 @@ class EachMemory(NumbersMemory):
         x = given(self.place(0), (shape.n,), member=not apart)
         super().__init__(shape, NO_PAGE, x, x, 0)
         at = Place("rows", end) if apart else Place("draws", 0)
-        self.e = given(at, (draws,), beside=x, member=not apart)
-        self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
-        self.prior_cov = self.beside(
+        self.e = given(at, (draws,), like=x, member=not apart)
+        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
+        self.prior_cov = self.read(
             "numbers", number_places(shape.n, shape.m).prior_cov, shape.n, shape.n, symmetric=True
         )
 
@@ -46,7 +46,7 @@ class EachMemory(NumbersMemory):
 
     def of_each(self, first: int, *shape: int, symmetric: bool = False) -> Matrix:
         """What each particle has in the table from a row on."""
-        return given(self.place(first), shape, symmetric=symmetric, beside=self.x, member=self._member)
+        return given(self.place(first), shape, symmetric=symmetric, like=self.x, member=self._member)
 
 
 class Works(NamedTuple):

@@ -197,6 +197,6 @@ class ResampledFilter(WeightedFilter):
         object.__setattr__(self, "resampling_threshold", threshold)
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
+    def own_parameters(self) -> tuple[float, ...]:
         """The factor on the kernel's width, and the threshold."""
-        return *super().own_numbers, self.resampling_threshold
+        return *super().own_parameters, self.resampling_threshold
