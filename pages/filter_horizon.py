@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from filters import make_filter, run
-from pages.filter_runs import LOOKS
+from pages.filter_runs import STYLES
 from pages.page import legend_below, log_ticks
 from pages.ranking_horizon import POSITIVE, SETTLED, assumed, batches
 from thruster_env.numerics.plots import new_figure, save_figure, tidy
@@ -28,8 +28,8 @@ def reactor(path: Path) -> Path:
         "mhe, bounded": ("mhe", make_filter("mhe", within)),
     }
     for label, (name, filter_) in filters.items():
-        left.plot(run(filter_, *given).means[0, :, 0], label=label, **LOOKS[name])
-    left.plot(states[0, :, 0], label="truth", **LOOKS["truth"])
+        left.plot(run(filter_, *given).means[0, :, 0], label=label, **STYLES[name])
+    left.plot(states[0, :, 0], label="truth", **STYLES["truth"])
     left.set_xlabel("step")
     left.set_ylabel("pressure of A")
 
@@ -38,9 +38,9 @@ def reactor(path: Path) -> Path:
         return float(np.sqrt(np.square(found).mean()))
 
     by_length = [error(make_filter("mhe", within, horizon=length)) for length in LENGTHS]
-    right.plot(LENGTHS, by_length, **LOOKS["mhe"])
+    right.plot(LENGTHS, by_length, **STYLES["mhe"])
     for name, filter_ in list(filters.values())[:2]:
-        right.axhline(error(filter_), **LOOKS[name])
+        right.axhline(error(filter_), **STYLES[name])
     log_ticks(right.yaxis, (0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
     right.set_xlabel("horizon L of mhe [steps]")
     right.set_ylabel("RMSE from step 20 on")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from filters import make_filter, run
-from pages.filter_runs import LOOKS
+from pages.filter_runs import STYLES
 from pages.page import log_ticks
 from thruster_env.numerics.plots import BLUE, DARK, new_figure, save_figure, tidy
 from thruster_env.studies import mixed_linear
@@ -16,14 +16,14 @@ SIZES = (20, 50, 100, 200, 500, 1000, 2000, 5000)
 RUNS = 200
 SENSORS = ((0.1, "R = 0.1"), (1e-3, "R = 0.001"))
 KINDS = {
-    "pf": ("pf", {}, LOOKS["pf"]),
+    "pf": ("pf", {}, STYLES["pf"]),
     "pf, optimal proposal": ("pf", {"proposal": "optimal"}, {"color": BLUE, "linestyle": "-"}),
     "pf, gaussian": (
         "pf",
         {"resampling": "gaussian", "resampling_threshold": 1.0},
         {"color": BLUE, "linestyle": "--"},
     ),
-    "rbpf": ("rbpf", {}, LOOKS["rbpf"] | {"linestyle": "-"}),
+    "rbpf": ("rbpf", {}, STYLES["rbpf"] | {"linestyle": "-"}),
 }
 
 

@@ -225,7 +225,7 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
 def test_the_page_on_tuning_holds_what_its_script_makes():
     import pages.tuning_figures as script
 
-    assert script.likeliest() in TUNING_PAGE
+    assert script.maximum_likelihood() in TUNING_PAGE
     lines = script.earned(["outliers"], trials=8).splitlines()[2:]
     assert [line.split(" | ")[1] for line in lines] == ["`kf`", "`ekf`", "`enkf`"]
     ratios = [[float(cell.split()[0]) for cell in line.split(" | ")[2:4]] for line in lines]

@@ -70,7 +70,7 @@ def packages_of(path):
 
 def rooms_of(path):
     """The rooms that a file knows."""
-    return {room_of(name).replace(".", "/") for name in imports_of(path)}
+    return {package_of(name).replace(".", "/") for name in imports_of(path)}
 
 
 def test_imports_are_found_wherever_they_hide():
