@@ -152,5 +152,6 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
         freedom: degrees of freedom of each run and step, (B, T); 0 where a run does not count.
     """
     runs, total = (freedom > 0).sum(axis=0), freedom.sum(axis=0)
-    limits = chdtri(np.maximum(total, 1.0)[:, None], [0.975, 0.025])  # chdtri takes the upper tail
+    sums, place = np.unique(total, return_inverse=True)  # there are few, and chdtri is slow
+    limits = chdtri(np.maximum(sums, 1.0)[:, None], [0.975, 0.025])[place]  # it takes the upper tail
     return np.where(runs[:, None] > 0, limits / np.maximum(runs, 1)[:, None], np.nan)

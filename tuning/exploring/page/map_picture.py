@@ -12,7 +12,8 @@ from bokeh.palettes import Cividis256, RdBu11
 from tuning.exploring.knobs import Knob
 from tuning.exploring.maps import Map
 from tuning.exploring.page.colours import Colours, paint
-from tuning.exploring.page.signal import as_sent, new_figure
+from tuning.exploring.page.sent import Sent, as_sent
+from tuning.exploring.page.signal import new_figure
 from tuning.exploring.trials import Trial
 
 HEIGHT = 330  # [px]
@@ -24,26 +25,31 @@ TICKS += " : String(+size.toPrecision(3))"
 class MapPicture:
     """Score or NIS over two knobs; a click takes their values."""
 
-    def __init__(self, knobs: Sequence[Knob], taken: Callable[[dict[str, float]], None]):
+    def __init__(self, knobs: Sequence[Knob], taken: Callable[[dict[str, float]], None], sent: Sent):
         """Make it empty.
 
         Args:
             knobs: all that may be an axis.
             taken: called with the two values of a click.
+            sent: takes where one is.
         """
         self.set_knobs(knobs)
-        self._taken = taken
+        self._taken, self._sent = taken, sent
         self.map: Map | None = None
         self.figure = new_figure("map", HEIGHT, tools="tap")
         self.image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self.trials, self.path = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
-        self.here = ColumnDataSource({"x": [], "y": []})
+        self.here: dict[str, list[float]] = {}
+        here = ColumnDataSource({"x": [], "y": []}, name="where one is")
         self.mapper = LogColorMapper(palette=Cividis256[::-1], low=1.0, high=BAD)
         draw = self.figure
         draw.image("image", "x", "y", "dw", "dh", source=self.image, color_mapper=self.mapper)
-        draw.line("x", "y", source=self.path, line_width=2, name="trials")
-        draw.scatter("x", "y", source=self.trials, size=7, fill_color="white", line_width=1.2, name="trials")
-        draw.scatter("x", "y", source=self.here, size=18, marker="cross", line_width=3, name="here")
+        top = {"level": "overlay"}  # on a canvas of its own: the map need not be drawn again
+        draw.line("x", "y", source=self.path, line_width=2, name="trials", **top)
+        draw.scatter(
+            "x", "y", source=self.trials, size=7, fill_color="white", line_width=1.2, name="trials", **top
+        )
+        draw.scatter("x", "y", source=here, size=18, marker="cross", line_width=3, name="here", **top)
         self.bar = ColorBar(color_mapper=self.mapper, width=12, padding=4, background_fill_color=None)
         self.bar.major_label_text_font_size = "12px"
         draw.add_layout(self.bar, "right")
@@ -88,8 +94,9 @@ class MapPicture:
         if self.map is None:
             return
         now = {"x": [self._place(self.map.x, values)], "y": [self._place(self.map.y, values)]}
-        if dict(self.here.data) != now:  # a map takes a while to be drawn
-            self.here.data = now
+        if self.here != now:
+            self.here = now
+            self._sent.columns("where one is", {axis: np.array(at) for axis, at in now.items()})
 
     def points(self, trials: Sequence[Trial]) -> None:
         """Draw a study's trials, and the path of the best one so far."""

@@ -17,7 +17,7 @@ const number_text = value => {
 }
 
 function ask(what, more = {}, began = null) {
-  const question = {do: what, ...more, width: picture_width(), dark: document.documentElement.classList.contains("dark")}
+  const question = {do: what, ...more, width: picture_width, dark: document.documentElement.classList.contains("dark")}
   if (what === "view") nextView = {question, began: began ?? performance.now()}
   else queue.push({question, began: null})
   send()
@@ -31,7 +31,35 @@ function send() {
   if (asked.question.do === "view") asked.question.values = {...values}
   wire.asked = JSON.stringify(asked.question)
 }
+const models = new Map()
+function model(name) {
+  if (!models.has(name)) models.set(name, Bokeh.documents[0].get_model_by_name(name))
+  return models.get(name)
+}
+// Numbers and axes of all pictures at once, so that one frame of the screen shows them; the server knows them.
+function draw({columns, axes}) {
+  paint_without_styles()
+  const {buffer, byteOffset} = wire.numbers, silently = {sync: false, check_eq: false}
+  const part = at => Array.isArray(at[0]) ? at.map(part) : new Float32Array(buffer, byteOffset + 4 * at[0], at[1] - at[0])
+  for (const [name, own] of Object.entries(columns))
+    model(name).setv({data: Object.fromEntries(Object.entries(own).map(([column, at]) => [column, part(at)]))}, silently)
+  for (const [name, own] of Object.entries(axes))
+    for (const [axis, [start, end]] of Object.entries(own)) model(name)[`${axis}_range`].setv({start, end}, silently)
+}
+// Whenever Bokeh paints, it writes where each axis and glyph lies into a style sheet of its own, and asks the styles of
+// the page for each colour and width: two thirds of the time of a picture. Nothing here needs these places and styles.
+function paint_without_styles() {
+  for (const {model, renderer_views} of Bokeh.index.roots) {
+    for (const view of renderer_views?.values() ?? []) {
+      if (model.name !== "map") view.update_position = () => {}
+      let kind = Object.values(view.visuals ?? {}).find(visual => visual?._get_css_value)
+      while (kind && !Object.hasOwn(kind, "_get_css_value")) kind = Object.getPrototypeOf(kind)
+      if (kind) kind._get_css_value = () => ""
+    }
+  }
+}
 function heard(told) {
+  if (told.drawn) draw(told.drawn)
   const answered = told.answers === number ? asked : null
   if (answered) {
     asked = null
@@ -48,8 +76,11 @@ function heard(told) {
   send()
 }
 const after_painting = call => requestAnimationFrame(() => { const {port1, port2} = new MessageChannel(); port1.onmessage = call; port2.postMessage(0) })
-const picture_width = () => Math.round((document.querySelector(".picture:not([hidden])")?.clientWidth ?? 800) * Math.min(devicePixelRatio, 2))
-function complain(text) { get("error").textContent = text; get("error").hidden = !text }
+const AXIS = 54  // pixels of a picture's width
+let picture_width = 800
+function measure() { picture_width = Math.round(((document.querySelector(".picture:not([hidden])")?.clientWidth || 800) - AXIS) * Math.min(devicePixelRatio, 2)) }
+const put = (element, name, value) => { if (element[name] !== value) element[name] = value }  // unlike it, no change costs nothing
+function complain(text) { put(get("error"), "textContent", text); put(get("error"), "hidden", !text) }
 
 // Knobs
 const to_place = (knob, value) => STEPS * (knob.log ? Math.log(value / knob.low) / Math.log(knob.high / knob.low) : (value - knob.low) / (knob.high - knob.low))
@@ -101,7 +132,7 @@ function build_knob(knob) {
     const value = Number(text.value.replace(",", ".").replace("\u2212", "-"))
     if (text.value.trim() === "" || !Number.isFinite(value)) {
       complain(`${knob.label} must be a number from ${number_text(knob.low)} to ${number_text(knob.high)}, but got ${text.value || "nothing"}`)
-      text.setAttribute("aria-invalid", "true")
+      text.ariaInvalid = "true"
       return
     }
     values[knob.name] = Math.min(knob.high, Math.max(knob.low, knob.integer ? Math.round(value) : value))
@@ -131,10 +162,11 @@ function build_knob(knob) {
 const letter_of = name => ({"rule of thumb": "R", "scaled default": "S", tuned: "T", oracle: "O", given: "G"})[name] ?? name[0].toUpperCase()
 function place_knobs(dragged = null) {
   for (const [name, {knob, range, text}] of knobs) {
-    if (range !== dragged) range.value = to_place(knob, values[name])
-    range.setAttribute("aria-valuetext", number_text(values[name]))
-    if (document.activeElement !== text || dragged) text.value = number_text(values[name])
-    text.removeAttribute("aria-invalid")
+    const said = number_text(values[name])
+    if (range !== dragged) put(range, "value", String(to_place(knob, values[name])))
+    put(range, "ariaValueText", said)
+    if (document.activeElement !== text || dragged) put(text, "value", said)
+    put(text, "ariaInvalid", null)
   }
 }
 function build_presets() {
@@ -164,21 +196,23 @@ const states_shown = () => [...get("shown").querySelectorAll("input[data-place]:
 function hide_pictures() {
   const shown = states_shown()
   for (const one of document.querySelectorAll('.picture[data-name^="state"]')) one.hidden = !shown.includes(+one.dataset.name.slice(5))
+  measure()
 }
 function tell_shown() {
   hide_pictures()
   ask("shown", {states: states_shown(), run: +get("seed").value, errors: get("errors")?.checked ?? false})
 }
 function show_figures(figures) {
-  const parts = []
-  for (const [name, {value, unit: measured, better, target, start}] of Object.entries(figures)) {
-    const unit = measured === "-" ? "" : measured
+  const names = Object.keys(figures), rows = get("figures").children
+  if (names.join() !== [...rows].map(row => row.firstChild.title).join())
+    get("figures").replaceChildren(...names.map(name => make("div", {}, make("dt", {textContent: name.replace(/:.*/, ""), title: name}), make("dd"))))
+  for (const [place, {value, unit: measured, better, target, start}] of Object.values(figures).entries()) {
+    const unit = measured === "-" ? "" : measured, number = rows[place].lastChild
     const [arrow, judgement] = against(value, start, better, target)
-    const number = make("dd", {className: judgement}, `${number_text(value)} ${unit} ${arrow}`)
-    if (judgement) number.title = `${judgement} than at the start: ${number_text(start)} ${unit}`
-    parts.push(make("div", {}, make("dt", {textContent: name.replace(/:.*/, ""), title: name}), number))
+    put(number, "textContent", `${number_text(value)} ${unit} ${arrow}`)
+    put(number, "className", judgement)
+    put(number, "title", judgement ? `${judgement} than at the start: ${number_text(start)} ${unit}` : "")
   }
-  get("figures").replaceChildren(...parts)
 }
 function against(value, start, better, target) {
   if (value === null || start === null || Math.abs(value - start) <= 1e-3 * Math.abs(start)) return ["", ""]
@@ -231,6 +265,8 @@ function listen() {
     ask("study", {trials: +get("trials").value})
   }
   get("take").onclick = () => { values = {...values, ...best.values}; place_knobs(); ask("view") }
+  addEventListener("resize", measure)
+  measure()
   get("knobs").onsubmit = event => event.preventDefault()
   const dark = matchMedia("(prefers-color-scheme: dark)")
   const ground = is => { document.documentElement.classList.toggle("dark", is); get("ground").textContent = is ? "Light" : "Dark" }

@@ -11,7 +11,8 @@ from bokeh.plotting import figure
 from tuning.exploring.bench import Bench
 from tuning.exploring.figure import WITHIN_95, mean_of_runs
 from tuning.exploring.page.colours import Colours, paint
-from tuning.exploring.page.signal import Signal, as_sent, new_figure
+from tuning.exploring.page.sent import Sent
+from tuning.exploring.page.signal import Signal, new_figure
 from tuning.exploring.page.thinning import extremes, places
 from tuning.exploring.view import View
 
@@ -22,13 +23,14 @@ Look = tuple[int, int, bool]  # points across, which run, and whether errors are
 class Pictures:
     """All pictures over time of one bench, and what they show."""
 
-    def __init__(self, bench: Bench):
-        """Make them empty."""
-        self.states = [Signal(f"state{place}") for place in range(len(bench.states))]
-        self.innovations = [Signal(f"innovation{place}") for place in range(len(bench.measurements))]
-        self.nis = Signal("nis", level=True)
-        self.nees = [Signal("nees", level=True)] if bench.has_truth else []
-        self.lags = ColumnDataSource({"lag": [], "value": []})
+    def __init__(self, bench: Bench, sent: Sent):
+        """Make them empty; `sent` takes what is to be drawn."""
+        self.sent = sent
+        self.states = [Signal(f"state{place}", sent) for place in range(len(bench.states))]
+        self.innovations = [Signal(f"innovation{place}", sent) for place in range(len(bench.measurements))]
+        self.nis = Signal("nis", sent, level=True)
+        self.nees = [Signal("nees", sent, level=True)] if bench.has_truth else []
+        self.lags = ColumnDataSource({"lag": [], "value": []}, name="lags")
         self.autocorrelation = new_figure("autocorrelation")
         self.autocorrelation.y_range.update(start=-1.0, end=1.0)
         self.white = BoxAnnotation(bottom=0.0, top=0.0, fill_alpha=0.18, line_color=None)
@@ -86,7 +88,7 @@ class Pictures:
         channels, lags = values.shape
         shift = (np.arange(channels) - (channels - 1) / 2) * 0.6 / max(channels, 1)
         lag = (np.arange(1, lags + 1)[None, :] + shift[:, None]).ravel()
-        self.lags.data = {"lag": as_sent(lag), "value": as_sent(values.ravel())}
+        self.sent.columns("lags", {"lag": lag, "value": values.ravel()})
         if self.white.top != view.autocorrelation_band:
             self.white.update(bottom=-view.autocorrelation_band, top=view.autocorrelation_band)
             self.autocorrelation.x_range.update(start=0.0, end=lags + 1.0)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
+from bokeh.core.properties import Any as AnyProperty
 from bokeh.core.properties import String
 from bokeh.document import Document
 from bokeh.model import DataModel
@@ -20,6 +21,7 @@ from tuning.exploring.page.colours import HELD, ground
 from tuning.exploring.page.export import exported
 from tuning.exploring.page.map_picture import MapPicture
 from tuning.exploring.page.pictures import Look, Pictures
+from tuning.exploring.page.sent import Sent
 from tuning.exploring.scenes import Scene
 from tuning.exploring.view import View
 
@@ -29,9 +31,10 @@ log = logging.getLogger(__name__)
 
 
 class Wire(DataModel):
-    """What the page and the server say to each other, as JSON."""
+    """What the page and the server say to each other, as JSON, and the numbers that are drawn."""
 
     asked = String(default="")
+    numbers = AnyProperty(default=None)  # float32, said before the text that says what they are
     told = String(default="")
 
 
@@ -49,8 +52,9 @@ class Session:
         self.held: dict[int, tuple[Bench, dict[str, float]]] = {}
         self.trials: list[Any] = []
         self._stopped, self._gone = threading.Event(), False
-        self.pictures = Pictures(bench)
-        self.map = MapPicture(bench.knobs, self._clicked)
+        self.sent = Sent()
+        self.pictures = Pictures(bench, self.sent)
+        self.map = MapPicture(bench.knobs, self._clicked, self.sent)
         self.wire = Wire(name="wire")
         self.map.figure.tags = [self.wire]
         self.wire.on_change("asked", self._asked)
@@ -74,7 +78,11 @@ class Session:
         self.tell({**answer, "answers": number})
 
     def tell(self, message: Mapping[str, Any]) -> None:
-        """Say something to the page."""
+        """Say something to the page, and what is to be drawn."""
+        numbers, drawn = self.sent.take()
+        if drawn:
+            self.wire.numbers = numbers
+            message = {**message, "drawn": drawn}
         self.wire.told = json.dumps(_plain(message), allow_nan=False)
 
     def do_hello(self, question: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,11 +10,13 @@ from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
 from tuning.exploring.page.colours import HELD
+from tuning.exploring.page.sent import Sent, as_sent
+from tuning.exploring.page.thinning import corners
 
 HEIGHT = 132  # [px]
 ROOM = 0.06  # of a range, left free at its ends
 KEPT = 0.45  # of an axis that what is drawn has to fill, or the axis is drawn anew
-OF_BAND = 98.0  # [%] of a band's points that are always in the picture: at the start it is often much wider
+OF_BAND = 0.98  # of a band's points that are always in the picture: at the start it is often much wider
 
 
 def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
@@ -49,27 +51,32 @@ def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
 class Signal:
     """One quantity over time: a line in its band, the truth, other runs, and the held configurations."""
 
-    def __init__(self, name: str, *, level: bool = False):
+    def __init__(self, name: str, sent: Sent, *, level: bool = False):
         """Make it empty.
 
         Args:
             name: of the figure, by which the page finds its place.
+            sent: takes what is to be drawn.
             level: whether it is a NIS or NEES, on a logarithmic axis.
         """
         self.figure = new_figure(name, y_axis_type="log" if level else "linear")
-        self.level = level
-        self.source = ColumnDataSource({"time": [], "low": [], "high": [], "line": [], "truth": []})
-        self.runs = ColumnDataSource({"xs": [], "ys": []})
+        self.name, self.sent, self.level = name, sent, level
+        self.columns: dict[str, np.ndarray] = {}  # what is drawn
+        self.runs: list[np.ndarray] = []
+        self._across = self._along = (0.0, 1.0)  # ends of the axes, of y as they are drawn
+        lines = ColumnDataSource({"time": [], "line": [], "truth": []}, name=f"{name} lines")
+        between = ColumnDataSource({"time": [], "low": [], "high": []}, name=f"{name} band")
+        self._runs = ColumnDataSource({"xs": [], "ys": []}, name=f"{name} runs")
         self.held = [ColumnDataSource({"time": [], "line": []}) for _ in HELD]
         draw = self.figure
-        draw.varea("time", "low", "high", source=self.source, fill_alpha=0.2, name="band")
-        self._fan = draw.multi_line("xs", "ys", source=self.runs, line_alpha=0.35, name="estimate", visible=False)
+        draw.varea("time", "low", "high", source=between, fill_alpha=0.2, name="band")
+        self._fan = draw.multi_line("xs", "ys", source=self._runs, line_alpha=0.35, name="estimate", visible=False)
         self._others = [
-            draw.line("time", "line", source=held, line_color=colour, line_width=1.3, visible=False)
+            draw.line("time", "line", source=held, line_color=colour, visible=False)
             for held, colour in zip(self.held, HELD, strict=True)
         ]
-        self._truth = draw.line("time", "truth", source=self.source, line_width=1.2, name="truth", visible=False)
-        draw.line("time", "line", source=self.source, line_width=1.6, name="estimate")
+        self._truth = draw.line("time", "truth", source=lines, name="truth", visible=False)
+        draw.line("time", "line", source=lines, name="estimate")
 
     def show(
         self,
@@ -81,12 +88,17 @@ class Signal:
     ) -> None:
         """Draw new numbers, each (points,)."""
         low, high = band
-        columns = {"time": time, "low": low, "high": high, "line": line, "truth": line if truth is None else truth}
-        self.source.data = {name: as_sent(one) for name, one in columns.items()}
+        self.columns = {"time": time, "low": low, "high": high, "line": line}
+        self.columns["truth"] = line if truth is None else truth
+        at = corners(low, high) if len(time) else np.arange(0)
+        for what, names in (("band", ("low", "high")), ("lines", ("line", "truth"))):
+            some = at if what == "band" else slice(None)
+            self.sent.columns(f"{self.name} {what}", {one: self.columns[one][some] for one in ("time", *names)})
+        self.runs = list(runs)
         _set_visible(self._truth, truth is not None)
         _set_visible(self._fan, len(runs) > 0)
-        if len(runs) > 0:
-            self.runs.data = {"xs": [as_sent(time)] * len(runs), "ys": [as_sent(one) for one in runs]}
+        if self.runs:
+            self.sent.columns(f"{self.name} runs", {"xs": [time] * len(runs), "ys": self.runs})
         self._frame(time, [line, *([] if truth is None else [truth]), *runs], band)
 
     def hold(self, slot: int, time: np.ndarray, line: np.ndarray) -> None:
@@ -108,34 +120,21 @@ class Signal:
             low, high = max(np.log10(low), np.log10(high) - 4.0), np.log10(high)
         if high - low < 1e-9 * max(abs(low), abs(high), 1e-30):
             low, high = low - 0.5, high + 0.5
-        axis = self.figure.y_range
-        was = (
-            (np.log10(axis.start), np.log10(axis.end))
-            if self.level and axis.start > 0.0
-            else (axis.start, axis.end)
-        )
+        was = self._across
         if not (was[0] <= low and high <= was[1] and high - low >= KEPT * (was[1] - was[0])):
             free = ROOM * (high - low)
-            now = low - free, high + free
-            axis.update(
-                start=10.0 ** now[0] if self.level else now[0], end=10.0 ** now[1] if self.level else now[1]
-            )
-        if len(time) and (self.figure.x_range.start, self.figure.x_range.end) != (time[0], time[-1]):
-            self.figure.x_range.update(start=float(time[0]), end=float(time[-1]))
-
-
-def as_sent(values: np.ndarray) -> np.ndarray:
-    """Numbers in the half as many bytes that a screen needs; without infinite ones, which no axis has."""
-    with np.errstate(over="ignore"):
-        short = np.asarray(values, dtype=np.float32)
-    return np.where(np.isfinite(short), short, np.float32(np.nan))
+            self._across = start, end = low - free, high + free
+            self.sent.axis(self.name, "y", *((10.0**start, 10.0**end) if self.level else (start, end)))
+        if len(time) and self._along != (time[0], time[-1]):
+            self._along = float(time[0]), float(time[-1])
+            self.sent.axis(self.name, "x", *self._along)
 
 
 def _most_of(band: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
-    low, high = (one[np.isfinite(one)] for one in band)
-    return [
-        np.percentile(one, [at], keepdims=False) for one, at in ((low, 100 - OF_BAND), (high, OF_BAND)) if len(one)
-    ]
+    """Where most of a band ends, below and above."""
+    low, high = (np.sort(one[np.isfinite(one)]) for one in band)
+    within = [int(share * (len(one) - 1)) for one, share in ((low, 1.0 - OF_BAND), (high, OF_BAND))]
+    return [one[[at]] for one, at in zip((low, high), within, strict=True) if len(one)]
 
 
 def _set_visible(renderer: Any, visible: bool) -> None:

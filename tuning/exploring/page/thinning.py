@@ -32,3 +32,11 @@ def extremes(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     peaks = np.flatnonzero(away == largest[stretch])
     first = peaks[np.unique(stretch[peaks], return_index=True)[1]]
     return values[first]
+
+
+def corners(*lines: np.ndarray) -> np.ndarray:
+    """Places that are enough to draw lines, (points,) each: those within a stretch where all are level are not."""
+    same = np.ones(len(lines[0]) - 1, dtype=bool)
+    for line in lines:
+        same &= (line[1:] == line[:-1]) | (np.isnan(line[1:]) & np.isnan(line[:-1]))
+    return np.flatnonzero(~(np.append(False, same) & np.append(same, False)))

@@ -18,6 +18,7 @@ from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.colours import DARK, HELD
 from tuning.exploring.page.document import page_of
+from tuning.exploring.page.sent import as_sent
 from tuning.exploring.page.server import Server
 from tuning.exploring.page.session import Session, _plain
 
@@ -74,19 +75,33 @@ def test_pictures_show_the_numbers_of_the_view(tab, bench):
     q = bench.knobs[0].name
     told = tab.ask("view", values={q: bench.start[q] * 3.0})
     view = bench.view(bench.start | {q: bench.start[q] * 3.0}, SEEDS)
-    shown = tab.session.pictures.states[1].source.data
+    shown = tab.session.pictures.states[1].columns
     np.testing.assert_allclose(shown["line"], view.estimate[0, :, 1], rtol=1e-6)
     np.testing.assert_allclose(shown["truth"], view.truth[0, :, 1], rtol=1e-6)
     np.testing.assert_allclose(shown["high"] - shown["low"], 2 * WITHIN * view.deviation[0, :, 1], rtol=1e-4)
-    innovation = tab.session.pictures.innovations[0].source.data
+    innovation = tab.session.pictures.innovations[0].columns
     np.testing.assert_allclose(innovation["line"], view.innovation[0, :, 0], rtol=1e-6)
     np.testing.assert_allclose(innovation["high"], WITHIN * view.innovation_deviation[0, :, 0], rtol=1e-6)
     scored = np.isfinite(view.nees).any(axis=0)
-    nees = tab.session.pictures.nees[0].source.data["line"]
+    nees = tab.session.pictures.nees[0].columns["line"]
     np.testing.assert_allclose(nees[scored], np.nanmean(view.nees[:, scored], axis=0), rtol=1e-6)
     for name, one in view.figures.items():
         assert told["figures"][name]["value"] == pytest.approx(one.value, nan_ok=True)
         assert told["figures"][name]["start"] == pytest.approx(bench.view(bench.start, SEEDS).figures[name].value)
+
+
+def test_what_is_drawn_is_sent_in_one_array(tab):
+    drawn = tab.ask("hello")["drawn"]
+    sent, nis = tab.session.wire.numbers, tab.session.pictures.nis
+    first, last = drawn["columns"]["nis lines"]["line"]
+    np.testing.assert_array_equal(sent[first:last], as_sent(nis.columns["line"]))
+    band = [sent[slice(*drawn["columns"]["nis band"][name])] for name in ("time", "high")]
+    there = np.isfinite(nis.columns["high"])
+    np.testing.assert_allclose(np.interp(nis.columns["time"][there], *band), nis.columns["high"][there], rtol=1e-6)
+    assert set(drawn["axes"]["nis"]) == {"x", "y"} and sent.dtype == np.float32
+    parts = [part for columns in drawn["columns"].values() for part in columns.values()]
+    assert sum(last - first for first, last in parts) == len(sent)
+    assert "nis" not in tab.ask("view", values={})["drawn"]["axes"]
 
 
 def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
@@ -94,9 +109,9 @@ def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
     tab.ask("shown", states=[0], run=1, errors=True)
     view = tab.session.view
     signal = tab.session.pictures.states[0]
-    np.testing.assert_allclose(signal.source.data["line"], view.estimate[1, :, 0] - view.truth[1, :, 0], rtol=1e-4)
-    assert len(signal.runs.data["ys"]) == SEEDS - 1
-    np.testing.assert_allclose(signal.runs.data["ys"][1], view.estimate[2, :, 0] - view.truth[2, :, 0], rtol=1e-4)
+    np.testing.assert_allclose(signal.columns["line"], view.estimate[1, :, 0] - view.truth[1, :, 0], rtol=1e-4)
+    assert len(signal.runs) == SEEDS - 1
+    np.testing.assert_allclose(signal.runs[1], view.estimate[2, :, 0] - view.truth[2, :, 0], rtol=1e-4)
     assert not tab.session.pictures.states[1].figure.visible
 
 
@@ -165,7 +180,7 @@ def test_a_map_is_drawn_with_its_rows_upwards_and_a_click_takes_values(tab, benc
     tab.session.map._click(at)
     assert tab.told()["values"][x.name] == x.low
     assert tab.told()["values"][y.name] == pytest.approx(np.sqrt(y.low * y.high))
-    assert tab.session.map.here.data["y"] == [pytest.approx(at.y)]
+    assert tab.session.map.here["y"] == [pytest.approx(at.y)]
 
 
 def test_a_study_tells_its_trials_and_stops(tab):

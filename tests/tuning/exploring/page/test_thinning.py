@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tuning.exploring.page.thinning import extremes, places
+from tuning.exploring.page.thinning import corners, extremes, places
 
 
 def test_a_short_run_is_drawn_whole():
@@ -25,3 +25,10 @@ def test_each_stretch_shows_what_is_farthest_from_the_mean():
     expected = np.zeros(10)
     expected[3], expected[6], expected[8] = 9.0, -4.0, np.nan
     np.testing.assert_array_equal(found, expected)
+
+
+def test_level_stretches_need_their_ends_alone():
+    low = np.array([np.nan, np.nan, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 2.0])
+    high = np.array([np.nan, np.nan, 5.0, 5.0, 5.0, 5.0, 5.0, 6.0, 6.0])
+    assert corners(low, high).tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert corners(np.ones(5)).tolist() == [0, 4] and corners(np.ones(1)).tolist() == [0]
