@@ -32,7 +32,7 @@ def draw(scene: Scene, path: Path) -> Path:
     for number, (step, column) in enumerate(zip(scene.steps, axes.T, strict=True)):
         view = scene.view(number)
         assert view.truth is not None  # scenes are of plants
-        time, truth, estimate = view.time[SPAN], view.truth[0, SPAN, place], view.estimate[0, SPAN, place]
+        time, truth, estimate = view.time[0, SPAN], view.truth[0, SPAN, place], view.estimate[0, SPAN, place]
         column[0].plot(time, truth, color=DARK, linewidth=1.0, label="truth")
         column[0].plot(time, estimate, color=BLUE, linewidth=1.2, label="estimate")
         column[0].set_title(f"{step.label}\n{_figures(view, scene.state)}", fontsize=9)

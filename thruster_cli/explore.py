@@ -25,6 +25,7 @@ from thruster_cli.options import (
     LogOption,
     LogPresetOption,
     ModelOption,
+    NoGridOption,
     SeedOption,
     SensorOption,
     StartOption,
@@ -62,6 +63,7 @@ def command(
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
+    no_grid: NoGridOption = False,
     seeds: Annotated[int, typer.Option(min=1, max=64, help="Number of runs at once.", rich_help_panel=RUNS)] = 8,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page; 0 for a free one.", rich_help_panel=RUNS)
@@ -98,7 +100,7 @@ def command(
     """
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
-    of_logs |= {"hold_gaps": hold_gaps or None, "start": start}
+    of_logs |= {"hold_gaps": hold_gaps or None, "start": start, "grid": False if no_grid else None}
     bench = _bench(file, filter_name, scenario, log, of_logs, seed)
     try:
         from tuning.exploring.page.document import page_of

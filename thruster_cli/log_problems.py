@@ -24,8 +24,7 @@ def problems_of(
     preset = given.pop("preset", None)
     if given:
         first = next(iter(given))
-        option = {"sensors": "sensor", "columns": "column"}.get(first, first).replace("_", "-")
-        raise ValueError(
-            f"--{option} must come with --log, but got --{option} {short_repr(given[first])} without one"
-        )
+        option = {"sensors": "sensor", "columns": "column", "grid": "no-grid"}.get(first, first).replace("_", "-")
+        value = "" if first == "grid" else f" {short_repr(given[first])}"
+        raise ValueError(f"--{option} must come with --log, but got --{option}{value} without one")
     return tuple(of_preset(find_problem(name), preset) for name in names or [default])

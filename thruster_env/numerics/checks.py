@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from functools import lru_cache
 from types import NoneType
 
 import numpy as np
@@ -183,7 +184,8 @@ def covariance(
         raise ValueError(f"{rule}, but got {short_repr(value)}") from None
     if array.shape == (size,):
         array = np.diag(array)
-    if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
+    symmetric = array.shape == (size, size) and ((array == array.T).all() or np.allclose(array, array.T))
+    if not symmetric or not np.isfinite(array).all():
         raise ValueError(f"{rule} of finite numbers, but got {short_repr(value)}")
     if np.abs(array).max() > largest:
         raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {short_repr(value)}")
@@ -209,7 +211,12 @@ def correlations(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def covariance_root(cov: np.ndarray) -> np.ndarray:
     """A lower triangular L with L L' = cov for a positive semidefinite covariance, zero variances allowed."""
-    scaled, units = correlations(cov)
+    return _root(np.asarray(cov, dtype=np.float64).tobytes(), len(cov)).copy()
+
+
+@lru_cache(maxsize=256)  # a study or map has the same prior all the time, and few values of Q or R
+def _root(entries: bytes, size: int) -> np.ndarray:
+    scaled, units = correlations(np.frombuffer(entries).reshape(size, size))
     eigenvalues, vectors = np.linalg.eigh(scaled)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     lower = np.linalg.qr(root.T).R.T

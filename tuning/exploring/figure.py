@@ -26,10 +26,10 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
         panels.append(partial(_state, view=view, run=run, place=place, named=named))
     for place, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
         panels.append(partial(_innovation, view=view, run=run, place=place, named=named))
-    panels.append(lambda ax: _level(ax, view.time, view.nis, view.nis_band, "NIS"))
+    panels.append(lambda ax: _level(ax, view.time[run], view.nis, view.nis_band, "NIS"))
     if view.nees is not None and view.nees_band is not None:
         nees, band = view.nees, view.nees_band
-        panels.append(lambda ax: _level(ax, view.time, nees, band, "NEES"))
+        panels.append(lambda ax: _level(ax, view.time[run], nees, band, "NEES"))
     panels.append(lambda ax: _lags(ax, view))
     rows = -(-len(panels) // 2)
     figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
@@ -50,17 +50,17 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
 
 def _state(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
     mean, half = view.estimate[run, :, place], WITHIN_95 * view.deviation[run, :, place]
-    ax.fill_between(view.time, mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.fill_between(view.time[run], mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
     if view.truth is not None:
-        ax.plot(view.time, view.truth[run, :, place], color=INK, linewidth=0.8)
-    ax.plot(view.time, mean, color=ESTIMATE, linewidth=1.0)
+        ax.plot(view.time[run], view.truth[run, :, place], color=INK, linewidth=0.8)
+    ax.plot(view.time[run], mean, color=ESTIMATE, linewidth=1.0)
     ax.set_ylabel(_labelled(named))
 
 
 def _innovation(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
     half = WITHIN_95 * view.innovation_deviation[run, :, place]
-    ax.fill_between(view.time, -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
-    ax.plot(view.time, view.innovation[run, :, place], color=ESTIMATE, linewidth=0.7)
+    ax.fill_between(view.time[run], -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.plot(*present(view.time[run], view.innovation[run, :, place]), color=ESTIMATE, linewidth=0.7)
     ax.set_ylabel(f"innovation {_labelled(named)}")
 
 
@@ -68,7 +68,7 @@ def _level(
     ax: Axes, time: np.ndarray, values: np.ndarray, band: tuple[np.ndarray, np.ndarray], label: str
 ) -> None:
     ax.fill_between(time, *band, color=ESTIMATE, alpha=0.2, linewidth=0)
-    ax.semilogy(time, mean_of_runs(values), color=ESTIMATE, linewidth=0.7)
+    ax.semilogy(*present(time, mean_of_runs(values)), color=ESTIMATE, linewidth=0.7)
     ax.set_ylabel(label)
 
 
@@ -83,6 +83,12 @@ def _lags(ax: Axes, view: View) -> None:
 
 def _labelled(named: Quantity) -> str:
     return f"{named.name} [{named.unit}]" if named.unit else named.name
+
+
+def present(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values where there is one: between two others that are missing, a line would show none."""
+    there = ~np.isnan(values)
+    return time[there], values[there]
 
 
 def mean_of_runs(values: np.ndarray) -> np.ndarray:

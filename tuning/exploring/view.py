@@ -36,7 +36,7 @@ class Figure(NamedTuple):
 class View(NamedTuple):
     """A filter on S runs of K rows: of a plant one a seed, of logs one a log; NaN where there is nothing."""
 
-    time: np.ndarray  # (K,), [s], or steps where there is no sample time
+    time: np.ndarray  # (S, K), [s], or steps where there is no sample time
     truth: np.ndarray | None  # (S, K, n), None where it is unknown
     estimate: np.ndarray  # (S, K, n)
     deviation: np.ndarray  # (S, K, n), standard deviations; half of the 95 % band is 1.96 of it
@@ -59,9 +59,8 @@ def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
     measured, n = ~np.isnan(data.seen.measurements), len(problem.quantities.states)
     white = _whiteness(estimates, data)
     truth = data.states is not None
-    dt = 1.0 if problem.dt is None else problem.dt
     return View(
-        time=dt * np.arange(data.steps + 1),
+        time=_times(filter_, data, 1.0 if problem.dt is None else problem.dt),
         truth=data.known_states if truth else None,
         estimate=_there(data, estimates.means[..., :n]),
         deviation=_there(data, _deviations(estimates.covs)[..., :n]),
@@ -75,6 +74,14 @@ def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
         autocorrelation_band=white[1],
         figures=_figures(filter_, shown, runs, problem),
     )
+
+
+def _times(filter_: Filter, data: Data, dt: float) -> np.ndarray:
+    """Times (S, K) of all rows; of logs on their own stamps the last input says how many dt a step is."""
+    runs, even = data.inputs.shape[0], dt * np.arange(data.steps + 1)
+    if not filter_.model.shape.step_ratio:
+        return np.broadcast_to(even, (runs, len(even)))
+    return dt * np.concatenate([np.zeros((runs, 1)), np.cumsum(data.inputs[..., -1], axis=1)], axis=1)
 
 
 def _figures(filter_: Filter, shown: Shown, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:

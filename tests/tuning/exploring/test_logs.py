@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 import tuning
+from tests.tuning.test_identify_stamps import DT, recorded, smooth, stamps_of
+from thruster_env.plants.logs.read import read_log
 from tuning.evaluation.evaluate import evaluate
 from tuning.exploring.bench import Bench
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
+from tuning.problems.log_problem import LogProblem
 
 
 def table(seed, steps, *, truth=False):
@@ -69,3 +72,13 @@ def test_a_log_with_truth_has_errors_and_log_scores():
 
 def test_a_log_has_no_disturbances(bench):
     assert not any(knob.group == "disturbances" for knob in bench.knobs)
+
+
+def test_logs_on_their_own_stamps_are_drawn_over_these(as_python):
+    stamps, model = [stamps_of(rows, rows) for rows in (130, 100)], smooth()
+    logs = [read_log(recorded(one, 3), model, grid=False, dt=DT, name=f"{len(one)}") for one in stamps]
+    view = Bench(LogProblem(logs, model)).view()
+    for run, one in enumerate(stamps):
+        measured = ~np.isnan(view.innovation[run, :, 0])
+        assert view.time[run, measured] == pytest.approx(one, abs=1e-9)
+        assert (np.diff(view.time[run]) >= 0).all()

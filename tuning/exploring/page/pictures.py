@@ -64,8 +64,9 @@ class Pictures:
     def show(self, view: View, look: Look) -> None:
         """Draw a view: one run's states, or the errors of all runs; what all runs say of consistency."""
         width, run, errors = look
-        at = places(len(view.time), width)
-        time, run = view.time[at], min(run, len(view.estimate) - 1)
+        at = places(view.time.shape[1], width)
+        run = min(run, len(view.estimate) - 1)
+        time = view.time[run, at]
         for place in self.chosen:
             band = band_of(view, place, run, at, errors)
             line, truth, runs = lines_of(view, place, run, at, errors)
@@ -96,8 +97,9 @@ class Pictures:
     def hold(self, slot: int, view: View, look: Look) -> None:
         """Draw a held configuration in its colour."""
         width, run, errors = look
-        at = places(len(view.time), width)
-        time, run = view.time[at], min(run, len(view.estimate) - 1)
+        at = places(view.time.shape[1], width)
+        run = min(run, len(view.estimate) - 1)
+        time = view.time[run, at]
         for place, one in enumerate(self.states):
             one.hold(slot, time, lines_of(view, place, run, at, errors)[0])
         for place, one in enumerate(self.innovations):

@@ -9,6 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
+from tuning.exploring.figure import present
 from tuning.exploring.page.colours import HELD
 from tuning.exploring.page.sent import Sent, as_sent
 from tuning.exploring.page.thinning import corners
@@ -90,9 +91,8 @@ class Signal:
         low, high = band
         self.columns = {"time": time, "low": low, "high": high, "line": line}
         self.columns["truth"] = line if truth is None else truth
-        at = corners(low, high) if len(time) else np.arange(0)
-        for what, names in (("band", ("low", "high")), ("lines", ("line", "truth"))):
-            some = at if what == "band" else slice(None)
+        parts = ("band", ("low", "high"), corners(low, high)), ("lines", ("line", "truth"), ~np.isnan(line))
+        for what, names, some in parts:
             self.sent.columns(f"{self.name} {what}", {one: self.columns[one][some] for one in ("time", *names)})
         self.runs = list(runs)
         _set_visible(self._truth, truth is not None)
@@ -103,7 +103,8 @@ class Signal:
 
     def hold(self, slot: int, time: np.ndarray, line: np.ndarray) -> None:
         """Draw a held configuration's line."""
-        self.held[slot].data = {"time": as_sent(time), "line": as_sent(line)}
+        at, values = present(time, line)
+        self.held[slot].data = {"time": as_sent(at), "line": as_sent(values)}
         _set_visible(self._others[slot], True)
 
     def drop(self, slot: int) -> None:

@@ -16,6 +16,7 @@ from bokeh.document import Document
 
 from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
+from tuning.exploring.figure import present
 from tuning.exploring.page.colours import DARK, HELD
 from tuning.exploring.page.document import page_of
 from tuning.exploring.page.sent import as_sent
@@ -94,7 +95,7 @@ def test_what_is_drawn_is_sent_in_one_array(tab):
     drawn = tab.ask("hello")["drawn"]
     sent, nis = tab.session.wire.numbers, tab.session.pictures.nis
     first, last = drawn["columns"]["nis lines"]["line"]
-    np.testing.assert_array_equal(sent[first:last], as_sent(nis.columns["line"]))
+    np.testing.assert_array_equal(sent[first:last], as_sent(present(nis.columns["time"], nis.columns["line"])[1]))
     band = [sent[slice(*drawn["columns"]["nis band"][name])] for name in ("time", "high")]
     there = np.isfinite(nis.columns["high"])
     np.testing.assert_allclose(np.interp(nis.columns["time"][there], *band), nis.columns["high"][there], rtol=1e-6)
