@@ -157,4 +157,6 @@ def _whiteness(estimates: Estimates, data: Data) -> tuple[np.ndarray, float]:
         present,
         min(LAGS, present.shape[1] - 1),
     )
-    return np.einsum("lii->il", found.correlations).copy(), float(found.half_widths.max())
+    widths = np.einsum("lii->il", found.half_widths)
+    told = widths[widths < 1.0]  # of slow sensors some lags have no pairs, and any correlation lies within theirs
+    return np.einsum("lii->il", found.correlations).copy(), float(told.max(initial=0.0)) or 1.0

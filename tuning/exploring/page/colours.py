@@ -41,7 +41,7 @@ def paint(picture: figure, colours: Colours) -> None:
             renderer.glyph.line_color = colour
         elif renderer.name == "band":
             renderer.glyph.fill_color = colours.band
-        elif renderer.name in ("here", "trials"):
+        elif renderer.name == "trials":
             renderer.glyph.line_color = colours.ink
     for box in picture.select(BoxAnnotation):
         box.fill_color = colours.band

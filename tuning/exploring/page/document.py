@@ -70,6 +70,7 @@ def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
             signals=signals(here),
             scenes=[(one.name, one.title) for one in SCENES.values()],
             scene=scene,
+            has_truth=here.has_truth,
         )
         Session(document, here, seeds, scene)
 

@@ -49,7 +49,9 @@ class MapPicture:
         draw.scatter(
             "x", "y", source=self.trials, size=7, fill_color="white", line_width=1.2, name="trials", **top
         )
-        draw.scatter("x", "y", source=here, size=18, marker="cross", line_width=3, name="here", **top)
+        cross = {"source": here, "marker": "cross", **top}  # light around dark: it is seen on all colours
+        draw.scatter("x", "y", size=20, line_color="white", line_width=6, **cross)
+        draw.scatter("x", "y", size=18, line_color="#1b1f24", line_width=2.5, **cross)
         self.bar = ColorBar(color_mapper=self.mapper, width=12, padding=4, background_fill_color=None)
         self.bar.major_label_text_font_size = "12px"
         draw.add_layout(self.bar, "right")

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 pytest.importorskip("bokeh")
@@ -98,6 +99,20 @@ def test_a_newcomer_halves_the_error_of_the_rule_of_thumb_by_dragging_r(page):
     assert after["score"] < 0.5 * before["score"]
     assert "better" in page.locator("#figures dd").nth(0).get_attribute("class")
     assert page.evaluate("performance.getEntriesByName('move to picture').length") > 0
+
+
+def test_pictures_show_the_numbers_of_what_is_set_and_stand_still(page):
+    was, place = seen(page), page.locator(R).bounding_box()
+    number = page.locator(f".knob:has({R}) input[type=text]")
+    number.fill("40")
+    number.press("Tab")
+    settled(page, was)
+    view = Bench(find_problem("outliers"), "ekf").view({"R": 40.0})
+    drawn = page.evaluate("Object.fromEntries(['time', 'line'].map(x => [x, [...model('state1 lines').data[x]]]))")
+    at = np.rint(np.array(drawn["time"]) / 0.01).astype(int)
+    assert len(at) > 200 and at[0] == 0 and at[-1] == 500
+    np.testing.assert_allclose(drawn["line"], view.estimate[0, at, 1], rtol=1e-6)
+    assert page.locator(R).bounding_box() == place  # though numbers became longer
 
 
 def test_keys_and_typed_numbers_set_a_value_and_a_wrong_one_is_said(page):
