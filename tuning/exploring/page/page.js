@@ -31,16 +31,17 @@ function send() {
   if (asked.question.do === "view") asked.question.values = {...values}
   wire.asked = JSON.stringify(asked.question)
 }
+const bytes_of = base64 => Uint8Array.fromBase64?.(base64) ?? Uint8Array.from(atob(base64), letter => letter.charCodeAt(0))
 const models = new Map()
 function model(name) {
   if (!models.has(name)) models.set(name, Bokeh.documents[0].get_model_by_name(name))
   return models.get(name)
 }
 // Numbers and axes of all pictures at once, so that one frame of the screen shows them; the server knows them.
-function draw({columns, axes}) {
+function draw({numbers, columns, axes}) {
   paint_without_styles()
-  const {buffer, byteOffset} = wire.numbers, silently = {sync: false, check_eq: false}
-  const part = at => Array.isArray(at[0]) ? at.map(part) : new Float32Array(buffer, byteOffset + 4 * at[0], at[1] - at[0])
+  const {buffer} = bytes_of(numbers), silently = {sync: false, check_eq: false}
+  const part = at => Array.isArray(at[0]) ? at.map(part) : new Float32Array(buffer, 4 * at[0], at[1] - at[0])
   for (const [name, own] of Object.entries(columns))
     model(name).setv({data: Object.fromEntries(Object.entries(own).map(([column, at]) => [column, part(at)]))}, silently)
   for (const [name, own] of Object.entries(axes))
@@ -229,7 +230,7 @@ function add_held({slot, colour, filter, figures}) {
   get("held").append(item)
 }
 function receive({name, type, text, base64}) {
-  const bytes = base64 ? Uint8Array.from(atob(base64), letter => letter.charCodeAt(0)) : text
+  const bytes = base64 ? bytes_of(base64) : text
   const link = make("a", {href: URL.createObjectURL(new Blob([bytes], {type})), download: name})
   link.click()
   setTimeout(() => URL.revokeObjectURL(link.href), 1e4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,8 +31,8 @@ class Sent:
         """The ends of a figure's axis, "x" or "y"."""
         self._axes.setdefault(figure, {})[axis] = start, end
 
-    def take(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """All that waits: one array of numbers, and which parts of it are whose; empty if nothing does."""
+    def take(self) -> dict[str, Any]:
+        """All that waits: float32 numbers in base 64, and which parts of them are whose; empty if nothing does."""
         numbers: list[np.ndarray] = []
         size = 0
 
@@ -47,13 +48,15 @@ class Sent:
             source: {name: part(column) for name, column in columns.items()}
             for source, columns in self._columns.items()
         }
-        where = {"columns": parts, "axes": self._axes} if parts or self._axes else {}
-        self._columns, self._axes = {}, {}
-        return np.concatenate(numbers) if numbers else np.empty(0, np.float32), where
+        axes, self._columns, self._axes = self._axes, {}, {}
+        if not (parts or axes):
+            return {}
+        sent = b"".join(one.tobytes() for one in numbers)
+        return {"numbers": base64.b64encode(sent).decode(), "columns": parts, "axes": axes}
 
 
 def as_sent(values: np.ndarray) -> np.ndarray:
     """Numbers in the half as many bytes that a screen needs; without infinite ones, which no axis has."""
     with np.errstate(over="ignore"):
         short = np.asarray(values, dtype=np.float32)
-    return np.where(np.isfinite(short), short, np.float32(np.nan))
+    return np.where(np.isfinite(short), short, np.float32(np.nan)).astype("<f4", copy=False)

@@ -11,7 +11,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from bokeh.core.properties import Any as AnyProperty
 from bokeh.core.properties import String
 from bokeh.document import Document
 from bokeh.model import DataModel
@@ -31,10 +30,9 @@ log = logging.getLogger(__name__)
 
 
 class Wire(DataModel):
-    """What the page and the server say to each other, as JSON, and the numbers that are drawn."""
+    """What the page and the server say to each other, as JSON."""
 
     asked = String(default="")
-    numbers = AnyProperty(default=None)  # float32, said before the text that says what they are
     told = String(default="")
 
 
@@ -79,10 +77,8 @@ class Session:
 
     def tell(self, message: Mapping[str, Any]) -> None:
         """Say something to the page, and what is to be drawn."""
-        numbers, drawn = self.sent.take()
-        if drawn:
-            self.wire.numbers = numbers
-            message = {**message, "drawn": drawn}
+        drawn = self.sent.take()
+        message = {**message, "drawn": drawn} if drawn else message
         self.wire.told = json.dumps(_plain(message), allow_nan=False)
 
     def do_hello(self, question: Mapping[str, Any]) -> dict[str, Any]:
