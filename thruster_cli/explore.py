@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import webbrowser
 from html import escape
@@ -112,6 +113,8 @@ def command(
         bench.view(bench.start, seeds)
     server = Server(page_of(bench, seeds), port=port)
     print(f"{bench.title}, until Ctrl-C or the last tab is closed:\n{server.url}", flush=True)
+    gc.collect()
+    gc.freeze()  # what is here stays: to look through it, once in 500 moves, took 0.14 s in mid-drag
     with tempfile.TemporaryDirectory(prefix="thruster-explore-") as folder:
         if browser:
             webbrowser.open(_forward(Path(folder), server.url).as_uri())
