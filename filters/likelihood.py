@@ -49,7 +49,7 @@ def likelihood(
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
         filter: one of `differentiated.differentiable.KINDS`, or your own, of which the type and its own parameters
             count: it is used with `model` in place of its own.
-        own_slopes: how the filter's own numbers (`own_parameters`, count of them) change, (parameters, count); not at
+        own_slopes: how `own_parameters` of the filter change, (parameters, count); not at
             all if None.
 
     Raises:

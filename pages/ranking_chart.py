@@ -34,6 +34,7 @@ STEPS = (
     Step("Could the state be in two places at once?", ("pf", "gsf"), "a mean and P cannot say that"),
     Step("Is it linear where a few states are known?", ("rbpf",), "particles for those few alone"),
     Step("Is it strongly curved within its uncertainty?", ("iekf", "ukf", "gsf"), "one tangent is not enough"),
+    Step("A poor first guess, or bounds on the past?", ("mhe",), "it estimates them again, too"),
     Step("Does the noise of the sensor change?", ("vb", "sage-husa"), "they estimate R as they run"),
     Step("More states than you can afford members?", ("letkf",), "localised by distance"),
     Step("Are there dozens of states, or no Jacobian?", ("etkf", "enkf-n"), "enkf-n needs no inflation"),

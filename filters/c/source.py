@@ -37,7 +37,7 @@ def c_filter(
     recursion, and needs math.h alone.
 
     Args:
-        filter_: a filter with a page, so no "gsf", "imm", "mmae" or "fuzzy".
+        filter_: a filter with a page, so no "gsf", "imm", "mmae", "mhe" or "fuzzy".
         name: of the type, and before all names; the filter's by default.
         single: floats in place of doubles.
         monitor: tests of the innovations, which run after each update.

@@ -74,7 +74,7 @@ def derivatives(
     """Scores and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
 
     Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked; and the filter
-    is used with the model in place of its own. Along a parameter its own numbers (`Filter.own_parameters`) may move
+    is used with the model in place of its own. Along a parameter its `own_parameters` may move
     by `own_slopes`, (p, their count). Of what is not wanted there is nothing: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions

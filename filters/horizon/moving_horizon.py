@@ -15,6 +15,13 @@ from filters.horizon.window import HUBER, LOSSES, kept_places
 from thruster_env.numerics.checks import at_least, one_of, positive
 
 MOST_STEPS, MOST_ITERATIONS = 200, 50
+KERNEL_HORIZONS = (
+    10,
+    20,
+    50,
+    100,
+    MOST_STEPS,
+)  # steps of the window that kernels are made for, so that studies compile few
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,10 +40,11 @@ class MovingHorizonFilter(Filter):
 
         quadratic  rho = r^2/2;  in a linear model without bounds the estimate is the Kalman filter's for any L
         huber      rho = r^2/2 up to the threshold k, from there on k r - k^2/2
-        student    rho = (k^2 + m)/2 log(1 + r^2/k^2), of Student's t with k^2 degrees of freedom
+        student    rho = (k^2 + d)/2 log(1 + r^2/k^2), of Student's t with k^2 degrees of freedom, for d channels
 
     The latter two divide R by a weight rho'(r)/r, which each pass computes anew. Bounds of states are the model's
-    `bounds`; its `bounded_by` has no meaning here. Components that are at a bound are found by an active set.
+    `bounds`; its `bounded_by` has no meaning here. Components that are at a bound are found by an active set. If
+    bounds of states and disturbances leave no room between them, the states keep theirs.
 
     The covariance is that of x_L by the last linearisation and weights, of a problem without bounds: it does not
     vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
@@ -78,16 +86,19 @@ class MovingHorizonFilter(Filter):
 
     @property
     def own_parameters(self) -> tuple[float, ...]:
-        """The threshold, and the limit of disturbances."""
-        return self.threshold, self.disturbance_limit
+        """The threshold, the limit of disturbances, the horizon, and the iterations."""
+        return self.threshold, self.disturbance_limit, float(self.horizon), float(self.iterations)
+
+    @property
+    def _kernel_horizon(self) -> int:
+        return next(one for one in KERNEL_HORIZONS if one >= self.horizon)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         return horizon_kernels(
             self.kernel_model.functions,
             self.kernel_model.shape,
-            horizon=self.horizon,
-            iterations=self.iterations,
+            room=self._kernel_horizon,
             loss=self.loss,
             bounds=self.model.bounds,
             limited=self.disturbance_limit < math.inf,
@@ -96,5 +107,5 @@ class MovingHorizonFilter(Filter):
     def window(self, belief: Belief) -> np.ndarray:
         """The states (at most L, n) of the window as they were last estimated, the oldest first."""
         places, n = kept_places(self.kernel_model.shape), self.model.n
-        steps = belief.extras[1 + n + n * n :].reshape(self.horizon + 1, places.end)
+        steps = belief.extras[1 + n + n * n :].reshape(self._kernel_horizon + 1, places.end)
         return steps[: int(belief.extras[0]), places.x : places.x + n].copy()

@@ -28,28 +28,31 @@ def horizon_kernels(
     functions: Functions,
     shape: Shape,
     *,
-    horizon: int,
-    iterations: int,
+    room: int,
     loss: str,
     bounds: tuple[Bound, ...],
     limited: bool,
 ) -> Kernels:
-    """Kernels for model functions and sizes; extras: the number of steps, arrival mean and P, the steps."""
+    """Kernels for model functions and sizes, with room for so many steps and one more.
+
+    Extras are the number of steps, arrival mean and P, and the steps.
+    """
     n, m, inputs = shape.n, shape.m, shape.inputs
     places, kept, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
     end, width, square = kept.end, at.end, n * n
     arrival = places.extras + 1
     steps = arrival + n + square
-    scratch = steps + (horizon + 1) * end
+    scratch = steps + (room + 1) * end
     mean, cov, number = places.mean, places.cov, places.extras
-    sigma_place, substeps = own_place(shape) + 1, number_places(n, m).substeps
+    sigma_place, horizon_place, iterations_place = (own_place(shape) + k for k in (1, 2, 3))
+    substeps = number_places(n, m).substeps
     works = window_works(functions, shape, loss)
     tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
     clip, hold_state, hold_disturbance, push_state, judge_state, judge_disturbance = limits(shape, bounds, limited)
     plain = page_kernels(ExtendedKalmanFilter.page, functions, shape)
     begin, predict_belief = plain.start, plain.predict
     has_bounds = bool(bounds) or limited
-    most = iterations + (MOST_PASSES if has_bounds else 0)
+    more = MOST_PASSES if has_bounds else 0
 
     @not_inlined
     def forwards(row, numbers, count, free):
@@ -166,14 +169,15 @@ def horizon_kernels(
             row[steps + (count - 1) * end + kept.u + i] = u[i]
         predict_belief(memory, u, numbers, size)
         begin_step(row, count)
-        if count == horizon:
+        if count == int(numbers[horizon_place]):
             leave_first(row, numbers, count + 1)
 
     @inlined
     def settle(row, numbers, count):
         """Pass over the window until all iterations are done and the right bounds hold, then once for P alone."""
         fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
-        for k in range(most + 1):
+        iterations = int(numbers[iterations_place])
+        for k in range(iterations + more + 1):
             cost = forwards(row, numbers, count, settled)
             for _ in range(HALVINGS):
                 if k == 0 or wrong > 0 or cost <= least + ROUNDING * (1.0 + abs(least)):
@@ -185,7 +189,7 @@ def horizon_kernels(
                 break
             wrong = backwards(row, numbers, count, patience < 0)
             fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
-            settled = k + 1 == most or (k + 1 >= iterations and wrong == 0)
+            settled = k + 1 == iterations + more or (k + 1 >= iterations and wrong == 0)
 
     @inlined
     def update(memory, z, numbers, size):
@@ -205,5 +209,5 @@ def horizon_kernels(
     return Kernels(
         *(n, m, n, 0, start, predict, update, nothing_to_summarise),
         extras=scratch - number,
-        scratch=(horizon + 1) * width,
+        scratch=(room + 1) * width,
     )

@@ -51,7 +51,9 @@ from thruster_env.plants.layout import starts_of
 from thruster_env.plants.shape import Functions, Shape
 
 HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
-OWN = ("threshold", ()), ("disturbance_limit", ())  # numbers of the filter that programs read
+OWN = tuple(
+    (name, ()) for name in ("threshold", "disturbance_limit", "horizon", "iterations")
+)  # the filter's numbers
 
 
 class Kept(NamedTuple):

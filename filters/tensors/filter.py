@@ -70,7 +70,7 @@ class TensorFilter:
         """Make the filter for tensors.
 
         Args:
-            filter_: a filter with a page, so no "gsf", "imm", "mmae" or "fuzzy".
+            filter_: a filter with a page, so no "gsf", "imm", "mmae", "mhe" or "fuzzy".
             transition: f(x, u, c) in place of the model's, a function of tuples of tensors (...,) that returns one
                 for each state; it may contain a network. x, u and c are those of `StateSpaceModel`.
             observe: h(x, c) in place of the model's.

@@ -53,12 +53,11 @@ def test_of_a_linear_model_it_is_the_kalman_filter_at_any_horizon(changes):
 
 
 def stepped(filter_, inputs, measurements):
-    """The belief after all measurements, and after each prediction and update before."""
-    beliefs = [filter_.update(filter_.init(), measurements[0])[0]]
+    """The belief after all measurements."""
+    belief, _ = filter_.update(filter_.init(), measurements[0])
     for u, z in zip(inputs, measurements[1:], strict=True):
-        beliefs.append(filter_.predict(beliefs[-1], u))
-        beliefs.append(filter_.update(beliefs[-1], z)[0])
-    return beliefs
+        belief, _ = filter_.update(filter_.predict(belief, u), z)
+    return belief
 
 
 def test_its_window_is_the_smoother_s_and_its_last_state_the_filter_s():
@@ -67,7 +66,7 @@ def test_its_window_is_the_smoother_s_and_its_last_state_the_filter_s():
     smoothed = smooth(make_filter("ekf", model), KEYS, inputs, measurements).means[0]
     for horizon in (4, 20):
         filter_ = MovingHorizonFilter(model=model, horizon=horizon, loss="quadratic")
-        window = filter_.window(stepped(filter_, inputs[0], measurements[0])[-1])
+        window = filter_.window(stepped(filter_, inputs[0], measurements[0]))
         assert len(window) == min(horizon, 13)
         np.testing.assert_allclose(window, smoothed[-horizon:], **CLOSE)
 
@@ -147,16 +146,8 @@ def least(start, *arguments, bounds=None, limit=None):
         return (limit - side * disturbances(x.reshape(-1, 2), inputs) / deviation).ravel()
 
     held = [{"type": "ineq", "fun": room, "args": (side,)} for side in rooms]
-    found = minimize(
-        cost,
-        start.ravel(),
-        arguments,
-        method="SLSQP",
-        bounds=bounds,
-        constraints=held,
-        options={"maxiter": 500, "ftol": 1e-15},
-    )
-    return found.x.reshape(-1, 2)
+    options = {"bounds": bounds, "constraints": held, "options": {"maxiter": 500, "ftol": 1e-15}}
+    return minimize(cost, start.ravel(), arguments, method="SLSQP", **options).x.reshape(-1, 2)
 
 
 @pytest.mark.parametrize(("loss", "limit"), [("quadratic", 0.7), ("huber", 0.5), ("student", 0.5)])
@@ -171,7 +162,7 @@ def test_its_window_is_where_the_cost_is_least_within_the_bounds(loss, limit, bo
         threshold=K,
         disturbance_limit=limit if bounded else math.inf,
     )
-    window = filter_.window(stepped(filter_, inputs, measurements)[-1])
+    window = filter_.window(stepped(filter_, inputs, measurements))
     start = window + 0.01 * np.sin(np.arange(window.size)).reshape(window.shape)
     sides = [BOUNDS[i % 2] for i in range(window.size)] if bounded else None
     expected = least(start, inputs, measurements, loss, bounds=sides, limit=limit if bounded else None)
@@ -186,7 +177,7 @@ def test_its_window_is_where_the_cost_is_least_within_the_bounds(loss, limit, bo
 def test_behind_its_arrival_cost_the_window_is_the_least_as_well(loss):
     inputs, measurements = curved_data()
     filter_ = MovingHorizonFilter(model=curved_model(), horizon=3, iterations=30, loss=loss, threshold=K)
-    belief = stepped(filter_, inputs, measurements[:])[-1]
+    belief = stepped(filter_, inputs, measurements)
     arrival = belief.extras[1:3], belief.extras[3:7].reshape(2, 2)
     window = filter_.window(belief)
     expected = least(window + 0.01, inputs[-2:], measurements[-3:], loss, arrival)
@@ -203,7 +194,7 @@ def slopes(function, x, *others):
 def test_the_arrival_cost_is_the_extended_filter_s_along_the_estimate():
     inputs, measurements = curved_data()
     filter_ = MovingHorizonFilter(model=curved_model(), horizon=3, iterations=30, loss="quadratic")
-    belief = stepped(filter_, inputs[:2], measurements[:3])[-1]
+    belief = stepped(filter_, inputs[:2], measurements[:3])
     x, z = filter_.window(belief)[0], measurements[0]
     H, F = slopes(observe, x, ()), slopes(transition, x, inputs[0], ())
     P = np.linalg.inv(np.linalg.inv(PRIOR_COV) + H.T @ np.linalg.inv(R) @ H)
@@ -218,7 +209,7 @@ def test_the_covariance_is_the_last_block_of_the_inverse_hessian_without_bounds(
     inputs, measurements = curved_data()
     model = curved_model(bounds=BOUNDS if bounded else {})
     filter_ = MovingHorizonFilter(model=model, horizon=10, iterations=30, loss="huber", threshold=K)
-    belief = stepped(filter_, inputs, measurements)[-1]
+    belief = stepped(filter_, inputs, measurements)
     window = filter_.window(belief)
     count = len(window)
     hessian = np.zeros((2 * count, 2 * count))
@@ -245,10 +236,8 @@ def test_of_functions_that_cannot_be_traced_it_is_the_same(loss):
 
     inputs, measurements = curved_data()
     data = KEYS, inputs[None], measurements[None]
-    found, expected = (
-        run(MovingHorizonFilter(model=model, horizon=3, loss=loss), *data)
-        for model in (curved_model().replace(transition=decides), curved_model())
-    )
+    models = curved_model().replace(transition=decides), curved_model()
+    found, expected = (run(MovingHorizonFilter(model=one, horizon=3, loss=loss), *data) for one in models)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
 

@@ -114,6 +114,11 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert upper(table("network_mismatch")["gru 32"][1]) < 0.3
     rows = table("network_outliers")
     assert upper(rows["ekf, tuned"][1]) < float(rows["gru 32"][1].split(" ± ")[0]) < 1
+    batches = table("batch_reactor")
+    assert float(batches["mhe, L = 30"][0]) < 0.1 * min(
+        float(one[0]) for name, one in batches.items() if "kf" in name
+    )
+    assert batches["mhe, L = 30"][2:] == ["0", "0 of 200"] and float(batches["ekf"][2]) < 0
 
 
 def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):

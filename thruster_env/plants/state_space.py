@@ -68,7 +68,8 @@ class StateSpaceModel:
         state_low: smallest value of each state in normal operation, (n,); None if unknown.
         state_high: largest value of each state, (n,); None if unknown.
         bounds: (low, high) of states by symbol or index, None for no bound: {"c": (0.0, None)}. Estimates of the
-            Kalman filters of one mean and covariance keep them; the belief beneath knows of none.
+            Kalman filters of one mean and covariance keep them; the belief beneath knows of none. `mhe` keeps
+            them in all states of its window.
         bounded_by: how: "truncation", the moments of the Gaussian within the bounds, or "projection", the most
             probable state within (`filters.engine.bounded`).
         states: a `Quantity` or a name for each state; x_1, x_2, ... if None.

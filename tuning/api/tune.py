@@ -87,7 +87,7 @@ def tune(
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: Optuna's sampler: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for Kalman filters except kf-steady, gsf, imm, mmae, fuzzy: maximum
+        method: "optuna"; or "gradient", for Kalman filters except kf-steady, gsf, imm, mmae, mhe, fuzzy: maximum
             likelihood, or the best "score", "mse" or "log-score" if that is the objective.
         way: another way of tuning instead of a study, such as "em", as `thruster ways` lists them: a sampler ends
             after `trials` trials, the others by their own criterion.

@@ -83,7 +83,7 @@ def tune_by_gradient(
     (`optimum` keeps it near the likeliest one).
 
     Args:
-        filter_name: a Kalman filter but "kf-steady", "gsf", "imm", "mmae" and "fuzzy".
+        filter_name: a Kalman filter but "kf-steady", "gsf", "imm", "mmae", "mhe" and "fuzzy".
         problems: make the assumed models, and have the untuned parameters; ranges are those of the first.
         data: the training runs of each problem.
         starts: factors on the untuned parameters, one for all or one each; `starts_of` if None.
