@@ -35,8 +35,8 @@ class Limits(NamedTuple):
     hold_state: Callable  # hold_state(rows, given)
     hold_disturbance: Callable  # hold_disturbance(rows, given, sigma)
     push_state: Callable  # push_state(rows, given, wrong, single), of l after the update; how many are wrong
-    judge_state: Callable  # judge_state(rows, given, wrong, single), of the estimate
-    judge_disturbance: Callable  # judge_disturbance(rows, given, sigma, wrong, single), of the estimate
+    update_state_set: Callable  # update_state_set(rows, given, wrong, single), of the estimate
+    update_disturbance_set: Callable  # update_disturbance_set(rows, given, sigma, wrong, single), of the estimate
 
 
 @inlined
@@ -68,7 +68,7 @@ def force(rows, adjoint, n, at):
 
 
 @inlined
-def judged(given, place, side, wrong, single):
+def set_changed(given, place, side, wrong, single):
     """Let another bound hold, unless bounds change one by one and one has; returns how many were wrong."""
     if given[place] == side:
         return wrong
@@ -131,17 +131,17 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                 push = force(rows, at.after, n, holds + i * size)
                 rows[at.after + i] += push
                 if s > 0.0 and side * push * s**0.5 > ENOUGH:
-                    wrong = judged(given, held + i, 0.0, wrong, single)
+                    wrong = set_changed(given, held + i, 0.0, wrong, single)
         return wrong
 
     @inlined
-    def judge_state(rows, given, wrong, single):
+    def update_state_set(rows, given, wrong, single):
         if bounded:
             for i in range(n):
                 if given[held_states + i] == 0.0:
                     spread = rows[at.cov + i * n + i] ** 0.5
                     side = side_of(rows[at.found + i], lows[i], highs[i], spread)
-                    wrong = judged(given, held_states + i, side, wrong, single)
+                    wrong = set_changed(given, held_states + i, side, wrong, single)
         return wrong
 
     @inlined
@@ -149,7 +149,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
         return pushed(rows, given, of_states, held_states, wrong, single) if bounded else wrong
 
     @inlined
-    def judge_disturbance(rows, given, sigma, wrong, single):
+    def update_disturbance_set(rows, given, sigma, wrong, single):
         for i in range(n):
             rows[at.after + i] = rows[at.end + at.before + i]
         wrong = pushed(rows, given, of_disturbances, held_disturbances, wrong, single)
@@ -157,7 +157,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
             if given[held_disturbances + i] == 0.0:
                 spread = rows[at.spread + i]
                 side = side_of(rows[at.disturbance + i], -sigma * spread, sigma * spread, spread)
-                wrong = judged(given, held_disturbances + i, side, wrong, single)
+                wrong = set_changed(given, held_disturbances + i, side, wrong, single)
         return wrong
 
-    return Limits(clip, hold_state, hold_disturbance, push_state, judge_state, judge_disturbance)
+    return Limits(clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set)

@@ -48,7 +48,9 @@ def horizon_kernels(
     substeps = number_places(n, m).substeps
     works = window_works(functions, shape, loss)
     tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
-    clip, hold_state, hold_disturbance, push_state, judge_state, judge_disturbance = limits(shape, bounds, limited)
+    clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set = limits(
+        shape, bounds, limited
+    )
     plain = page_kernels(ExtendedKalmanFilter.page, functions, shape)
     begin, predict_belief = plain.start, plain.predict
     has_bounds = bool(bounds) or limited
@@ -93,14 +95,14 @@ def horizon_kernels(
             if j < count - 1:
                 if limited:
                     find(rows, given, numbers)
-                    wrong = judge_disturbance(rows, given, numbers[sigma_place], wrong, single)
+                    wrong = update_disturbance_set(rows, given, numbers[sigma_place], wrong, single)
                 descend(rows, given, numbers)
             else:
                 for i in range(n):
                     rows[at.after + i] = 0.0
             wrong = push_state(rows, given, wrong, single)
             estimate(rows, given, numbers)
-            wrong = judge_state(rows, given, wrong, single)
+            wrong = update_state_set(rows, given, wrong, single)
             for i in range(n):
                 given[kept.x + i] = rows[at.found + i]
                 given[kept.adjoint + i] = rows[at.before + i]

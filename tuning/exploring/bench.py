@@ -15,7 +15,7 @@ from tuning.exploring.disturbed import disturbed
 from tuning.exploring.exported import command_of, file_of, lines_of
 from tuning.exploring.knobs import Knob, checked_values, knobs_of, marks_of, start_of
 from tuning.exploring.maps import Map, map_of
-from tuning.exploring.shown import Shown, shown_data
+from tuning.exploring.page_data import PageData, page_data
 from tuning.exploring.trials import Trial, trials_of
 from tuning.exploring.view import View, view_of
 from tuning.problems.parameter import Parameter
@@ -137,7 +137,7 @@ class Bench:
         """
         checked = self.checked(values or {})
         problem = self._problem(checked)
-        return view_of(self._filter(checked), self._shown(problem, seeds), problem)
+        return view_of(self._filter(checked), self._page_data(problem, seeds), problem)
 
     def map(self, values: Mapping[str, float], x: str, y: str, size: int = 32, seeds: int = 8) -> Map:
         """Score and NIS over two knobs, size x size runs of all seeds.
@@ -160,7 +160,7 @@ class Bench:
 
         def case(of_x: float, of_y: float):
             at = {**checked, x: of_x, y: of_y}
-            return self._filter(at), self._shown(self._problem(at), seeds).counted
+            return self._filter(at), self._page_data(self._problem(at), seeds).counted
 
         return map_of(known[x], known[y], size, case, self.problem.scale)
 
@@ -213,5 +213,5 @@ class Bench:
     def _problem(self, checked: Mapping[str, float]) -> Problem:
         return disturbed(self.problem, checked)
 
-    def _shown(self, problem: Problem, seeds: int) -> Shown:
-        return shown_data(problem, at_least("seeds", seeds, 1, MOST_SEEDS), self.seed, self.held_out)
+    def _page_data(self, problem: Problem, seeds: int) -> PageData:
+        return page_data(problem, at_least("seeds", seeds, 1, MOST_SEEDS), self.seed, self.held_out)

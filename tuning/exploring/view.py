@@ -16,7 +16,7 @@ from filters.engine.batch import Estimates
 from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
-from tuning.exploring.shown import Shown
+from tuning.exploring.page_data import PageData
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_on
 from tuning.problems.problem import Problem, score_label
@@ -51,9 +51,9 @@ class View(NamedTuple):
     figures: Mapping[str, Figure]
 
 
-def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
+def view_of(filter_: Filter, page_data: PageData, problem: Problem) -> View:
     """A filter on the data of a bench."""
-    data = shown.drawn
+    data = page_data.drawn
     estimates = estimates_on(filter_, data)
     runs = metrics_by_run(filter_, estimates, data, outputs=False, scale=problem.scale)
     measured, n = ~np.isnan(data.seen.measurements), len(problem.quantities.states)
@@ -72,7 +72,7 @@ def view_of(filter_: Filter, shown: Shown, problem: Problem) -> View:
         nis_band=_band(np.where(data.scored, measured.sum(axis=-1), 0).astype(np.float64)),
         autocorrelation=white[0],
         autocorrelation_band=white[1],
-        figures=_figures(filter_, shown, runs, problem),
+        figures=_figures(filter_, page_data, runs, problem),
     )
 
 
@@ -84,13 +84,13 @@ def _times(filter_: Filter, data: Data, dt: float) -> np.ndarray:
     return dt * np.concatenate([np.zeros((runs, 1)), np.cumsum(data.inputs[..., -1], axis=1)], axis=1)
 
 
-def _figures(filter_: Filter, shown: Shown, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:
+def _figures(filter_: Filter, page_data: PageData, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:
     """The figures of a bench: those of `tuning.evaluation`, without intervals."""
-    data, scale = shown.counted, problem.scale
-    found = _summed(filter_, data, scale, runs if data is shown.drawn else None)
+    data, scale = page_data.counted, problem.scale
+    found = _summed(filter_, data, scale, runs if data is page_data.drawn else None)
     figures = {**_of_states(found, problem), **_of_innovations(found)}
-    if shown.held_out is not None:
-        held = _summed(filter_, shown.held_out, scale)
+    if page_data.held_out is not None:
+        held = _summed(filter_, page_data.held_out, scale)
         told = {**_of_states(held, problem), **_of_innovations(held)}
         figures |= {f"held-out {name}": one for name, one in told.items() if name != "restarts"}
     return figures

@@ -201,7 +201,7 @@ function hide_pictures() {
 }
 function tell_shown() {
   hide_pictures()
-  ask("shown", {states: states_shown(), run: +get("seed").value, errors: get("errors")?.checked ?? false})
+  ask("plotted", {states: states_shown(), run: +get("seed").value, errors: get("errors")?.checked ?? false})
 }
 function show_figures(figures) {
   const names = Object.keys(figures), rows = get("figures").children

@@ -127,7 +127,7 @@ class Session:
         self._look()
         return {"spec": self._spec(), **self._numbers()}
 
-    def do_shown(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def do_plotted(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """Which states are drawn, of which run, and whether as errors."""
         self.pictures.choose([int(place) for place in question["states"]])
         self.run, self.errors = max(0, int(question["run"])), bool(question["errors"])
@@ -144,7 +144,7 @@ class Session:
             raise ValueError(f"a map must have two of {', '.join(known)}, but got {x} and {y}")
         self.what = "nis" if question.get("what") == "nis" else "score"
         bench, values = self.bench, dict(self.values)
-        self._beside(lambda: bench.map(values, x, y), self._mapped)
+        self._in_background(lambda: bench.map(values, x, y), self._mapped)
 
     def do_study(self, question: Mapping[str, Any]) -> None:
         """Run a study from here; its trials appear as they end."""
@@ -162,7 +162,7 @@ class Session:
                 if stopped.is_set():
                     return
 
-        self._beside(work, lambda _: self.tell({"study": {"done": True}}))
+        self._in_background(work, lambda _: self.tell({"study": {"done": True}}))
 
     def do_stop(self, _: Mapping[str, Any]) -> None:
         """End the study after the trial that runs."""
@@ -188,7 +188,7 @@ class Session:
         """What is seen, as a file or text; a tuned file is evaluated first, which takes seconds."""
         assert self.view is not None
         seen = self.bench, dict(self.values), self.view, self.run, str(question["kind"])
-        self._beside(lambda: exported(*seen), lambda file: self.tell({"file": file._asdict()}))
+        self._in_background(lambda: exported(*seen), lambda file: self.tell({"file": file._asdict()}))
 
     def _seen(self, question: Mapping[str, Any]) -> None:
         width, least, most = float(question.get("width", self.width)), *WIDTHS
@@ -256,7 +256,7 @@ class Session:
         best = min(self.trials, key=lambda one: one.score if math.isfinite(one.score) else math.inf)
         self.tell({"study": {"done": False, "trial": len(self.trials), "trials": trials, "best": best._asdict()}})
 
-    def _beside(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
+    def _in_background(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
         """Do work in a thread, then go on with its result in the document's; an error is told."""
 
         def run() -> None:

@@ -108,7 +108,7 @@ def test_what_is_drawn_is_sent_in_one_array(tab):
 
 def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
     tab.ask("hello")
-    tab.ask("shown", states=[0], run=1, errors=True)
+    tab.ask("plotted", states=[0], run=1, errors=True)
     view = tab.session.view
     signal = tab.session.pictures.states[0]
     np.testing.assert_allclose(signal.columns["line"], view.estimate[1, :, 0] - view.truth[1, :, 0], rtol=1e-4)
@@ -138,7 +138,7 @@ def test_what_is_no_value_is_said_and_nothing_changes(tab, bench, value):
         {"do": "study", "trials": "many"},
         {"do": "drop", "slot": 7},
         {"do": "export"},
-        {"do": "shown", "states": ["a"], "run": 0, "errors": False},
+        {"do": "plotted", "states": ["a"], "run": 0, "errors": False},
         {"do": "view", "values": {"os": 1}},
         {},
     ],

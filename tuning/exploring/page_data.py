@@ -14,7 +14,7 @@ from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 
 
-class Shown(NamedTuple):
+class PageData(NamedTuple):
     """What is drawn, and what is counted: the same runs, unless they are logs."""
 
     drawn: Data  # of a plant the runs of some seeds; of logs each log as a whole
@@ -23,7 +23,7 @@ class Shown(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def shown_data(problem: Problem, seeds: int, seed: int, held_out: bool) -> Shown:
+def page_data(problem: Problem, seeds: int, seed: int, held_out: bool) -> PageData:
     """The data of a problem for a bench.
 
     Args:
@@ -34,10 +34,10 @@ def shown_data(problem: Problem, seeds: int, seed: int, held_out: bool) -> Shown
     """
     if isinstance(problem, LogProblem):
         blocks = [data_of(problem, some(seed, seeds)) for some in (problem.training_seeds, problem.held_out_seeds)]
-        return Shown(_whole(problem), *blocks)
+        return PageData(_whole(problem), *blocks)
     some = problem.held_out_seeds if held_out else problem.training_seeds
     data = data_of(problem, some(seed, seeds))
-    return Shown(data, data, None)
+    return PageData(data, data, None)
 
 
 def _whole(problem: LogProblem) -> Data:

@@ -1,0 +1,40 @@
+"""Names are the field's words: no definition has a word of the list in CONTRIBUTING.md."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("thruster_env", "auv_env", "filters", "tuning", "thruster_cli", "pages", "benchmarks", "examples")
+
+
+def words_to_avoid():
+    """The first column of the list, each word between underscores."""
+    listed = (ROOT / "CONTRIBUTING.md").read_text().partition("| no name has |")[2].partition("\n\n")[0]
+    rows = [line.split("|")[1] for line in listed.splitlines()[2:]]
+    return [f"_{word.strip()}_" for row in rows for word in row.split(",")]
+
+
+def defined_in(path):
+    """Names that a file defines: its own, functions, parameters, classes, fields."""
+    yield path.stem
+    for one in ast.walk(ast.parse(path.read_text())):
+        if isinstance(one, ast.FunctionDef | ast.ClassDef):
+            yield one.name
+        if isinstance(one, ast.arg):
+            yield one.arg
+        if isinstance(one, ast.ClassDef):
+            yield from (line.target.id for line in one.body if isinstance(line, ast.AnnAssign))
+
+
+def as_words(name):
+    return "_" + re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().strip("_") + "_"
+
+
+def test_no_definition_has_a_word_of_the_list():
+    avoided = words_to_avoid()
+    assert len(avoided) > 10 and as_words("MyTwin") == "_my_twin_"
+    paths = (path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    found = {(path.relative_to(ROOT).as_posix(), name) for path in paths for name in defined_in(path)}
+    found = [one for one in sorted(found) if any(word in as_words(one[1]) for word in avoided)]
+    assert not found, found
