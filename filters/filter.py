@@ -112,6 +112,10 @@ class Filter:
         self._put_back(session)
         return found
 
+    def sample(self, belief: Belief) -> np.ndarray:
+        """Members that stand for a belief, (n, N); where they have weights, a row behind holds the logarithms."""
+        return belief.members[: self.kernel_model.n + 1]
+
     def _borrowed(self) -> Session:
         """A session as if it were new, whose memory nobody else uses: to make one takes longer than a step.
 

@@ -21,7 +21,7 @@ from thruster_cli.options import INPUT, JsonOption, spelt
 from thruster_cli.output import console, emit, table
 from thruster_cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
-from tuning.search.space import KALMAN_SIZES, PARTICLE_SIZES, has_ensemble
+from tuning.search.space import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES, has_ensemble
 
 MADE = EnsembleKalmanFilter.ensemble_size  # by default
 ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
@@ -102,8 +102,8 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
         table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
         "cov.: it has a covariance, the uncertainty of the estimate. ens.: it has an ensemble.",
         f"ensemble_size: {MADE} members in make_filter and estimate, {KALMAN_SIZES.untuned} in the rule of thumb, "
-        f"from which tune, evaluate and compare start (particles: {PARTICLE_SIZES.untuned} in both); a tuned file "
-        "has its own.",
+        f"from which tune, evaluate and compare start (particles: {PARTICLE_SIZES.untuned} in both, "
+        f"{GAUSSIANS.untuned} of rbpf); a tuned file has its own.",
         "thruster filters NAME shows one in full, with its equations and sources.",
     ]
 

@@ -193,9 +193,10 @@ class ParticleFilter(ResampledFilter):
     `Belief.extras` holds the ESS, and then whether there is noise.
 
     Attributes:
-        proposal: "prior" or "optimal".
-        resampling: "systematic" or "gaussian".
-        smoothed: indices of constants; -1 is the last. They need a regularisation, of some 1.
+        proposal: "prior", or "optimal" to draw particles again where z is.
+        resampling: "systematic", or "gaussian" to draw particles from N(mean, cov) instead.
+        smoothed: indices of states that are constants, which the kernel alone spreads; -1 is the last. They need a
+            regularisation, of some 1.
 
     The other attributes are those of `ResampledFilter`, c its regularisation.
 

@@ -26,9 +26,17 @@ from filters.particles.weights import (
 from thruster_env.numerics import matrices
 from thruster_env.numerics.angles import row_aligner
 from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, uniform_block
+from thruster_env.numerics.streams import (
+    FILTER_MEASUREMENT,
+    FILTER_PRIOR,
+    FILTER_PROCESS,
+    FILTER_PROPOSAL,
+    GROUP,
+    fill_normals,
+    uniform_block,
+)
 from thruster_env.numerics.tuples import matrix_reader, zeros_of
-from thruster_env.plants.layout import number_places
+from thruster_env.plants.layout import number_places, padded
 from thruster_env.plants.shape import Functions, Shape, innovation_of
 
 
@@ -156,9 +164,9 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
                  cov = sum of w_j P_j + sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
     The Kalman filters are exact where, with the sampled states given, f and h are affine in the others, whatever
-    Q: what the others tell of the step of the sampled ones, and that step of the others, is in the joint P_j.
-    There fewer states are sampled than by `pf`, and a particle stands for a whole Gaussian. Elsewhere each
-    particle linearises by itself. If all states are sampled, this is `pf`.
+    Q: the joint P_j holds what the step of the sampled states tells of the others. There particles have to cover
+    few states, and it takes fewer of them than `pf` does. Elsewhere each particle linearises by itself. If all
+    states are sampled, this is `pf`.
 
     The log-likelihood is log L; innovation and S are those of the mixture before the measurement. `Belief.members`
     is (n + 1 + n^2, N): x_j, log weight, and P_j by rows, of which those on and below the diagonal are used.
@@ -193,6 +201,16 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
         return rao_blackwell_kernels(model.functions, model.shape, self.sampled)
+
+    def sample(self, belief: Belief) -> np.ndarray:
+        """A state (n, N) drawn from each particle's N(x_j, P_j), and the row of log weights."""
+        n, size = self.model.n, self.ensemble_size
+        values, vectors = np.linalg.eigh(self.particle_covariances(belief))
+        draws = np.zeros(padded(n * size, GROUP))
+        fill_normals(draws, n * size, belief.step, FILTER_PROPOSAL, *belief.key)
+        e = np.sqrt(np.maximum(values, 0.0)) * draws[: n * size].reshape(size, n)
+        drawn = belief.members[:n] + np.einsum("jab,jb->aj", vectors, e)
+        return np.concatenate([drawn, belief.members[n : n + 1]])
 
     def particle_covariances(self, belief: Belief) -> np.ndarray:
         """The covariances P_j (N, n, n) of the particles of a belief."""

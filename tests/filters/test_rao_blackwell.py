@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from filters import RaoBlackwellisedParticleFilter, StateSpaceModel, affine_model, make_filter, run
 from tests.models import KEY, line_model, plane_model, simulated
-from tests.oracles import normals
+from tests.oracles import assert_normal, normals
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import (
     FILTER_MEASUREMENT,
@@ -167,6 +167,17 @@ def test_it_is_the_kalman_filter_where_nothing_uncertain_is_sampled():
     exact = run(make_filter("kf", model), [KEY], inputs, z)
     for name in ("means", "covs", "innovations", "innovation_covs", "log_likelihoods"):
         np.testing.assert_allclose(getattr(found, name), getattr(exact, name), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_sample_of_the_particles_gaussians_has_the_moments_of_the_belief():
+    filter_ = RaoBlackwellisedParticleFilter(model=mixed_model(), ensemble_size=4000)
+    belief = filter_.predict(filter_.init(KEY), [0.1])  # all weigh the same
+    members = filter_.sample(belief)
+    np.testing.assert_array_equal(members[0], belief.members[0])  # which is sampled already
+    assert_normal(members[1:3], belief.cov[1:, 1:], belief.mean[1:])
+    cross = np.cov(members[:3])[0, 1:] - belief.cov[0, 1:]
+    assert (np.abs(cross) < 4 * np.sqrt(belief.cov[0, 0] * np.diag(belief.cov)[1:] / 4000)).all()
 
 
 @pytest.mark.usefixtures("as_python")

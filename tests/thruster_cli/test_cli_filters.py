@@ -35,7 +35,7 @@ def test_the_list_names_every_filter_and_number_and_fits_the_terminal(thruster, 
     for name in FILTERS:
         assert name in first_words
         assert set(tunable_numbers(name)) <= set(first_words)
-    assert out.split().count("ensemble_size") == 2  # of members and of particles: shared lines are told once
+    assert out.split().count("ensemble_size") == 3  # of members, particles, and few: shared lines are told once
 
 
 @pytest.mark.parametrize("name", FILTERS)
