@@ -67,7 +67,13 @@ def ambient() -> str:
 def published() -> str:
     """The published noise."""
     ensembles = [SMALL, SMALL_INFLATED, SMALL_ADAPTIVE, SMALL_FINITE, ENKF, INFLATED, IENKF, IENKF_INFLATED]
-    return table_of(leaderboard(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
+    particles = [
+        contender("pf", proposal="optimal"),
+        contender("pf", resampling="gaussian", resampling_threshold=1.0),
+    ]
+    particles.append(contender("rbpf", sampled=(1,)))  # U_a
+    filters = [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY, *particles]
+    return table_of(leaderboard(find_scenario("published_noise"), filters))
 
 
 def reference() -> str:
