@@ -28,8 +28,12 @@ class EachMemory(NumbersMemory):
         u, z: of all.
     """
 
-    def __init__(self, shape: Shape, end: int, draws: int, apart: bool):
-        """Take the sizes, how many rows of the table are used, and whether particles are taken one by one."""
+    def __init__(self, shape: Shape, end: int, draws: int, common: int, apart: bool):
+        """Take the sizes, how many rows of the table are used, and whether particles are taken one by one.
+
+        From `common` on the row has numbers that all particles share.
+        """
+        self._common = Place("rows", end + draws if apart else common)
         self._array, self._member = ("rows" if apart else "table"), not apart
         x = given(self.place(0), (shape.n,), member=not apart)
         super().__init__(shape, NO_PAGE, x, x, 0)
@@ -48,6 +52,10 @@ class EachMemory(NumbersMemory):
         """What each particle has in the table from a row on."""
         return given(self.place(first), shape, symmetric=symmetric, like=self.x, member=self._member)
 
+    def of_all(self, *shape: int, symmetric: bool = False) -> Matrix:
+        """What all particles share."""
+        return given(self._common, shape, symmetric=symmetric, beside=self.x)
+
 
 class Works(NamedTuple):
     """Stages as functions (row, given, numbers, table, draws, size), and the memory that they need."""
@@ -63,15 +71,18 @@ def works_of_each(
     end: int,
     draws: int,
     stages: Callable[[EachMemory, Equations], dict[str, Stage]],
+    common: tuple[int, int] = (0, 0),
 ) -> Works:
     """Stages of a model's particles, which use rows of the table before `end`, and so many normals each.
+
+    They share numbers of the row: from which place on, and how many.
 
     They are programs of all particles. Where the model cannot be traced or is too large, each particle is copied
     to the end of the row, and what is done with it is calls.
     """
 
     def seen(apart: bool) -> tuple[EachMemory, Equations]:
-        memory = EachMemory(shape, end, draws, apart)
+        memory = EachMemory(shape, end, draws, common[0], apart)
         return memory, Equations(functions, memory, constants_move=False, trace=not apart)
 
     try:
@@ -81,15 +92,18 @@ def works_of_each(
         memory, model = seen(apart=True)
         made, readers = stages(memory, model), {memory.constants: constants_reader(shape)}
         calls = {name: as_calls(one, 0, model.called, readers, OF_STEPS).values for name, one in made.items()}
-        return Works({name: _one_by_one(one, end, draws) for name, one in calls.items()}, end, end + draws)
+        length = end + draws + common[1]
+        return Works({name: _one_by_one(one, end, draws, *common) for name, one in calls.items()}, end, length)
 
 
-def _one_by_one(work: Callable, end: int, count: int) -> Callable:
+def _one_by_one(work: Callable, end: int, count: int, common: int, shared: int) -> Callable:
     """`work(row, given, numbers)` of one particle, done with each column of the table."""
 
     @inlined
     def works(row, given, numbers, table, draws, size):
-        width, one = table.shape[1], row[row.shape[0] - end - count :]
+        width, one = table.shape[1], row[row.shape[0] - end - count - shared :]
+        for i in range(shared):
+            one[end + count + i] = row[common + i]
         for j in range(width):
             for i in range(end):
                 one[i] = table[i, j]

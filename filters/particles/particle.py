@@ -38,7 +38,7 @@ def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
     """Kernels of a particle filter for a model's functions and shape.
 
     The table's rows: n of particles, one of log weights, n of noise if the proposal is optimal, one of weights,
-    scratch. Behind the ESS the row then has whether there is noise.
+    scratch. Behind the ESS the row then has the Q of that noise: a later update may meet another one.
     """
     n, m, observe = shape.n, shape.m, functions.observe
     kept = n + 1 + kind.optimal * n
@@ -51,7 +51,7 @@ def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
     set_equal, expect, normal, distance, level, weigh, summarise = parts
     resample = systematic_resampler(n, weights, scratch)
     read_r, predicted = matrix_reader(m, m, number_places(n, m).r), column_reader(m, scratch)
-    (read_mean, read_cov), root = row_access(shape)[0], size_place + 1 + kind.optimal
+    (read_mean, read_cov), root = row_access(shape)[0], size_place + 1 + kind.optimal * n * n
     spread = constants_spreader(shape, kind.smoothed, root) if kind.smoothed else kernel_spreader(shape, root)
     spread_by = cov_spreader(shape, root)
 
@@ -106,14 +106,15 @@ def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
     if not kind.optimal:
         return Kernels(n, m, rows, n, start, predict, update, summarise, 1, kept - n, of_root)
 
-    works, rows_of_works, length = proposal_works(functions, shape, noise, scratch + m)
-    condition, log_weight, moved, draw = works["update"], scratch + m, size_place + 1, drawer(n, m)
-    q_root_place = number_places(n, m).q_root
+    noise_cov, log_weight, source = size_place + 1, scratch + m, number_places(n, m)
+    works, rows_of_works, length = proposal_works(functions, shape, noise, log_weight, noise_cov)
+    condition, draw, q_place, q_root_place = works["update"], drawer(n, m), source.q, source.q_root
 
     @inlined
     def forget_noise(memory):
         row, table, _ = memory
-        row[moved] = 0.0
+        for i in range(n * n):
+            row[noise_cov + i] = 0.0
         for i in range(n):
             for j in range(table.shape[1]):
                 table[noise + i, j] = 0.0
@@ -129,25 +130,27 @@ def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
         predict(memory, u, numbers, size)
         forget_noise(memory)
         add_noise(table, noise, n, draws, numbers, q_root_place)  # of the very draws that moved the particles
-        row[moved] = 1.0
+        for i in range(n * n):
+            row[noise_cov + i] = numbers[q_place + i]
 
     @inlined
     def propose(memory, z, numbers, size):
         row, table, draws = memory
-        if row[moved] == 0.0 or not anything_measured(z):
-            update(memory, z, numbers, size)
-        else:
-            expect(memory, z, numbers, size)
+        expect(memory, z, numbers, size)
+        row[likelihood_place] = 0.0
+        if anything_measured(z):
             draw(draws, m * table.shape[1], row, FILTER_PROPOSAL)
             condition(row, z, numbers, table, draws, size)
             for j in range(table.shape[1]):
                 table[logarithms, j] += table[log_weight, j]
             row[likelihood_place] = weigh(memory, size)
             forget_noise(memory)
+        else:
+            summarise(memory, size)
 
     return Kernels(
         *(n, m, max(rows, rows_of_works), max(n, m), start_without_noise, predict_with_noise, propose, summarise),
-        extras=2,
+        extras=1 + n * n,
         extra_kept_rows=kept - n,
         scratch=of_root + length,
     )
@@ -190,7 +193,7 @@ class ParticleFilter(ResampledFilter):
     model, the belief restarts from the prior, which `divergences` counts.
 
     `Belief.members` is (n + 1, N), its last row the log weights; with the optimal proposal n rows of noise follow.
-    `Belief.extras` holds the ESS, and then whether there is noise.
+    `Belief.extras` holds the ESS, and then the Q of that noise.
 
     Attributes:
         proposal: "prior", or "optimal" to draw particles again where z is.

@@ -13,17 +13,17 @@ from thruster_env.numerics.algebra.operations import divide, only, present, sym,
 from thruster_env.plants.shape import Functions, Shape
 
 
-def propose(model, x, d, z, e):
+def propose(model, x, d, Q, z, e):
     """Particles x = mu + d and their noise d ~ N(0, Q), moved by the measurement z; logarithms of their weights.
 
     Conditioning d on z in the manner of an ensemble filter, with a perturbation of z for each particle, makes of a
-    sample of the prior one of the proposal.
+    sample of the prior one of the proposal. Without noise, and with Q = 0, nothing moves.
     """
     seen, mu = present(z), x - d
     H, R = only(seen, model.H(mu)), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - model.h(mu), model.measurement_angles))
-    S = sym(H @ model.Q @ H.T + R)
-    d = d + divide(model.Q @ H.T, S) @ (v - H @ d - only(seen, model.R_root @ e))
+    S = sym(H @ Q @ H.T + R)
+    d = d + divide(Q @ H.T, S) @ (v - H @ d - only(seen, model.R_root @ e))
     x = mu + d
     rest = only(seen, wrap(z - model.h(x), model.measurement_angles))
     return x, d, log_density(v, S, seen) + log_density(rest, R, seen) - log_density(v - H @ d, R, seen)
@@ -31,12 +31,14 @@ def propose(model, x, d, z, e):
 
 def stages_of(noise: int, level: int, memory: EachMemory, model: Equations) -> dict[str, Stage]:
     """The update, of noise in rows from `noise` on; the logarithms go into the row `level`."""
-    d = memory.of_each(noise, memory.shape.n)
-    x, new, logarithm = propose(model, memory.x, d, memory.z, memory.e)
+    n = memory.shape.n
+    d, Q = memory.of_each(noise, n), memory.of_all(n, n, symmetric=True)
+    x, new, logarithm = propose(model, memory.x, d, Q, memory.z, memory.e)
     return {"update": Stage({**stored((x, new), (memory.x, d)).values, memory.place(level): logarithm}, {})}
 
 
 @lru_cache(maxsize=64)
-def proposal_works(functions: Functions, shape: Shape, noise: int, level: int) -> Works:
-    """The update for a model's functions and shape."""
-    return works_of_each(functions, shape, level + 1, shape.m, partial(stages_of, noise, level))
+def proposal_works(functions: Functions, shape: Shape, noise: int, level: int, cov: int) -> Works:
+    """The update for a model's functions and shape, whose row has the Q of the noise from `cov` on."""
+    stages, common = partial(stages_of, noise, level), (cov, shape.n * shape.n)
+    return works_of_each(functions, shape, level + 1, shape.m, stages, common)

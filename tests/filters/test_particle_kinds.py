@@ -17,7 +17,7 @@ from tests.filters.test_particle import (
     root,
     weighted_covariance,
 )
-from tests.models import KEY, line_model, plane_model, scalar_model, simulated
+from tests.models import KEY, line_model, plane_model, scalar_model, simulated, varying_noise
 from tests.oracles import assert_normal, normals
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
@@ -205,7 +205,17 @@ def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_th
 )
 def test_they_are_the_same_on_every_path(numbers):
     inputs, z = simulated(plane_model(), 20, missing=0.2)
-    assert_paths_agree(make_filter("pf", plane_model(), ensemble_size=10, **numbers), KEY, inputs, z)
+    filter_ = make_filter("pf", plane_model(), ensemble_size=10, **numbers)
+    assert_paths_agree(filter_, KEY, inputs, z)
+    noise = varying_noise(plane_model(), 20)
+    (q, *_), (_, r, *_) = noise["process_noise_covs"], noise["measurement_noise_covs"]
+    found = run(filter_, [KEY], inputs, z, **noise)
+    belief, _ = filter_.update(
+        filter_.init(KEY), z[0, 0], measurement_noise_cov=noise["measurement_noise_covs"][0]
+    )
+    belief = filter_.predict(belief, inputs[0, 0], process_noise_cov=q)
+    belief, _ = filter_.update(belief, z[0, 1], measurement_noise_cov=r)
+    np.testing.assert_allclose(belief.mean, found.means[0, 1], rtol=1e-12)
 
 
 def test_what_the_kinds_may_not_be():
