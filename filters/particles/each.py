@@ -54,7 +54,7 @@ class EachMemory(NumbersMemory):
 
     def of_all(self, *shape: int, symmetric: bool = False) -> Matrix:
         """What all particles share."""
-        return given(self._common, shape, symmetric=symmetric, beside=self.x)
+        return given(self._common, shape, symmetric=symmetric, like=self.x)
 
 
 class Works(NamedTuple):
