@@ -24,9 +24,9 @@ PACKAGES = (
 NUMERICS, PLANTS, TRAINING, STUDIES = (
     f"thruster_env/{name}" for name in ("numerics", "plants", "training", "studies")
 )
-ROOMS = (NUMERICS, PLANTS, *PACKAGES[:-1], TRAINING, STUDIES, PACKAGES[-1])
+LAYERS = (NUMERICS, PLANTS, *PACKAGES[:-1], TRAINING, STUDIES, PACKAGES[-1])
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-every_room = pytest.mark.parametrize("room", ROOMS)
+every_package = pytest.mark.parametrize("package", LAYERS)
 
 ALLOWED = {
     NUMERICS: set(),
@@ -37,12 +37,12 @@ ALLOWED = {
     "tuning": {NUMERICS, PLANTS, "filters"},
     TRAINING: {NUMERICS, PLANTS, "thruster_env", "auv_env", "filters", "tuning"},
     STUDIES: {NUMERICS, PLANTS, "thruster_env", "auv_env", "filters", "tuning"},
-    "thruster_cli": set(ROOMS),
+    "thruster_cli": set(LAYERS),
 }
 TUNING_OF_PLANTS = {
     "tuning/thruster": {"thruster_env"},
     "tuning/auv": {"auv_env"},
-}  # the rooms of tuning that know a plant
+}  # the packages of tuning that know a plant
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
 PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
@@ -68,8 +68,8 @@ def packages_of(path):
     return {name.partition(".")[0] for name in imports_of(path)}
 
 
-def rooms_of(path):
-    """The rooms that a file knows."""
+def layers_of(path):
+    """The packages that a file knows."""
     return {package_of(name).replace(".", "/") for name in imports_of(path)}
 
 
@@ -88,25 +88,25 @@ def those(condition):
     return [path.relative_to(ROOT).as_posix() for path in FILES if condition(path)]
 
 
-def room_of(path):
+def own_package_of(path):
     return package_of(".".join(path.relative_to(ROOT).with_suffix("").parts)).replace(".", "/")
 
 
 def known_to(path):
     """Our packages that a file may import."""
-    room = path.relative_to(ROOT).parent.as_posix()
-    return ALLOWED[room_of(path)] | {room_of(path)} | TUNING_OF_PLANTS.get(room, set())
+    package = path.relative_to(ROOT).parent.as_posix()
+    return ALLOWED[own_package_of(path)] | {own_package_of(path)} | TUNING_OF_PLANTS.get(package, set())
 
 
-def test_a_room_knows_only_the_rooms_below():
-    assert not those(lambda path: rooms_of(path) & set(ROOMS) - known_to(path))
+def test_a_package_knows_only_the_packages_below():
+    assert not those(lambda path: layers_of(path) & set(LAYERS) - known_to(path))
 
 
-def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
-    rooms = {room.replace("/", ".") for room in TUNING_OF_PLANTS}
+def test_packages_of_tuning_know_those_of_plants_by_the_finder_alone():
+    packages = {package.replace("/", ".") for package in TUNING_OF_PLANTS}
     outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
-    knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
-    assert not knowing and set(PLANT_PACKAGES.values()) == {f"{room}.find" for room in rooms}
+    knowing = [path for path in outside if own_package_of(path) == "tuning" and imports_of(path) & packages]
+    assert not knowing and set(PLANT_PACKAGES.values()) == {f"{package}.find" for package in packages}
 
 
 def test_imports_of_training_go_in_no_circle_not_even_within_functions():
@@ -120,7 +120,7 @@ def test_imports_of_training_go_in_no_circle_not_even_within_functions():
 
 
 def test_only_tuning_imports_optuna():
-    assert not those(lambda path: "optuna" in packages_of(path) and room_of(path) != "tuning")
+    assert not those(lambda path: "optuna" in packages_of(path) and own_package_of(path) != "tuning")
 
 
 def test_the_page_alone_imports_bokeh_and_computes_nothing():
@@ -130,11 +130,11 @@ def test_the_page_alone_imports_bokeh_and_computes_nothing():
 
 
 def test_only_training_imports_packages_that_learn_policies():
-    assert not those(lambda path: packages_of(path) & LEARNING - {"torch"} and room_of(path) != TRAINING)
+    assert not those(lambda path: packages_of(path) & LEARNING - {"torch"} and own_package_of(path) != TRAINING)
 
 
 def test_torch_is_imported_by_training_and_by_filters_on_tensors_alone():
-    knowing = those(lambda path: "torch" in packages_of(path) and room_of(path) != TRAINING)
+    knowing = those(lambda path: "torch" in packages_of(path) and own_package_of(path) != TRAINING)
     assert knowing and all(name.startswith(f"{OF_TENSORS}/") for name in knowing)
     outside = [path for path in FILES if not path.relative_to(ROOT).as_posix().startswith(OF_TENSORS)]
     of_tensors = {name for path in outside for name in imports_of(path) if name.startswith("filters.tensors")}
@@ -157,10 +157,10 @@ def test_text_files_are_utf_8_whatever_the_terminal_has():
                 assert "encoding" in {keyword.arg for keyword in call.keywords}, f"{path}:{call.lineno}"
 
 
-@every_room
-def test_a_package_says_that_it_is_typed(room):
-    assert (ROOT / room / "__init__.py").is_file()
-    assert (ROOT / room / "py.typed").is_file()
+@every_package
+def test_a_package_says_that_it_is_typed(package):
+    assert (ROOT / package / "__init__.py").is_file()
+    assert (ROOT / package / "py.typed").is_file()
 
 
 def test_the_command_line_starts_without_packages_that_learn_policies():

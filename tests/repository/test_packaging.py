@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.repository.test_house import PACKAGES, ROOMS
+from tests.repository.test_house import LAYERS, PACKAGES
 from thruster_env import __version__
 from tuning.search.samplers import NEEDS
 
@@ -92,7 +92,7 @@ def test_a_wheel_holds_every_file_of_every_package_and_nothing_else(packed):
     (wheel,) = dist.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
-    of_rooms = {name for name in files if name.partition("/")[0] in PACKAGES}
-    assert {f"{room}/py.typed" for room in ROOMS} <= found
-    assert sorted(found ^ of_rooms) == []
+    of_packages = {name for name in files if name.partition("/")[0] in PACKAGES}
+    assert {f"{package}/py.typed" for package in LAYERS} <= found
+    assert sorted(found ^ of_packages) == []
     assert wheel.name.split("-")[:2] == ["thruster_env", __version__]
