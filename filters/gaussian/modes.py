@@ -10,10 +10,12 @@ from typing import NamedTuple
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.engine.restart import restart_if_lost
+from filters.gaussian.absent import Absent, Parts, completer
 from filters.gaussian.mixture import blender
 from filters.pages.kernels import nothing_to_summarise
 from filters.particles.weighted import anything_measured
 from thruster_env.numerics.compiled import inlined
+from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Shape
 
 
@@ -46,14 +48,14 @@ def mode_places(modes: tuple[Mode, ...], n: int, m: int) -> Places:
 
 
 @lru_cache(maxsize=64)
-def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
-    """Kernels for filters of the same states, inputs and measurements as `shape`.
+def mode_kernels(modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ...] = ()) -> Kernels:
+    """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
 
     The filter's own numbers are p (K,), Pi (K, K) by rows, and those of each mode.
     """
     n, m, count = shape.n, shape.m, len(modes)
     row_places, places, own = memory_places(n, m), mode_places(modes, n, m), own_place(shape)
-    first, stride, probabilities, foreseen, mixed, end = places
+    first, stride, probabilities, foreseen, mixed, completing = places
     mean_place, cov_place, likelihood_place = row_places.mean, row_places.cov, row_places.log_likelihood
     step_place, lost_place, weight_place = row_places.step, row_places.divergences, first + stride - 1
     transitions, belief = own + count, n + n * n
@@ -64,6 +66,9 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
     of_innovations = blender(m, seen, seen_covs, weight_place, stride, shape.measurement_angles)
     _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     start_all, predict_all, update_all = _of_all(modes, first, stride, own + count + count * count)
+    parts = Parts(means, covs, weight_place, stride, count, completing)
+    complete = completer(absent, parts, n, of_states, (store_mean, store_cov), _priors(modes, shape))
+    end = completing + (count + belief if absent else 0)
 
     @inlined
     def take_weights(row, place):
@@ -71,8 +76,9 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
             row[weight_place + j * stride] = row[place + j]
 
     @inlined
-    def merge(row):
+    def merge(row, numbers):
         take_weights(row, probabilities)
+        complete(row, numbers)
         mean, p = of_states(row, count)
         store_mean(row, mean)
         store_cov(row, p)
@@ -85,7 +91,7 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
         for j in range(count):
             row[probabilities + j] = numbers[own + j]
         start_all(memory, numbers, numbers)
-        merge(row)
+        merge(row, numbers)
 
     @inlined
     def mix(row, numbers):
@@ -98,6 +104,7 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
             for i in range(count):
                 came = numbers[transitions + i * count + j] * row[probabilities + i]
                 row[weight_place + i * stride] = came / total if total > 0.0 else 1.0 if i == j else 0.0
+            complete(row, numbers)
             mean, p = of_states(row, count)
             begun = row[mixed + j * belief : mixed + (j + 1) * belief]
             store_mean(begun, mean)
@@ -112,7 +119,7 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
         row, _, _ = memory
         mix(row, numbers)
         predict_all(memory, u, numbers)
-        merge(row)
+        merge(row, numbers)
         row[step_place] += 1.0
 
     @inlined
@@ -141,12 +148,21 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape) -> Kernels:
         store_innovation(row, innovation)
         store_s(row, s)
         row[likelihood_place] = weigh(row) if anything_measured(z) else 0.0
-        merge(row)
+        merge(row, numbers)
 
     kept = foreseen - first
     return Kernels(
         n, m, n, 0, start, predict, update, nothing_to_summarise, extras=kept, scratch=end - first - kept
     )
+
+
+def _priors(modes: tuple[Mode, ...], shape: Shape) -> list[tuple[int, int]]:
+    """Places of the prior mean and covariance of each mode's model in the filter's numbers."""
+    place, model, found = own_place(shape) + len(modes) * (len(modes) + 1), number_places(shape.n, shape.m), []
+    for one in modes:
+        found.append((place + model.prior_mean, place + model.prior_cov))
+        place += one.length
+    return found
 
 
 def _of_all(modes: tuple[Mode, ...], first: int, stride: int, numbers_place: int) -> tuple[Callable, ...]:

@@ -10,11 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.embedded import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places
 from filters.filter import Filter
+from filters.gaussian.absent import Absent, absent_states
 from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.numerics.checks import between, one_of, positive, short_repr
+from thruster_env.numerics.checks import between, one_of, positive, short_repr, vector
 from thruster_env.plants.state_space import StateSpaceModel
 
 MOST_MODES = 32
@@ -27,10 +29,12 @@ class MultipleModelFilter(Filter):
     """Base of filters that run one filter for each of K models, its modes; see the subclasses.
 
     Attributes:
-        modes: K models with the states, inputs and measurements of `model`, or changes of it, as
-            `StateSpaceModel.replace` takes them; `usual_modes` if None.
+        modes: K models with the inputs and measurements of `model` and its states, or some of them by their
+            symbols, or changes of it, as `StateSpaceModel.replace` takes them; `usual_modes` if None.
         mode_filter: name of a Gaussian filter for all modes, such as "kf", "ekf" or "ukf", or one for each.
         probabilities: p (K,), of the modes at first; `usual_probabilities` if None.
+        absent: mean and variance of a state, by symbol, in modes that lack it; without these it has there the
+            moments of the modes that have it (`filters.gaussian.absent`).
     """
 
     one_model: ClassVar[bool] = False
@@ -40,6 +44,7 @@ class MultipleModelFilter(Filter):
     modes: Any = None
     mode_filter: Any = "ekf"
     probabilities: Any = None
+    absent: Any = None
 
     def __post_init__(self):
         """Check the modes; raise ValueError that states the rule and the value."""
@@ -71,7 +76,7 @@ class MultipleModelFilter(Filter):
         """The filter of each mode."""
         from filters.registry import make_filter  # where this one is listed, too
 
-        models = self._models()
+        models = self._models
         names = [self.mode_filter] * len(models) if isinstance(self.mode_filter, str) else self.mode_filter
         if not isinstance(names, Sequence) or len(names) != len(models):
             rule = f"mode_filter must be one name, or one for each of {len(models)} modes"
@@ -84,7 +89,9 @@ class MultipleModelFilter(Filter):
                 raise ValueError(f"{rule}, such as 'ekf', but got {one.name!r}")
         return found
 
-    def _models(self) -> list[StateSpaceModel]:
+    @cached_property
+    def _given(self) -> list[StateSpaceModel]:
+        """The models of the modes, with the states that each has."""
         model, modes = self.model, self.usual_modes if self.modes is None else self.modes
         if not isinstance(modes, Sequence) or not 2 <= len(modes) <= MOST_MODES:
             raise ValueError(f"modes must be a list of 2 to {MOST_MODES} models, but got {short_repr(modes)}")
@@ -93,9 +100,48 @@ class MultipleModelFilter(Filter):
             if not isinstance(one, StateSpaceModel):
                 raise ValueError(f"a mode must be a model, or changes of one, but got {short_repr(one)}")
             if _sizes(one) != _sizes(model):
-                rule = "states, measurements, inputs and angles of a mode must be those of the model"
+                rule = "measurements, inputs and angles of a mode must be those of the model"
                 raise ValueError(f"{rule}, {_sizes(model)}, but got {_sizes(one)}")
         return models
+
+    @cached_property
+    def _places(self) -> list[tuple[int, ...]]:
+        """Places of the states of each mode among the model's."""
+        return [places_within(one.states, self.model.states) for one in self._given]
+
+    @cached_property
+    def _models(self) -> list[StateSpaceModel]:
+        """The models of the modes with all states."""
+        every, moments = tuple(range(self.model.n)), self._moments
+        return [
+            one if places == every else embedded_model(one, self.model, moments)
+            for one, places in zip(self._given, self._places, strict=True)
+        ]
+
+    @cached_property
+    def _moments(self) -> dict[int, tuple[float, float]]:
+        """Mean and variance of states in modes that lack them, by place, where these are given."""
+        given = {} if self.absent is None else self.absent
+        if not isinstance(given, Mapping):
+            raise ValueError(f"absent must map symbols to (mean, variance), but got {short_repr(given)}")
+        symbols = [one.symbol for one in self.model.states]
+        lacking = [name for i, name in enumerate(symbols) if not all(i in own for own in self._places)]
+        found = {}
+        if given and not lacking:
+            raise ValueError("absent needs a mode that lacks states, but all have all")
+        for name, value in given.items():
+            place = symbols.index(one_of("absent", name, lacking))
+            mean, variance = vector(f"absent[{name!r}]", value, 2).tolist()
+            found[place] = mean, positive(f"variance of absent[{name!r}]", variance, zero_allowed=True)
+        for i, name in enumerate(symbols):
+            if i not in found and not any(i in own for own in self._places):
+                raise ValueError(f"each state must be one of a mode's, or of absent, but {name!r} is of none")
+        return found
+
+    @cached_property
+    def absent_states(self) -> tuple[Absent, ...]:
+        """States that some modes lack."""
+        return absent_states(self._places, self.model.n, tuple(self._moments))
 
     def _changed(self, changes: Mapping[str, Any]) -> StateSpaceModel:
         names = [one.name for one in dataclasses.fields(self.model) if one.init]
@@ -112,7 +158,9 @@ class MultipleModelFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the modes; see `Filter.kernels`."""
         return mode_kernels(
-            tuple(Mode(one.kernels(), len(one.numbers)) for one in self.mode_filters), self.model.shape
+            tuple(Mode(one.kernels(), len(one.numbers)) for one in self.mode_filters),
+            self.model.shape,
+            self.absent_states,
         )
 
     def mode_probabilities(self, belief: Belief) -> np.ndarray:
@@ -221,7 +269,7 @@ class MultipleModelAdaptiveEstimator(MultipleModelFilter):
 
 
 def _sizes(model: StateSpaceModel) -> tuple:
-    return model.n, model.m, model.inputs, model.shape.state_angles, model.shape.measurement_angles
+    return model.m, model.inputs, model.shape.measurement_angles
 
 
 def _probabilities(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:

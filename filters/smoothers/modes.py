@@ -62,6 +62,9 @@ def smooth_modes(
         ValueError: as `filters.smooth`.
     """
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
+    if filter_.absent_states:
+        lacked = ", ".join(filter_.model.states[i].symbol for one in filter_.absent_states for i in one.states)
+        raise ValueError(f"a smoother needs modes that have all states of the model, but some lack {lacked}")
     relations = [relation_of(one, "a mode of a smoother") for one in filter_.mode_filters]
     kinds = [one for one in filter_.mode_filters if isinstance(one, PageFilter)]
     steps = [passes(one, relation) for one, relation in zip(kinds, relations, strict=True)]

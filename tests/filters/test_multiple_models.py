@@ -199,7 +199,7 @@ def test_an_angle_is_mixed_the_short_way_round():
     ("changes", "rule"),
     [
         ({"modes": [thruster_model()]}, "modes must be a list of 2 to 32 models, but got"),
-        ({"modes": [thruster_model(), pendulum()]}, "states, measurements, inputs and angles of a mode must be"),
+        ({"modes": [thruster_model(), pendulum()]}, "measurements, inputs and angles of a mode must be those"),
         ({"modes": [thruster_model(), 3]}, "a mode must be a model, or changes of one, but got 3"),
         ({"modes": [{}, {"gain": 3.0}]}, "a change of a mode must be one of .*, but got 'gain'"),
         ({"stay": 1.5}, "stay must be"),
