@@ -192,7 +192,8 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
 
     Modes are models, or changes of `model`, such as `{"measurement_noise_cov": 100 * R}`. Without modes there are
     two, the model and the same with R times `outlier_scale`, with probabilities 1 - `outlier_rate` and
-    `outlier_rate`: a filter for outliers.
+    `outlier_rate`: a filter for outliers. What a mode lacks of the model's states the others say (unbiased mixing,
+    `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
 
     `Belief.extras` holds the memory of the modes' filters and the probabilities: see `mode_estimates`.
 
@@ -207,7 +208,7 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
 
     Source: Blom, Bar-Shalom (1988), "The interacting multiple model algorithm for systems with Markovian switching
     coefficients"; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation,
-    section 11.6.6.
+    section 11.6.6; unequal states: Granstrom, Willett, Bar-Shalom (2015).
     """
 
     name: ClassVar[str] = "imm"

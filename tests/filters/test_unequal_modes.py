@@ -1,6 +1,5 @@
 """Modes of fewer states than the model: a naive filter of unequal sizes, a bias, angles, what is refused."""
 
-import pickle
 from contextlib import nullcontext
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
-from filters.embedded import embedded_model
 from tests.filters.test_multiple_models import merged
 from tests.models import wide_model
 from tests.numerics.test_angles import RATE, turning
@@ -188,12 +186,13 @@ def test_the_mixture_does_not_pull_a_missing_state_to_a_value_of_its_own():
                 belief = filter_.predict(belief, [0.0]) if k else belief
                 belief, _ = filter_.update(belief, [(k * DT) ** 2 + rng.normal() if k % 4 == 0 else np.nan])
             found.append(belief.mean[2] - 2.0)
-        errors[name] = np.mean(found) / (np.std(found) / np.sqrt(30))
+        errors[name] = np.mean(found), np.std(found) / np.sqrt(30)
         before, mu = filter_.mode_estimates(belief)[0][1, 2], filter_.mode_probabilities(belief)
         share = filter_.transition_matrix[1, 1] * mu[1] / (mu @ filter_.transition_matrix[:, 1])
         after = filter_.mode_estimates(filter_.predict(belief, [0.0]))[0][1, 2]
         accelerations[name] = after / before / (share if name == "zero" else 1.0)
-    assert abs(errors["others"]) < 3.0 and errors["zero"] < -4.0, errors
+    (kept, spread), (lost, _) = errors["others"], errors["zero"]
+    assert abs(kept) < 2.0 * spread < 0.1 and lost < -0.3, errors
     assert accelerations == pytest.approx({"others": 1.0, "zero": 1.0}, rel=1e-9)
 
 
@@ -234,60 +233,6 @@ def test_an_angle_that_a_mode_lacks_is_that_of_the_others_the_short_way_round(na
     np.testing.assert_allclose(there.means[..., 0], here.means[..., 0], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(there.covs, here.covs, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(there.log_likelihoods, here.log_likelihoods, rtol=1e-8, atol=1e-9)
-
-
-def pushed(x, u, c):
-    return [x[i] + 0.1 * x[i - 1] ** 2 for i in range(len(x))]
-
-
-def slopes(x, u, c):
-    found = np.eye(len(x))
-    for i in range(len(x)):
-        found[i, i - 1] += 0.2 * x[i - 1]
-    return found
-
-
-def corner(x, c):
-    return (x[0] * x[1],)
-
-
-def corner_slopes(x, c):
-    return (tuple(float(x[1 - i]) if i < 2 else 0.0 for i in range(len(x))),)
-
-
-@pytest.mark.parametrize("n", [3, 7, 40])
-def test_slopes_within_a_larger_model_are_those_of_its_functions(n):
-    """In tuples, in arrays, and of tuples within arrays; also after pickle."""
-
-    def model(size, names):
-        return StateSpaceModel(
-            transition=pushed,
-            observe=corner,
-            transition_jacobian=slopes,
-            observe_jacobian=corner_slopes,
-            process_noise_cov=np.full(size, 0.1),
-            measurement_noise_cov=[1.0],
-            prior_mean=np.linspace(1.0, 2.0, size),
-            prior_cov=np.full(size, 0.1),
-            states=names,
-        )
-
-    names = [f"s{i}" for i in range(n)]
-    small, whole = model(n - 1, names[:0:-1]), model(n, names)
-    one = pickle.loads(pickle.dumps(embedded_model(small, whole)))
-    x = np.random.default_rng(n).normal(size=n)
-    with interpreted():
-        given = (tuple(x) if n <= 36 else x), (0.0,), ()
-        np.testing.assert_allclose(one.functions.transition(*given)[0], x[0])
-        np.testing.assert_allclose(one.functions.transition(*given)[1:], pushed(x[:0:-1], (), ())[::-1])
-        f, h = np.zeros((n, n)), np.zeros((1, n))
-        f[0, 0], f[1:, 1:], h[0, 1:] = (
-            1.0,
-            slopes(x[:0:-1], (), ())[::-1, ::-1],
-            corner_slopes(x[:0:-1], ())[0][::-1],
-        )
-        np.testing.assert_allclose(one.functions.transition_jacobian(*given), f)
-        np.testing.assert_allclose(one.functions.observe_jacobian(given[0], ()), h)
 
 
 @pytest.mark.parametrize(
