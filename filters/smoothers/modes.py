@@ -8,6 +8,8 @@ Backwards from the last step, of the filters' means x_i, covariances P_i and pro
     smoothed mu_i = sum over j of w_ij (smoothed mu_j);  x_i, P_i those of the mixture of all x_ij
 
 What parts the modes i that lead to j is in the smoothed P_j, and again between the x_ij: P is on the safe side.
+Of states that mode j lacks its smoothed x_j tells nothing: their place takes what the prediction from x_i says of
+them, given the others. After each step a mode has them from those that know them (`filters.gaussian.absent`).
 
 Source: Kim (1994), "Dynamic linear models with Markov-switching", and for the density Koch (2000), "Fixed-interval
 retrodiction approach to Bayesian IMM-MHT for maneuvering multiple targets".
@@ -62,15 +64,14 @@ def smooth_modes(
         ValueError: as `filters.smooth`.
     """
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
-    if filter_.absent_states:
-        lacked = ", ".join(filter_.model.states[i].symbol for one in filter_.absent_states for i in one.states)
-        raise ValueError(f"a smoother needs modes that have all states of the model, but some lack {lacked}")
     relations = [relation_of(one, "a mode of a smoother") for one in filter_.mode_filters]
     kinds = [one for one in filter_.mode_filters if isinstance(one, PageFilter)]
     steps = [passes(one, relation) for one, relation in zip(kinds, relations, strict=True)]
     means, covs, mu, restarted = _filtered(filter_, keys, inputs, measurements)
     angles, transition = filter_.model.shape.state_angles, filter_.transition_matrix
     count, times, modes, n = means.shape
+    lacking = [[i for one in filter_.absent_states if j in one.modes for i in one.states] for j in range(modes)]
+    own = [[i for i in range(n) if i not in some] for some in lacking]
     found = SmoothedModes(np.empty((count, times, n)), np.empty((count, times, n, n)), mu.copy())
     x, p = means[:, -1], covs[:, -1]
     found.means[:, -1], found.covs[:, -1] = _merged(mu[:, -1], x, p, angles)
@@ -79,10 +80,11 @@ def smooth_modes(
         levels = np.empty((count, modes, modes))
         anew = np.stack([np.zeros(count, bool), restarted[:, k + 1]], axis=1)
         for i, j in np.ndindex(modes, modes):
-            ends = np.stack([means[:, k, i], x[:, j]], axis=1), np.stack([covs[:, k, i], p[:, j]], axis=1), anew
+            begun = means[:, k, i], covs[:, k, i]
+            levels[:, i, j], later, later_cov = _told(kinds[j], own[j], *begun, inputs[:, k], x[:, j], p[:, j])
+            ends = np.stack([begun[0], later], axis=1), np.stack([begun[1], later_cov], axis=1), anew
             corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1)
             pair_x[:, i, j], pair_p[:, i, j] = corrected[:, 0], cov[:, 0]
-            levels[:, i, j] = _levels(kinds[j], means[:, k, i], covs[:, k, i], inputs[:, k], x[:, j])
         w = _weights(transition * mu[:, k, :, None], levels)
         joint = w * found.probabilities[:, k + 1, None, :]  # of modes i at k and j at k + 1
         now = np.where(restarted[:, k + 1, None], mu[:, k], joint.sum(axis=2))
@@ -90,22 +92,62 @@ def smooth_modes(
         shares = np.where(of_i > 0.0, joint / np.where(of_i > 0.0, of_i, 1.0), 1.0 / modes)
         merged = [_merged(shares[:, i], pair_x[:, i], pair_p[:, i], angles) for i in range(modes)]
         x, p = (np.stack(part, axis=1) for part in zip(*merged, strict=True))
+        _complete(filter_, now, x, p)
         found.probabilities[:, k] = now
         found.means[:, k], found.covs[:, k] = _merged(now, x, p, angles)
     return found
 
 
-def _levels(filter_: PageFilter, x, p, inputs, later) -> np.ndarray:
-    """Log densities (B,) of later states by what a filter predicts of x (B, n) and P, but for a constant."""
-    found, begun = np.empty(len(x)), filter_.init()
+def _told(
+    filter_: PageFilter, own: list[int], x, p, inputs, later, later_cov
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the later states (B, n) of a mode, of which some are its own, tell of x (B, n) and P.
+
+    Returns:
+        The log densities (B,) of its own states by what its filter predicts, but for a constant.
+        Means and covariances of all later states, of which the others follow from these by the prediction.
+    """
+    levels, means, covs, begun = np.empty(len(x)), later.copy(), later_cov.copy(), filter_.init()
+    rest = [i for i in range(x.shape[1]) if i not in own]
     for b in range(len(x)):
         predicted = filter_.predict(begun._replace(mean=x[b], cov=p[b]), inputs[b])
         scale = np.sqrt(np.diag(predicted.cov))
         scale = np.where(scale > 0.0, scale, 1.0)
-        off = difference(later[b], predicted.mean, filter_.model.shape.state_angles) / scale
-        near = predicted.cov / np.outer(scale, scale) + ROUNDING * np.eye(len(off))  # which may be singular
-        found[b] = -np.log(scale).sum() - 0.5 * (np.linalg.slogdet(near)[1] + off @ np.linalg.solve(near, off))
-    return found
+        cov = predicted.cov / np.outer(scale, scale)
+        off = (difference(later[b], predicted.mean, filter_.model.shape.state_angles) / scale)[own]
+        near = cov[np.ix_(own, own)] + ROUNDING * np.eye(len(own))  # which may be singular
+        levels[b] = -np.log(scale[own]).sum() - 0.5 * (
+            np.linalg.slogdet(near)[1] + off @ np.linalg.solve(near, off)
+        )
+        if rest:
+            slopes = np.linalg.solve(near, cov[np.ix_(own, rest)])
+            known = (later_cov[b] / np.outer(scale, scale))[np.ix_(own, own)]
+            means[b, rest] = predicted.mean[rest] + scale[rest] * (off @ slopes)
+            joint = np.empty_like(cov)
+            joint[np.ix_(own, own)], joint[np.ix_(own, rest)] = known, known @ slopes
+            joint[np.ix_(rest, own)] = joint[np.ix_(own, rest)].T
+            joint[np.ix_(rest, rest)] = cov[np.ix_(rest, rest)] + slopes.T @ (known - near) @ slopes
+            covs[b] = joint * np.outer(scale, scale)
+    return levels, means, covs
+
+
+def _complete(filter_: MultipleModelFilter, mu, means, covs) -> None:
+    """Give the modes, of probabilities (B, M), what they lack: in means (B, M, n) and covariances."""
+    angles = filter_.model.shape.state_angles
+    for one in filter_.absent_states:
+        s, square = list(one.states), np.ix_(one.states, one.states)
+        have = [k for k in range(mu.shape[1]) if k not in one.modes]
+        total = mu[:, have].sum(axis=1)
+        for b in np.flatnonzero((total > 0.0) | one.given):
+            if not one.given:
+                w = mu[b : b + 1, have] / total[b]
+                mean, cov = (it[0] for it in _merged(w, means[b : b + 1, have], covs[b : b + 1, have], angles))
+            for k in one.modes:
+                if one.given:
+                    mean, cov = filter_.mode_filters[k].model.prior_mean, filter_.mode_filters[k].model.prior_cov
+                means[b, k, s] = mean[s]
+                covs[b, k, s] = covs[b, k][:, s] = 0.0
+                covs[b, k][square] = cov[square]
 
 
 def _weights(prior: np.ndarray, levels: np.ndarray) -> np.ndarray:

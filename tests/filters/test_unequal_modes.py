@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
+from filters import StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run
 from tests.filters.test_multiple_models import merged
 from tests.models import wide_model
 from tests.numerics.test_angles import RATE, turning
@@ -264,11 +264,3 @@ def test_an_angle_that_a_mode_lacks_is_that_of_the_others_the_short_way_round(na
 def test_what_is_refused(changes, rule):
     with pytest.raises(ValueError, match=rule):
         make_filter("imm", moving("pva", 1.0), **{"modes": [{}, moving("pv", 0.1)], **changes})
-
-
-def test_the_smoother_needs_modes_that_have_all_states():
-    filter_ = make_filter("imm", moving("pva", 1.0), modes=[{}, moving("pv", 0.1)])
-    with pytest.raises(
-        ValueError, match="a smoother needs modes that have all states of the model, but some lack a"
-    ):
-        smooth(filter_, inputs=np.zeros((1, 3, 1)), measurements=np.zeros((1, 4, 1)))
