@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, make_filter, run, smooth, smooth_modes
-from filters.smoothers.modes import _merged
+from filters.smoothers.modes import _merged, _told
+from filters.smoothers.relations import relation_of
+from filters.smoothers.rts import passes
 from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
@@ -172,6 +174,28 @@ def test_the_smoother_of_models_that_stay_is_that_of_each_by_itself():
         mean, cov = mixture(mu, means[:, k], covs[:, k])
         np.testing.assert_allclose(both.means[0, k], mean, rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(both.covs[0, k], cov, rtol=1e-6, atol=1e-9)
+
+
+def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covariance():
+    """x + G (later - A x_o), P + G (E - C) G', G = P_:o A' C^-1, C = A P_oo A' + Q, of own states o."""
+    small = point("pv", 0.3)
+    imm = make_filter("imm", point("pva", 0.3), modes=[small, point("pva", 0.3)], mode_filter="kf")
+    mode, rng, u = imm.mode_filters[0], np.random.default_rng(7), np.zeros((1, 1))
+    root, less = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+    x, p, later, e = rng.normal(size=3), root @ root.T + np.eye(3), rng.normal(size=(2, 3)), 0.1 * less @ less.T
+    step, found = passes(mode, relation_of(mode, "a test")), []
+    for one in later:
+        level, mean, cov = _told(mode, [0, 1], x[None], p[None], u, one[None], e[None])
+        ends = np.stack([x, mean[0]])[None], np.stack([p, cov[0]])[None], np.zeros((1, 2), bool)
+        found.append((level[0], *(it[0, 0] for it in step(ends, u[:, None], 1))))
+    a = small.matrices()[0]
+    c = a @ p[:2, :2] @ a.T + small.process_noise_cov
+    gain, off = np.linalg.solve(c, a @ p[:2]).T, later[:, :2] - a @ x[:2]
+    for (_, mean, cov), one in zip(found, off, strict=True):
+        np.testing.assert_allclose(mean, x + gain @ one, rtol=1e-8)
+        np.testing.assert_allclose(cov, p + gain @ (e[:2, :2] - c) @ gain.T, rtol=1e-8, atol=1e-9)
+    first, second = (-0.5 * one @ np.linalg.solve(c, one) for one in off)
+    assert found[1][0] - found[0][0] == pytest.approx(second - first, rel=1e-8)
 
 
 @pytest.mark.parametrize("given", [None, {"a": (0.0, 1.0)}])
