@@ -20,7 +20,7 @@ from thruster_env.numerics.checks import at_least, positive, short_repr
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation"  # parameters that no page reads
+OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation", "lag"  # that no page reads
 
 
 def advance(model, x, u):
@@ -60,10 +60,14 @@ def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
     if number := filter_.adaptive_inflation:
         raise ValueError(f"an ensemble {where} must have no adaptive_inflation, but got {number:g}")
     if filter_.by_parts:
-        radius = getattr(filter_, "radius", 0.0)
-        given = f"{filter_.name!r}{f' with a radius of {radius:g}' if radius else ''}"
         rule = f"an ensemble {where} must have a page for its whole update, as 'etkf' has"
-        raise ValueError(f"{rule}, but got {given}")
+        raise ValueError(f"{rule}, but got {named(filter_)}")
+
+
+def named(filter_: EnsembleFilter) -> str:
+    """The name of a filter, with what makes its update more than its page."""
+    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "lag"))
+    return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +116,7 @@ class EnsembleFilter(FilterWithPage):
 
     @property
     def by_parts(self) -> bool:
-        """Whether an update goes through states or channels, and is more than the page."""
+        """Whether an update goes through states or channels, or runs the motion, and is more than the page."""
         return False
 
     @property

@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, expect, settle
+from filters.ensembles.window import seen_anew, window_kernels
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.geometric import geometric_mean
-from thruster_env.numerics.algebra.members import covariance, mean
-from thruster_env.numerics.algebra.operations import divide, only, present, wrap
+from thruster_env.numerics.algebra.members import covariance
+from thruster_env.numerics.algebra.operations import divide
 from thruster_env.numerics.checks import at_least
 
 MOST_ITERATIONS = 20  # that are written out
+LONGEST_LAG = 1000
 
 
 def update(model, x, z, e):
@@ -20,13 +23,8 @@ def update(model, x, z, e):
     Y, C, v, S, R, level = compare(model, x, z)
     told = v, S, level
     for _ in range(1, model.own.iterations):
-        middle = geometric_mean(R, S)
-        y = expect(model, x + (divide(C, S) @ v - divide(C, S + middle) @ Y), z)
-        E = covariance(y, Y)
-        D = divide(E, R + middle)
-        moved = divide(E + D @ (S - R), S) @ v
-        v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + moved
-        Y = y - mean(y) + D @ Y
+        y = expect(model, x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), z)
+        Y, v = seen_anew(model, y, z, Y, v, S, R)
         C, S = covariance(x, Y), covariance(Y, Y) + R
     return x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), *told
 
@@ -46,13 +44,21 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     iteration is the `EnsembleTransformFilter`; where h is linear, further ones change nothing. T and its inverse
     are symmetric and N x N, and never formed. The innovation and its covariance are those of the first iteration.
 
-    The motion f is not run again, unlike in methods that re-estimate the last state together with this one (Sakov,
-    Oliver and Bertino do so, without process noise). Steps are not damped: where the measurement fits several
-    states, iterations may jump between them. Where a measurement is far more accurate than the forecast, T^-1
-    magnifies any nonlinearity of h along unobserved directions, and iterations gain little.
+    Steps are not damped: where the measurement fits several states, iterations may jump between them. Where a
+    measurement is far more accurate than the forecast, T^-1 magnifies any nonlinearity of h along unobserved
+    directions, and iterations gain little.
+
+    With a `lag` L this is the iterative ensemble Kalman smoother (IEnKS) over a window of L steps, each
+    measurement used once, the window shifted by one: mean and X are of x_0, L steps ago, and of the process noise
+    w_1 ... w_L since, and y_j = h(x_Lj) follows by x_kj = f(x_(k-1)j, u_k) + w_kj, run again in each iteration. So
+    the slopes are those of f, too. Where f and h are linear the estimates are those without a lag.
+    `Belief.members` then is (n (L + 2), N): the members now, those at the window's start given all measurements
+    since, and w_1 ... w_L; `Belief.extras` holds how many steps the window has so far, and their inputs.
 
     Attributes:
-        iterations: evaluations of h by all members in an update, 1 to 20. The others are those of
+        iterations: evaluations of h by all members in an update, 1 to 20; with a lag, each with L steps of f.
+        lag: steps of the window, 0 to 1000; 0 leaves the motion as predicted. With a lag inflation and relaxation
+            act on x_0 and the noise, and there is no adaptive_inflation. The others are those of
             `EnsembleFilter`.
 
     Raises:
@@ -61,15 +67,34 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     Source: Sakov, Oliver, Bertino (2012), "An iterative EnKF for strongly nonlinear systems"; over the update
     alone it is the filter of Zupanski (2005), "Maximum likelihood ensemble filter: theoretical aspects", solved as
     in Bocquet, Sakov (2012), "Combining inflation-free and iterative ensemble Kalman filters for strongly
-    nonlinear systems".
+    nonlinear systems". With a lag: Bocquet, Sakov (2014), "An iterative ensemble Kalman smoother"; noise that is
+    estimated, too: Sakov, Haussaire, Bocquet (2018), "An iterative ensemble Kalman filter in the presence of
+    additive model error", here with one ensemble of states and noise.
     """
 
     name: ClassVar[str] = "ienkf"
     page: ClassVar[Page] = Page(advance, settle, update)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 3
+    lag: int = 0
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
+        object.__setattr__(self, "lag", at_least("lag", self.lag, 0, LONGEST_LAG))
+        if self.lag and self.adaptive_inflation:
+            rule = f"lag of a filter with adaptive_inflation {self.adaptive_inflation:g} must be 0"
+            raise ValueError(f"{rule}, but got {self.lag}")
+
+    @property
+    def by_parts(self) -> bool:
+        """Whether an update runs the motion again, too, and is more than the page."""
+        return bool(self.lag)
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        if not self.lag:
+            return super().kernels()
+        page, model, inflates = self.page_with(False, False), self.kernel_model, self.inflation != 1.0
+        return window_kernels(page, model.functions, model.shape, self.lag, self.iterations, inflates)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.session import Session
+from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from thruster_env.numerics.checks import at_least
 
@@ -49,7 +50,7 @@ def record_members(
     session, n = Session(filter_), filter_.kernel_model.n
     count, times = measurements.shape[:2]
     steps = np.arange(at_least("first", first, 0), times, at_least("every", every, 1))
-    rows = min(filter_.kernels().kept_rows, n + 1)
+    rows = n if isinstance(filter_, EnsembleFilter) else n + 1  # particles have weights
     kept = np.empty((count, len(steps), rows, filter_.size))
     for b in range(count):
         session.start(keys[b], measurements[b, 0])

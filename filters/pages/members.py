@@ -82,21 +82,24 @@ class Works(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def works_of(page: Page, functions: Functions, shape: Shape) -> dict[str, Works]:
+def works_of(
+    page: Page, functions: Functions, shape: Shape, stages: Callable = stages_of, first: int | None = None
+) -> dict[str, Works]:
     """Stages of an ensemble's page, for a model's functions and shape.
 
     They are programs without calls, as `programs.programs_of` makes them. Of a large model all are calls, and of a
-    function that cannot be traced those that need it.
+    function that cannot be traced those that need it. `stages(page, memory, model)` names them; they leave rows of
+    the table before `first` alone, n by default, but for those that they store.
     """
-    memory, model, called = _seen(page, functions, shape, trace=False)
-    readers, n = {memory.constants: constants_reader(shape)}, shape.n
+    memory, model, called = _seen(page, functions, shape, stages, trace=False)
+    readers, first = {memory.constants: constants_reader(shape)}, shape.n if first is None else first
     if not _is_large(called["update"]):
-        _, _, traced = _seen(page, functions, shape, trace=True)
+        _, _, traced = _seen(page, functions, shape, stages, trace=True)
         try:
-            return {name: _work_of(traced[name], stage, model, readers, n) for name, stage in called.items()}
+            return {name: _work_of(traced[name], stage, model, readers, first) for name, stage in called.items()}
         except TooLarge:
             pass
-    return {name: _as_calls(stage, model, readers, n) for name, stage in called.items()}
+    return {name: _as_calls(stage, model, readers, first) for name, stage in called.items()}
 
 
 def _is_large(stage: Stage) -> bool:
@@ -116,10 +119,10 @@ def _work_of(traced: Stage, called: Stage, model: Equations, readers: dict, firs
         return _as_calls(called, model, readers, first)
 
 
-def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool):
+def _seen(page: Page, functions: Functions, shape: Shape, stages: Callable, *, trace: bool):
     memory = MembersMemory(shape, page)
     model = Equations(functions, memory, constants_move=False, trace=trace, partly=True)
-    return memory, model, stages_of(page, memory, model)
+    return memory, model, stages(page, memory, model)
 
 
 def of_members(stage: Stage, first: int) -> Works:

@@ -13,7 +13,7 @@ from filters.engine.belief import Kernels
 from filters.engine.compile import new_memory
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
-from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.ensemble import EnsembleFilter, named
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.numerics.threads import spread
 from thruster_env.numerics.tuples import joiner, vector_part, written_out
@@ -31,16 +31,14 @@ def smooth_ensembles(
     - v_j - y_j). Relaxation is for the members of now only, and steps before a restart from the prior are left as
     they are.
 
-    Raises ValueError for a filter with rotations, which would part the members of different steps, or with a
-    radius, as localisation moves each state by other weights.
+    Raises ValueError for a filter with rotations, which would part the members of different steps, with a radius,
+    as localisation moves each state by other weights, or with a lag of its own.
     """
     rotations = getattr(filter_, "rotations", 0)
     if rotations:
         raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
-    radius = getattr(filter_, "radius", 0.0)
-    if radius or filter_.by_parts:
-        rule = "a smoothed ensemble must have one gain for all states"
-        raise ValueError(f"{rule}, but got {filter_.name!r} with a radius of {radius:g}")
+    if getattr(filter_, "radius", 0.0) or filter_.by_parts:
+        raise ValueError(f"a smoothed ensemble must have one gain for all states, but got {named(filter_)}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = filter_.analysis(paired.model.functions, paired.model.shape)

@@ -1,0 +1,283 @@
+"""The iterated ensemble filter over a window of steps: its start and its process noise are estimated anew.
+
+    window   x_0j the members `lag` steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
+    motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... lag, so that y_j = h(x_lag,j) is a function of all these
+    update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_lag)
+
+Each iteration runs the motion again from where the window then starts. The next step moves x_0 by the first step
+of the window, drops that, and adds noise of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place
+from filters.ensembles.ensemble import compare, expect
+from filters.pages.members import MembersMemory, stages_of, works_of
+from filters.pages.page import Page
+from filters.pages.programs import stored
+from filters.pages.stages import Stage
+from thruster_env.numerics.algebra.geometric import geometric_mean
+from thruster_env.numerics.algebra.matrices import given
+from thruster_env.numerics.algebra.members import covariance, mean, on_branch
+from thruster_env.numerics.algebra.operations import divide, only, present, wrap
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
+
+
+def seen_anew(model, y, z, Y, v, S, R):
+    """Slopes Y T^-1 and innovation z - mean(y) + Y w of members y that the last Y, v and S have moved."""
+    E = covariance(y, Y)
+    D = divide(E, R + geometric_mean(R, S))
+    moved = divide(E + D @ (S - R), S) @ v
+    v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + moved
+    return y - mean(y) + D @ Y, v
+
+
+def pull(Y, v, S, R):
+    """S^-1 v - (S + R # S)^-1 Y: what is correlated with Y moves by its covariance times this."""
+    return divide(v, S) - divide(Y, S + geometric_mean(R, S))
+
+
+class WindowPlaces(NamedTuple):
+    """Where the window lies: rows of the table, then places of the belief's row."""
+
+    window: int  # x_0, then the noise, n rows for each step
+    moved: int  # the same in an iteration, scratch
+    slopes: int  # Y, m rows
+    pull: int  # m rows
+    scratch: int  # of programs
+    steps: int  # how many steps the window has so far
+    inputs: int  # of these steps
+    innovation: int  # v of an iteration, scratch
+    innovation_cov: int  # S of an iteration
+
+
+def window_places(shape: Shape, lag: int) -> WindowPlaces:
+    """Places for a window of `lag` steps."""
+    n, m, rows = shape.n, shape.m, shape.n * (lag + 1)
+    moved, first = n + rows, memory_places(n, m).extras
+    slopes, v = moved + rows, first + 1 + lag * shape.inputs
+    return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v, v + m)
+
+
+@cache
+def window_stages(lag: int) -> Callable:
+    """Return `stages(page, memory, model)`: motion and moments of a page, the first look at z, and later ones."""
+
+    def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
+        m, z, places = memory.shape.m, memory.z, window_places(memory.shape, lag)
+        row = memory_places(memory.shape.n, m)
+        Y, B = (
+            given(Place("table", at), (m,), member=True, beside=memory.x) for at in (places.slopes, places.pull)
+        )
+        v = memory.beside("rows", places.innovation, m)
+        S = memory.beside("rows", places.innovation_cov, m, m, symmetric=True)
+        first, _, first_v, first_S, R, level = compare(model, memory.x, z)
+        later, later_v = seen_anew(model, expect(model, memory.x, z), z, Y, v, S, R)
+        later_S = covariance(later, later) + R
+        told = row.innovation, row.innovation_cov, row.log_likelihood
+        plain = stages_of(page, memory, model)
+        noise = given(Place("table", places.moved), (memory.shape.n,), member=True, beside=memory.x)
+        return {
+            **{name: plain[name] for name in ("start", "advance", "summarise")},
+            "draw": stored((model.Q_root @ memory.w,), (noise,)),
+            "settle": stored((on_branch(memory.x + memory.w, model.state_angles),), (memory.x,)),
+            "update": stored(
+                (first, pull(first, first_v, first_S, R), first_v, first_S, first_v, first_S, level),
+                (Y, B, v, S, *told),
+            ),
+            "again": stored((later, pull(later, later_v, later_S, R), later_v, later_S), (Y, B, v, S)),
+        }
+
+    return stages
+
+
+@inlined
+def copy_rows(table, source, target, count):
+    """Rows target ... become rows source ..., the first ones first."""
+    for i in range(count):
+        for j in range(table.shape[1]):
+            table[target + i, j] = table[source + i, j]
+
+
+@inlined
+def stretch_row(table, i, factor, size):
+    """A row's distances from its mean, times a factor."""
+    mean = 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(table.shape[1]):
+        table[i, j] = mean + factor * (table[i, j] - mean)
+
+
+@inlined
+def pull_row(table, source, target, slopes, pulls, count, size):
+    """Row target becomes row source + its covariance with `count` rows of slopes times rows of pulls."""
+    mean = 0.0
+    for j in range(size):
+        mean += table[source, j] / size
+    for j in range(table.shape[1]):
+        table[target, j] = table[source, j]
+    for k in range(count):
+        slope = 0.0
+        for j in range(size):
+            slope += (table[source, j] - mean) * table[slopes + k, j]
+        slope /= size - 1.0
+        for j in range(table.shape[1]):
+            table[target, j] += slope * table[pulls + k, j]
+
+
+@inlined
+def spread_of(table, i, size):
+    """Root mean square distance of a row from its mean."""
+    mean, squares = 0.0, 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(size):
+        squares += (table[i, j] - mean) ** 2
+    return (squares / size) ** 0.5
+
+
+@lru_cache(maxsize=64)
+def window_kernels(
+    page: Page, functions: Functions, shape: Shape, lag: int, iterations: int, inflates: bool
+) -> Kernels:
+    """Kernels of a window of `lag` steps; the page's `model.own` has inflation and relaxation.
+
+    Both are of all that is estimated, (x_0, w_1 ... w_lag): each prediction stretches it, each update relaxes it.
+    """
+    n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, lag)
+    works = works_of(page, functions, shape, window_stages(lag), at.scratch)
+    begin, advance, draw, settle, moments_of, look, again = (
+        works[name].work for name in ("start", "advance", "draw", "settle", "summarise", "update", "again")
+    )
+    row_places, substeps = memory_places(n, m), number_places(n, m).substeps
+    step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
+    own = page.places(own_place(shape))
+    inflation, relaxation = own["inflation"], own["relaxation"]
+    window, moved, slopes, pulls, _, steps, inputs, _, _ = at
+    rows = n * (lag + 1)
+
+    @inlined
+    def start(memory, numbers, size):
+        row, table, draws = memory
+        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PRIOR, row[key_0], row[key_1])
+        begin(row, numbers, numbers, table, draws, size)
+        for k in range(1 + lag * p):
+            row[steps + k] = 0.0
+        copy_rows(table, 0, window, n)
+        for i in range(window + n, window + rows):
+            for j in range(table.shape[1]):
+                table[i, j] = 0.0
+
+    @inlined
+    def move(memory, source, k, numbers, size):
+        """The members by step k of the window, whose start is in rows source ..., its noise behind."""
+        row, table, draws = memory
+        width, u = table.shape[1], row[inputs + k * p : inputs + (k + 1) * p]
+        for i in range(n):
+            for j in range(width):
+                draws[i * width + j] = table[source + (k + 1) * n + i, j]
+        for _ in range(int(numbers[substeps])):
+            advance(row, u, numbers, table, draws, size)
+        settle(row, u, numbers, table, draws, size)
+
+    @inlined
+    def run_window(memory, source, numbers, size):
+        """The members from the start of the window on."""
+        row, table, _ = memory
+        copy_rows(table, source, 0, n)
+        for k in range(int(row[steps])):
+            move(memory, source, k, numbers, size)
+
+    @inlined
+    def last_step(memory, numbers, size):
+        row, _, _ = memory
+        move(memory, window, int(row[steps]) - 1, numbers, size)
+
+    @inlined
+    def all_steps_stretched(memory, numbers, size):
+        _, table, _ = memory
+        for i in range(window, window + rows):
+            stretch_row(table, i, numbers[inflation], size)
+        run_window(memory, window, numbers, size)
+
+    arrive = all_steps_stretched if inflates else last_step
+
+    @inlined
+    def shift(memory, numbers, size):
+        """Start the window a step later."""
+        row, table, _ = memory
+        copy_rows(table, 0, moved, n)
+        copy_rows(table, window, 0, n)
+        move(memory, window, 0, numbers, size)
+        copy_rows(table, 0, window, n)
+        copy_rows(table, moved, 0, n)
+        copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
+        for k in range((lag - 1) * p):
+            row[inputs + k] = row[inputs + p + k]
+        row[steps] -= 1.0
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        if row[steps] == lag:
+            shift(memory, numbers, size)
+        k, width = int(row[steps]), table.shape[1]
+        for i in range(p):
+            row[inputs + k * p + i] = u[i]
+        row[step_place] += 1.0
+        fill_normals(draws, n * width, row[step_place], FILTER_PROCESS, row[key_0], row[key_1])
+        draw(row, row[inputs + k * p : inputs + (k + 1) * p], numbers, table, draws, size)
+        copy_rows(table, moved, window + (k + 1) * n, n)
+        row[steps] += 1.0
+        arrive(memory, numbers, size)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, draws = memory
+        look(row, z, numbers, table, draws, size)
+        seen = False
+        for k in range(m):
+            seen = seen or z[k] == z[k]
+        if seen:
+            for iteration in range(1, iterations + 1):
+                for i in range(rows):
+                    pull_row(table, window + i, moved + i, slopes, pulls, m, size)
+                    if iteration == iterations and numbers[relaxation] > 0.0:
+                        before, after = spread_of(table, window + i, size), spread_of(table, moved + i, size)
+                        if after > 0.0:
+                            stretch_row(table, moved + i, 1.0 + numbers[relaxation] * (before / after - 1.0), size)
+                run_window(memory, moved, numbers, size)
+                if iteration < iterations:
+                    again(row, z, numbers, table, draws, size)
+            copy_rows(table, moved, window, rows)
+        moments_of(row, row, row, table, draws, size)
+
+    @inlined
+    def summarise(memory, size):
+        row, table, draws = memory
+        moments_of(row, row, row, table, draws, size)
+
+    used = max(at.scratch, *(work.rows for work in works.values()))
+    return Kernels(
+        n,
+        m,
+        used,
+        max(n, m),
+        start,
+        predict,
+        update,
+        summarise,
+        extras=1 + lag * p,
+        extra_kept_rows=rows,
+        scratch=m + m * m,
+    )
