@@ -20,7 +20,7 @@ from thruster_env.numerics.checks import at_least, positive, short_repr
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation", "lag"  # that no page reads
+OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation", "window"  # that no page reads
 
 
 def advance(model, x, u):
@@ -66,7 +66,7 @@ def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
 
 def named(filter_: EnsembleFilter) -> str:
     """The name of a filter, with what makes its update more than its page."""
-    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "lag"))
+    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "window"))
     return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)
 
 

@@ -15,7 +15,7 @@ from thruster_env.numerics.algebra.operations import divide
 from thruster_env.numerics.checks import at_least
 
 MOST_ITERATIONS = 20  # that are written out
-LONGEST_LAG = 1000
+LONGEST_WINDOW = 1000  # steps
 
 
 def update(model, x, z, e):
@@ -48,18 +48,18 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     measurement is far more accurate than the forecast, T^-1 magnifies any nonlinearity of h along unobserved
     directions, and iterations gain little.
 
-    With a `lag` L this is the iterative ensemble Kalman smoother (IEnKS) over a window of L steps, each
-    measurement used once, the window shifted by one: mean and X are of x_0, L steps ago, and of the process noise
-    w_1 ... w_L since, and y_j = h(x_Lj) follows by x_kj = f(x_(k-1)j, u_k) + w_kj, run again in each iteration. So
-    the slopes are those of f, too. Where f and h are linear the estimates are those without a lag.
+    With a `window` of L steps this is the iterative ensemble Kalman smoother (IEnKS) of lag L, each measurement
+    used once, the window shifted by one: mean and X are of x_0, L steps ago, and of the process noise w_1 ... w_L
+    since, and y_j = h(x_Lj) follows by x_kj = f(x_(k-1)j, u_k) + w_kj, run again in each iteration. So the slopes
+    are those of f, too. Where f and h are linear the estimates are those without a window.
     `Belief.members` then is (n (L + 2), N): the members now, those at the window's start given all measurements
     since, and w_1 ... w_L; `Belief.extras` holds how many steps the window has so far, and their inputs.
 
     Attributes:
-        iterations: evaluations of h by all members in an update, 1 to 20; with a lag, each with L steps of f.
-        lag: steps of the window, 0 to 1000; 0 leaves the motion as predicted. With a lag inflation and relaxation
-            act on x_0 and the noise, and there is no adaptive_inflation. The others are those of
-            `EnsembleFilter`.
+        iterations: evaluations of h by all members in an update, 1 to 20; with a window, each with its steps of f.
+        window: steps L that an update estimates anew, 0 to 1000; 0 leaves the motion as predicted. With a window
+            inflation and relaxation act on x_0 and the noise, and there is no adaptive_inflation.
+            The others are those of `EnsembleFilter`.
 
     Raises:
         ValueError: if a parameter is out of its range.
@@ -67,8 +67,8 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     Source: Sakov, Oliver, Bertino (2012), "An iterative EnKF for strongly nonlinear systems"; over the update
     alone it is the filter of Zupanski (2005), "Maximum likelihood ensemble filter: theoretical aspects", solved as
     in Bocquet, Sakov (2012), "Combining inflation-free and iterative ensemble Kalman filters for strongly
-    nonlinear systems". With a lag: Bocquet, Sakov (2014), "An iterative ensemble Kalman smoother"; noise that is
-    estimated, too: Sakov, Haussaire, Bocquet (2018), "An iterative ensemble Kalman filter in the presence of
+    nonlinear systems". With a window: Bocquet, Sakov (2014), "An iterative ensemble Kalman smoother"; noise that
+    is estimated, too: Sakov, Haussaire, Bocquet (2018), "An iterative ensemble Kalman filter in the presence of
     additive model error", here with one ensemble of states and noise.
     """
 
@@ -76,25 +76,25 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     page: ClassVar[Page] = Page(advance, settle, update)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 3
-    lag: int = 0
+    window: int = 0
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
-        object.__setattr__(self, "lag", at_least("lag", self.lag, 0, LONGEST_LAG))
-        if self.lag and self.adaptive_inflation:
-            rule = f"lag of a filter with adaptive_inflation {self.adaptive_inflation:g} must be 0"
-            raise ValueError(f"{rule}, but got {self.lag}")
+        object.__setattr__(self, "window", at_least("window", self.window, 0, LONGEST_WINDOW))
+        if self.window and self.adaptive_inflation:
+            rule = f"window of a filter with adaptive_inflation {self.adaptive_inflation:g} must be 0"
+            raise ValueError(f"{rule}, but got {self.window}")
 
     @property
     def by_parts(self) -> bool:
         """Whether an update runs the motion again, too, and is more than the page."""
-        return bool(self.lag)
+        return bool(self.window)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        if not self.lag:
+        if not self.window:
             return super().kernels()
-        page, model, inflates = self.page_with(False, False), self.kernel_model, self.inflation != 1.0
-        return window_kernels(page, model.functions, model.shape, self.lag, self.iterations, inflates)
+        page, model = self.page_with(False, False), self.kernel_model
+        return window_kernels(page, model.functions, model.shape, self.window, self.iterations)

@@ -1,8 +1,8 @@
 """The iterated ensemble filter over a window of steps: its start and its process noise are estimated anew.
 
-    window   x_0j the members `lag` steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
-    motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... lag, so that y_j = h(x_lag,j) is a function of all these
-    update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_lag)
+    window   x_0j the members L steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
+    motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... L, so that y_j = h(x_Lj) is a function of all these
+    update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_L)
 
 Each iteration runs the motion again from where the window then starts. The next step moves x_0 by the first step
 of the window, drops that, and adds noise of its own.
@@ -60,20 +60,20 @@ class WindowPlaces(NamedTuple):
     innovation_cov: int  # S of an iteration
 
 
-def window_places(shape: Shape, lag: int) -> WindowPlaces:
-    """Places for a window of `lag` steps."""
-    n, m, rows = shape.n, shape.m, shape.n * (lag + 1)
+def window_places(shape: Shape, length: int) -> WindowPlaces:
+    """Places for a window of `length` steps."""
+    n, m, rows = shape.n, shape.m, shape.n * (length + 1)
     moved, first = n + rows, memory_places(n, m).extras
-    slopes, v = moved + rows, first + 1 + lag * shape.inputs
+    slopes, v = moved + rows, first + 1 + length * shape.inputs
     return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v, v + m)
 
 
 @cache
-def window_stages(lag: int) -> Callable:
+def window_stages(length: int) -> Callable:
     """Return `stages(page, memory, model)`: motion and moments of a page, the first look at z, and later ones."""
 
     def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
-        m, z, places = memory.shape.m, memory.z, window_places(memory.shape, lag)
+        m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
         row = memory_places(memory.shape.n, m)
         Y, B = (
             given(Place("table", at), (m,), member=True, beside=memory.x) for at in (places.slopes, places.pull)
@@ -147,15 +147,13 @@ def spread_of(table, i, size):
 
 
 @lru_cache(maxsize=64)
-def window_kernels(
-    page: Page, functions: Functions, shape: Shape, lag: int, iterations: int, inflates: bool
-) -> Kernels:
-    """Kernels of a window of `lag` steps; the page's `model.own` has inflation and relaxation.
+def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, iterations: int) -> Kernels:
+    """Kernels of a window of `length` steps; the page's `model.own` has inflation and relaxation.
 
     Both are of all that is estimated, (x_0, w_1 ... w_lag): each prediction stretches it, each update relaxes it.
     """
-    n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, lag)
-    works = works_of(page, functions, shape, window_stages(lag), at.scratch)
+    n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, length)
+    works = works_of(page, functions, shape, window_stages(length), at.scratch)
     begin, advance, draw, settle, moments_of, look, again = (
         works[name].work for name in ("start", "advance", "draw", "settle", "summarise", "update", "again")
     )
@@ -164,14 +162,14 @@ def window_kernels(
     own = page.places(own_place(shape))
     inflation, relaxation = own["inflation"], own["relaxation"]
     window, moved, slopes, pulls, _, steps, inputs, _, _ = at
-    rows = n * (lag + 1)
+    rows = n * (length + 1)
 
     @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PRIOR, row[key_0], row[key_1])
         begin(row, numbers, numbers, table, draws, size)
-        for k in range(1 + lag * p):
+        for k in range(1 + length * p):
             row[steps + k] = 0.0
         copy_rows(table, 0, window, n)
         for i in range(window + n, window + rows):
@@ -199,47 +197,46 @@ def window_kernels(
             move(memory, source, k, numbers, size)
 
     @inlined
-    def last_step(memory, numbers, size):
-        row, _, _ = memory
-        move(memory, window, int(row[steps]) - 1, numbers, size)
-
-    @inlined
-    def all_steps_stretched(memory, numbers, size):
-        _, table, _ = memory
-        for i in range(window, window + rows):
-            stretch_row(table, i, numbers[inflation], size)
-        run_window(memory, window, numbers, size)
-
-    arrive = all_steps_stretched if inflates else last_step
-
-    @inlined
-    def shift(memory, numbers, size):
-        """Start the window a step later."""
+    def drop(memory):
+        """Leave out the first step of the window."""
         row, table, _ = memory
-        copy_rows(table, 0, moved, n)
-        copy_rows(table, window, 0, n)
-        move(memory, window, 0, numbers, size)
-        copy_rows(table, 0, window, n)
-        copy_rows(table, moved, 0, n)
         copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
-        for k in range((lag - 1) * p):
+        for k in range((length - 1) * p):
             row[inputs + k] = row[inputs + p + k]
         row[steps] -= 1.0
 
     @inlined
-    def predict(memory, u, numbers, size):
-        row, table, draws = memory
-        if row[steps] == lag:
-            shift(memory, numbers, size)
-        k, width = int(row[steps]), table.shape[1]
+    def admit(memory, u, numbers, size):
+        """A step more, whose noise is in rows moved ...; then inflation."""
+        row, table, _ = memory
+        k = int(row[steps])
         for i in range(p):
             row[inputs + k * p + i] = u[i]
-        row[step_place] += 1.0
-        fill_normals(draws, n * width, row[step_place], FILTER_PROCESS, row[key_0], row[key_1])
-        draw(row, row[inputs + k * p : inputs + (k + 1) * p], numbers, table, draws, size)
         copy_rows(table, moved, window + (k + 1) * n, n)
         row[steps] += 1.0
-        arrive(memory, numbers, size)
+        if numbers[inflation] != 1.0:
+            for i in range(window, window + rows):
+                stretch_row(table, i, numbers[inflation], size)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        row[step_place] += 1.0
+        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PROCESS, row[key_0], row[key_1])
+        draw(row, u, numbers, table, draws, size)
+        full, k = row[steps] == length, 0
+        if not full:
+            admit(memory, u, numbers, size)
+        copy_rows(table, window, 0, n)
+        while k < row[steps]:
+            move(memory, window, k, numbers, size)
+            k += 1
+            if full:  # the window starts there from now on
+                full, k = False, 0
+                copy_rows(table, 0, window, n)
+                drop(memory)
+                admit(memory, u, numbers, size)
+                copy_rows(table, window, 0, n)
 
     @inlined
     def update(memory, z, numbers, size):
@@ -277,7 +274,7 @@ def window_kernels(
         predict,
         update,
         summarise,
-        extras=1 + lag * p,
+        extras=1 + length * p,
         extra_kept_rows=rows,
         scratch=m + m * m,
     )

@@ -32,7 +32,7 @@ def smooth_ensembles(
     they are.
 
     Raises ValueError for a filter with rotations, which would part the members of different steps, with a radius,
-    as localisation moves each state by other weights, or with a lag of its own.
+    as localisation moves each state by other weights, or with a window of its own.
     """
     rotations = getattr(filter_, "rotations", 0)
     if rotations:

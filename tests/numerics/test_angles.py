@@ -164,6 +164,7 @@ OTHERS = [
     ("fuzzy", {"blending": "moments"}),
     ("fuzzy", {"blending": "output"}),
     ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
+    ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "window": 2}),
     ("etkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
     ("ensrf", {"ensemble_size": 12, "rotations": 1}),
     ("pf", {"ensemble_size": 12, "proposal": "optimal"}),

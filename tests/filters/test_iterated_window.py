@@ -1,0 +1,241 @@
+"""The iterated ensemble filter with a window: an N x N textbook form, DAPPER's iEnKS, linear models, Lorenz-63."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import inv, sqrtm
+
+from filters import StateSpaceModel, make_filter, run
+from filters.c.source import c_filter
+from filters.ensembles.recording import record_members
+from filters.smoothers.ensemble import smooth_ensembles
+from filters.tensors import torch
+from tests.filters.test_ensemble_twins import step, whole
+from tests.filters.test_filter_paths import assert_compiled_as_python, assert_paths_agree
+from tests.models import KEY, plane_model, random_affine, simulated, varying_noise
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.simulate import simulate
+
+DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_windows.json").read_text())
+SIZE = 9
+
+
+def spring(x, u, c):
+    """What `data/dapper_windows.py` moves."""
+    return (x[0] + 0.3 * x[1], x[1] - 0.3 * x[0] * (1.0 + 0.2 * x[0] * x[0]), 0.9 * x[2] + 0.2 * x[0] * x[1])
+
+
+def curved(x, c):
+    """What it measures."""
+    return (x[0] + 0.2 * x[1] * x[1], x[0] * x[1] - 0.5 * x[2])
+
+
+def pushed(x, u, c):
+    moved = spring(x, u, c)
+    return (moved[0], moved[1] + 0.2 * u[0], moved[2])
+
+
+def curved_model(**changes):
+    arguments = {
+        "transition": pushed,
+        "observe": curved,
+        "process_noise_cov": [[0.1, 0.05, 0.0], [0.05, 0.2, 0.0], [0.0, 0.0, 0.1]],
+        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
+        "prior_mean": [1.0, -0.5, 2.0],
+        "prior_cov": [0.6, 0.2, 1.5],
+        "inputs": 1,
+        "substeps": 2,
+    }
+    return StateSpaceModel(**{**arguments, **changes})
+
+
+class Textbook:
+    """The IEnKS, every transform N x N, of the window's start and its process noise."""
+
+    def __init__(self, model, start, lag, iterations, inflation, relaxation):
+        self.model, self.lag, self.iterations = model, lag, iterations
+        self.inflation, self.relaxation = inflation, relaxation
+        self.start, self.noise, self.inputs = start, [], []
+
+    def moved(self, x, u, w):
+        for _ in range(self.model.substeps):
+            x = np.array([self.model.functions.transition(tuple(one), u, ()) for one in x.T]).T
+        return x + w
+
+    def now(self, stacked):
+        x, *noise = np.split(stacked, 1 + len(self.noise))
+        for u, w in zip(self.inputs, noise, strict=True):
+            x = self.moved(x, u, w)
+        return x
+
+    @property
+    def stacked(self):
+        return np.vstack([self.start, *self.noise])
+
+    @stacked.setter
+    def stacked(self, rows):
+        self.start, *self.noise = np.split(rows, 1 + len(self.noise))
+
+    def predict(self, u, w):
+        if len(self.noise) == self.lag:
+            self.start = self.moved(self.start, self.inputs.pop(0), self.noise.pop(0))
+        self.noise.append(w)
+        self.inputs.append(u)
+        mean = self.stacked.mean(axis=1, keepdims=True)
+        self.stacked = mean + self.inflation * (self.stacked - mean)
+
+    def update(self, z):
+        seen = ~np.isnan(z)
+        if not seen.any():
+            return
+        size = self.start.shape[1]
+        mean, inverse = self.stacked.mean(axis=1), inv(self.model.measurement_noise_cov[np.ix_(seen, seen)])
+        far, w, transform = self.stacked - mean[:, None], np.zeros(size), np.eye(size)
+        for _ in range(self.iterations):
+            x = self.now((mean + far @ w)[:, None] + far @ transform)
+            y = np.array([self.model.functions.observe(tuple(one), ()) for one in x.T]).T[seen]
+            slopes = (y - y.mean(axis=1, keepdims=True)) @ inv(transform)
+            hessian = (size - 1) * np.eye(size) + slopes.T @ inverse @ slopes
+            w = w - inv(hessian) @ ((size - 1) * w - slopes.T @ inverse @ (z[seen] - y.mean(axis=1)))
+            transform = sqrtm((size - 1) * inv(hessian)).real
+        after = far @ transform
+        kept = self.relaxation * (far.std(axis=1) / after.std(axis=1) - 1.0)
+        self.stacked = (mean + far @ w)[:, None] + (1.0 + kept)[:, None] * after
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(
+    ("lag", "iterations", "inflation", "relaxation"), [(1, 3, 1.0, 0.0), (2, 1, 1.1, 0.0), (3, 4, 1.05, 0.3)]
+)
+def test_every_member_is_the_textbook_s(lag, iterations, inflation, relaxation):
+    model = curved_model()
+    numbers = {"iterations": iterations, "inflation": inflation, "relaxation": relaxation}
+    filter_ = make_filter("ienkf", model, ensemble_size=SIZE, window=lag, **numbers)
+    plain = make_filter("ienkf", model, ensemble_size=SIZE)
+    inputs, z = simulated(model, 8)
+    z[0, 3, 1] = z[0, 6] = np.nan
+    belief, nothing = filter_.init(KEY), np.zeros((3, SIZE))
+    textbook = Textbook(model, belief.members[:3], lag, iterations, inflation, relaxation)
+    for k in range(9):
+        if k > 0:
+            # The noise that a filter without a window adds to members at rest, where f is zero.
+            rest = plain.init(KEY)._replace(members=nothing, step=k - 1)
+            w = plain.predict(rest, np.zeros(1)).members
+            belief = filter_.predict(belief, inputs[0, k - 1])
+            textbook.predict(inputs[0, k - 1], w)
+            np.testing.assert_allclose(belief.members[:3], textbook.now(textbook.stacked), rtol=1e-9, atol=1e-9)
+        forecast, (belief, innovation) = belief.members[:3], filter_.update(belief, z[0, k])
+        textbook.update(z[0, k])
+        rows = len(textbook.stacked)
+        np.testing.assert_allclose(belief.members[3 : 3 + rows], textbook.stacked, rtol=1e-8, atol=1e-8)
+        now = textbook.now(textbook.stacked)
+        np.testing.assert_allclose(belief.members[:3], now, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(belief.mean, now.mean(axis=1), rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(belief.cov, np.cov(now), rtol=1e-8, atol=1e-8)
+        expected = np.where(np.isnan(z[0, k]), 0.0, z[0, k] - np.mean([curved(x, ()) for x in forecast.T], axis=0))
+        np.testing.assert_allclose(innovation.value, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("case", DAPPER, ids=lambda case: f"lag {case['lag']}")
+def test_without_process_noise_it_is_dapper_s(case):
+    model = curved_model(
+        transition=spring, process_noise_cov=np.zeros(3), measurement_noise_cov=case["r"], inputs=0, substeps=1
+    )
+    lag, prior = case["lag"], np.array(case["prior"])
+    filter_ = make_filter("ienkf", model, ensemble_size=10, window=lag, iterations=case["iterations"])
+    belief = filter_.init()
+    belief.members[:3] = belief.members[3:6] = prior
+    for k, z in enumerate(case["z"]):
+        belief, _ = filter_.update(filter_.predict(belief, np.zeros(0)), z)
+        if k >= lag:
+            np.testing.assert_allclose(belief.members[3:6], case["starts"][k - lag], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("lag", [1, 4])
+def test_of_a_linear_model_every_step_is_that_without_a_lag(lag):
+    """Also where Q and R change, and where inflation stretches."""
+    model = plane_model()
+    inputs, z = simulated(model, 15, count=2, missing=0.3)
+    for own, noise in (({}, varying_noise(model, 15)), ({"inflation": 1.1}, {})):
+        without, with_window = (
+            make_filter("ienkf", model, ensemble_size=SIZE, window=number, **own) for number in (0, lag)
+        )
+        for one, other in zip(
+            run(with_window, None, inputs, z, **noise), run(without, None, inputs, z, **noise), strict=True
+        ):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_window_of_one_step_nearly_halves_the_error_on_lorenz_s_system():
+    """Of 1963, measured every 0.25 time units: the motion of the members is not linear within their spread."""
+    model = StateSpaceModel(
+        transition=step,
+        observe=whole,
+        process_noise_cov=[1e-6] * 3,
+        measurement_noise_cov=[2.0] * 3,
+        prior_mean=[1.5, -1.5, 25.0],
+        prior_cov=[2.0] * 3,
+        inputs=0,
+        substeps=5,
+    )
+    nothing = np.zeros((2, 200, 0))
+    drawn = simulate(model, filter_keys(range(2)), nothing)
+
+    def rmse(window):
+        filter_ = make_filter("ienkf", model, ensemble_size=10, inflation=1.02, window=window)
+        return ((run(filter_, None, nothing, drawn.measurements).means - drawn.states)[:, 50:] ** 2).mean() ** 0.5
+
+    assert rmse(1) < 0.6 * rmse(0)
+
+
+def whole_filter():
+    """One that has everything, with its data."""
+    model = plane_model(process_noise_cov=[[0.3, 0.1], [0.1, 0.2]])
+    filter_ = make_filter("ienkf", model, ensemble_size=SIZE, window=2, relaxation=0.2, inflation=1.05)
+    return filter_, *simulated(model, 12, missing=0.2)
+
+
+def test_compiled_code_is_python_s():
+    filter_, inputs, z = whole_filter()
+    noise = varying_noise(filter_.model, 12)
+    assert_compiled_as_python(filter_, np.array([KEY]), inputs, z, **noise)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_all_paths_agree_and_members_of_now_are_recorded():
+    filter_, inputs, z = whole_filter()
+    assert_paths_agree(filter_, KEY, inputs, z)
+    recorded = record_members(filter_, np.array([KEY]), inputs, z)
+    assert recorded.members.shape == (1, 13, 2, SIZE) and recorded.weights is None
+
+
+@pytest.mark.usefixtures("as_python")
+def test_large_models_are_called():
+    model = random_affine(38, 8, 1)
+    inputs, z = simulated(model, 4)
+    without, with_window = (
+        run(make_filter("ienkf", model, ensemble_size=6, window=lag, iterations=2), None, inputs, z)
+        for lag in (0, 2)
+    )
+    np.testing.assert_allclose(with_window.means, without.means, rtol=1e-8, atol=1e-8)
+
+
+def test_what_a_window_does_not_allow_is_refused():
+    filter_ = make_filter("ienkf", plane_model(), window=2)
+    for use, where in ((torch, "on tensors"), (c_filter, "in C")):
+        with pytest.raises(
+            ValueError, match=f"ensemble {where} must have a page .* got 'ienkf' with a window of 2"
+        ):
+            use(filter_)
+    nothing = np.zeros((1, 1, 2)), np.zeros((1, 2, 2))
+    with pytest.raises(ValueError, match="one gain for all states, but got 'ienkf' with a window of 2"):
+        smooth_ensembles(filter_, np.array([KEY]), *nothing, 1)
+    with pytest.raises(ValueError, match="window of a filter with adaptive_inflation 0.1 must be 0, but got 2"):
+        make_filter("ienkf", plane_model(), window=2, adaptive_inflation=0.1)
+    with pytest.raises(ValueError, match="window must be a whole number of at least 0, but got -1"):
+        make_filter("ienkf", plane_model(), window=-1)
