@@ -57,8 +57,9 @@ FILTER_PARAMETERS = {
 }
 
 
-# Without process noise only this separates the copies of a particle; with process noise Q does.
-WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0),)}
+# Without process noise only `regularisation` separates the copies of a particle; with process noise Q does.
+# A `window` gains most there; elsewhere a tuned filter shall have none, for neither a smoother nor C takes one.
+WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0), _own("window", 0, 3, integer=True))}
 
 
 def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: bool) -> list[Parameter]:
