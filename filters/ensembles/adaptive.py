@@ -8,9 +8,17 @@ One factor t is kept in the belief, in its extras; it begins at 1. Before each u
 deviation that does not shrink, so that it can follow a model whose errors change; its likelihood is linear about
 the last value. An error of the model which is not in Q widens the innovations, and so the ensemble.
 
+With a factor for each state, t_i is that of state i, and its likelihood is that of all channels while it alone
+moves:
+
+    g_i = d log N(v; 0, D A D + R)/dt' at t' = t_i,  D_kk = (1 + c_ik (t'^1/2 - 1))/(1 + c_ik (t_i^1/2 - 1)),
+    c_ik = taper of i and k times |correlation of x_i and y_k| in the forecast
+
+so that of a single state it is the same, if h is linear.
+
 Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters", for
-one factor; the linear likelihood is that of Anderson (2009), "Spatially and temporally varying adaptive covariance
-inflation for ensemble filters", here of all channels at once.
+one factor; the linear likelihood and factors of states are those of Anderson (2009), "Spatially and temporally
+varying adaptive covariance inflation for ensemble filters", here of all channels at once.
 """
 
 from __future__ import annotations
@@ -21,14 +29,17 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
+from filters.particles.motion import silencer
 from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.layout import number_places
+from thruster_env.numerics.tuples import column_reader, column_writer
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Functions, Shape
 
 
 @inlined
-def score_of(row, innovation, cov, numbers, r, z, lower):
-    """W'A w - tr(S^-1 A), w = S^-1 v and A = S less R, over channels that are there; lower (m, m) is scratch."""
-    m, found = len(z), 0.0
+def write_scores(row, innovation, cov, numbers, r, z, lower, scores):
+    """Scores (m,) w_k (A w)_k - (S^-1 A)_kk, w = S^-1 v, A = S less R, 0 if missing; lower (m, m) is scratch."""
+    m = len(z)
     for i in range(m):
         for j in range(i + 1):
             total = row[cov + i * m + j]
@@ -47,6 +58,7 @@ def score_of(row, innovation, cov, numbers, r, z, lower):
         w[i] /= lower[i, i]
     column = np.zeros(m)
     for j in range(m):
+        found = 0.0
         if z[j] == z[j]:
             for i in range(m):
                 seen = z[i] == z[i]
@@ -62,7 +74,41 @@ def score_of(row, innovation, cov, numbers, r, z, lower):
                     column[i] -= lower[k, i] * column[k]
                 column[i] /= lower[i, i]
             found -= column[j]
-    return found
+        scores[j] = found
+
+
+@inlined
+def moved_factor(factor, slope, deviation):
+    """The mode of a factor, at least 1, of which the log-likelihood has a slope."""
+    # A root of u^2 + u/slope - deviation^2: the larger one where the slope is positive, else the smaller one.
+    product = 2.0 * slope * deviation**2
+    move = product / (1.0 + (1.0 + 2.0 * slope * product) ** 0.5)
+    return max(factor + move, 1.0) if abs(move) < np.inf else 1.0
+
+
+@inlined
+def stretch_row(table, i, factor, size):
+    """A row's distances from its mean, times a factor."""
+    mean = 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(table.shape[1]):
+        table[i, j] = mean + factor * (table[i, j] - mean)
+
+
+@inlined
+def correlation_of(table, i, k, size):
+    """The sample correlation of two rows of the members; 0 of constants."""
+    mean, other, products, squares, others = 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+        other += table[k, j] / size
+    for j in range(size):
+        d, e = table[i, j] - mean, table[k, j] - other
+        products += d * e
+        squares += d * d
+        others += e * e
+    return products / (squares * others) ** 0.5 if squares * others > 0.0 else 0.0
 
 
 @lru_cache(maxsize=64)
@@ -84,20 +130,68 @@ def with_adaptive_inflation(kernels: Kernels, deviation_place: int) -> Kernels:
         row, table, _ = memory
         spread = row[factor] ** 0.5
         for i in range(n):
-            mean = 0.0
-            for j in range(size):
-                mean += table[i, j] / size
-            for j in range(size):
-                table[i, j] = mean + spread * (table[i, j] - mean)
+            stretch_row(table, i, spread, size)
 
     @inlined
     def update(memory, z, numbers, size):
         update_plainly(memory, z, numbers, size)
         row, _, _ = memory
-        slope = 0.5 * score_of(row, innovation, cov, numbers, r, z, np.zeros((m, m))) / row[factor]
-        # A root of u^2 + u/slope - deviation^2: the larger one where the slope is positive, else the smaller one.
-        product = 2.0 * slope * numbers[deviation_place] ** 2
-        move = product / (1.0 + (1.0 + 2.0 * slope * product) ** 0.5)
-        row[factor] = max(row[factor] + move, 1.0) if abs(move) < np.inf else 1.0
+        scores, total = np.zeros(m), 0.0
+        write_scores(row, innovation, cov, numbers, r, z, np.zeros((m, m)), scores)
+        for k in range(m):
+            total += scores[k]
+        row[factor] = moved_factor(row[factor], 0.5 * total / row[factor], numbers[deviation_place])
 
     return kernels._replace(start=start, predict=predict, update=update, extras=1)
+
+
+@lru_cache(maxsize=64)
+def with_inflation_by_state(
+    kernels: Kernels, functions: Functions, shape: Shape, deviation_place: int, taper_place: int | None
+) -> Kernels:
+    """The same with a factor for each state; tapers (n, m) of states and channels are among the numbers, if any.
+
+    Those of the forecast's correlations that tapers or missing channels leave are `near` (n, m).
+    """
+    n, m = kernels.n, kernels.m
+    places = memory_places(n, m)
+    first, innovation, cov, r = places.extras, places.innovation, places.innovation_cov, number_places(n, m).r
+    start_plainly, predict_plainly, update_plainly = kernels.start, kernels.predict, kernels.update
+    constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
+    observe, silence = functions.observe, silencer(n, shape.measurement_angles)
+    tapers = -1 if taper_place is None else taper_place
+
+    @inlined
+    def start(memory, numbers, size):
+        start_plainly(memory, numbers, size)
+        for i in range(n):
+            memory[0][first + i] = 1.0
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        predict_plainly(memory, u, numbers, size)
+        row, table, _ = memory
+        for i in range(n):
+            stretch_row(table, i, row[first + i] ** 0.5, size)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, _ = memory
+        near, scores, c = np.zeros((n, m)), np.zeros(m), constants(numbers)
+        for j in range(table.shape[1]):
+            store(table, j, observe(state(table, j), c))
+        silence(table, z, size)
+        for i in range(n):
+            for k in range(m):
+                taper = numbers[tapers + i * m + k] if tapers >= 0 else 1.0
+                near[i, k] = taper * abs(correlation_of(table, i, n + k, size)) if taper > 0.0 else 0.0
+        update_plainly(memory, z, numbers, size)
+        write_scores(row, innovation, cov, numbers, r, z, np.zeros((m, m)), scores)
+        for i in range(n):
+            root, slope = row[first + i] ** 0.5, 0.0
+            for k in range(m):
+                slope += 0.5 * scores[k] * near[i, k] / (root * (1.0 + near[i, k] * (root - 1.0)))
+            row[first + i] = moved_factor(row[first + i], slope, numbers[deviation_place])
+
+    rows = max(kernels.table_rows, n + m)
+    return kernels._replace(start=start, predict=predict, update=update, extras=n, table_rows=rows)

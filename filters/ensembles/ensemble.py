@@ -8,7 +8,7 @@ from typing import Any
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import own_place
-from filters.ensembles.adaptive import with_adaptive_inflation
+from filters.ensembles.adaptive import with_adaptive_inflation, with_inflation_by_state
 from filters.ensembles.inflation import inflated, relaxed
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
@@ -16,11 +16,18 @@ from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import covariance, mean, on_branch
 from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.scalars import entries_product
-from thruster_env.numerics.checks import at_least, positive, short_repr
+from thruster_env.numerics.checks import at_least, positive, short_repr, switch
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = "ensemble_size", "rotations", "radius", "adaptive_inflation", "window"  # that no page reads
+OF_THE_ENGINE = (  # parameters that no page reads
+    "ensemble_size",
+    "rotations",
+    "radius",
+    "adaptive_inflation",
+    "inflation_by_state",
+    "window",
+)
 
 
 def advance(model, x, u):
@@ -89,6 +96,7 @@ class EnsembleFilter(FilterWithPage):
         adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast that
             is learnt from the innovations and never below 1, in steps of any length; 0 for none. See
             `filters.ensembles.adaptive`.
+        inflation_by_state: 1 if adaptive_inflation learns a factor for each state, 0 if it is one for all.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
@@ -99,6 +107,7 @@ class EnsembleFilter(FilterWithPage):
     inflation: float = 1.0
     relaxation: float = 0.0
     adaptive_inflation: float = 0.0
+    inflation_by_state: int = 0
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
@@ -113,6 +122,9 @@ class EnsembleFilter(FilterWithPage):
         object.__setattr__(self, "relaxation", relaxation)
         deviation = positive("adaptive_inflation", self.adaptive_inflation, zero_allowed=True)
         object.__setattr__(self, "adaptive_inflation", deviation)
+        switch("inflation_by_state", self.inflation_by_state)
+        if self.inflation_by_state and not deviation:
+            raise ValueError("adaptive_inflation of a filter with inflation_by_state must be positive, but got 0")
 
     @property
     def by_parts(self) -> bool:
@@ -154,7 +166,12 @@ class EnsembleFilter(FilterWithPage):
         """Kernels of a page with adaptive inflation, if it is chosen."""
         if not self.adaptive_inflation:
             return kernels
-        return with_adaptive_inflation(kernels, page.places(own_place(self.kernel_model.shape))["deviation"])
+        model = self.kernel_model
+        places = page.places(own_place(model.shape))
+        if self.inflation_by_state:
+            chosen = model.functions, model.shape, places["deviation"], places.get("taper")
+            return with_inflation_by_state(kernels, *chosen)
+        return with_adaptive_inflation(kernels, places["deviation"])
 
     def analysis(self, functions: Functions, shape: Shape) -> Callable:
         """Return `analyse(memory, z, numbers, size)`: the update of a model's members, without relaxation."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
+from filters.ensembles.adaptive import stretch_row
 from filters.ensembles.ensemble import compare, expect
 from filters.pages.members import MembersMemory, stages_of, works_of
 from filters.pages.page import Page
@@ -106,16 +107,6 @@ def copy_rows(table, source, target, count):
     for i in range(count):
         for j in range(table.shape[1]):
             table[target + i, j] = table[source + i, j]
-
-
-@inlined
-def stretch_row(table, i, factor, size):
-    """A row's distances from its mean, times a factor."""
-    mean = 0.0
-    for j in range(size):
-        mean += table[i, j] / size
-    for j in range(table.shape[1]):
-        table[i, j] = mean + factor * (table[i, j] - mean)
 
 
 @inlined

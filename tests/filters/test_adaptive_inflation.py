@@ -9,7 +9,7 @@ from filters import StateSpaceModel, make_filter, run
 from filters.c.source import c_filter
 from filters.tensors import torch
 from tests.filters.test_localised import ring
-from tests.models import KEY, plane_model, simulated
+from tests.models import KEY, plane_model, random_affine, simulated
 from thruster_env.numerics.compiled import interpreted
 
 DEVIATION = 0.3
@@ -21,13 +21,17 @@ def naive_factor(t, v, s, r):
     def level(other):
         return multivariate_normal.logpdf(v, cov=other / t * (s - r) + r)
 
-    slope = (level(t + 1e-5) - level(t - 1e-5)) / 2e-5
+    return max(t + mode_of((level(t + 1e-5) - level(t - 1e-5)) / 2e-5), 1.0)
+
+
+def mode_of(slope):
+    """Where (1 + slope u) exp(-u^2/(2 deviation^2)) is largest."""
 
     def cost(u):
         return 0.5 * (u / DEVIATION) ** 2 - np.log(max(1.0 + slope * u, 1e-300))
 
     found = minimize_scalar(cost, bounds=(-DEVIATION, DEVIATION), method="bounded", options={"xatol": 1e-12})
-    return max(t + found.x, 1.0)
+    return found.x
 
 
 @pytest.mark.usefixtures("as_python")
@@ -58,6 +62,56 @@ def test_each_step_stretches_and_each_update_adapts(name):
     assert max(seen) > 1.2 and len(set(seen)) > 4
     again, _ = adaptive.update(adaptive.predict(belief, u), np.full(model.m, np.nan))
     assert again.extras[0] == belief.extras[0]
+
+
+def naive_factors(t, members, y, v, s, r, taper):
+    """The next factor of each state: the likelihood of all channels, of which A is stretched where x_i shows."""
+    found = []
+    for i, factor in enumerate(t):
+        c = np.array([taper[i, k] * abs(np.corrcoef(members[i], y[k])[0, 1]) for k in range(len(v))])
+
+        def level(other, factor=factor, c=c):
+            d = (1.0 + c * (other**0.5 - 1.0)) / (1.0 + c * (factor**0.5 - 1.0))
+            return multivariate_normal.logpdf(v, cov=d[:, None] * (s - r) * d + r)
+
+        slope = (level(factor + 1e-5) - level(factor - 1e-5)) / 2e-5
+        found.append(max(factor + mode_of(slope), 1.0))
+    return found
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["enkf", "etkf", "letkf 2", "denkf 2"])
+def test_each_state_has_a_factor_of_its_own(name):
+    kind, _, radius = name.partition(" ")
+    own = {"radius": float(radius)} if radius else {}
+    model = ring() if radius else plane_model()
+    numbers = {"adaptive_inflation": DEVIATION, "inflation_by_state": 1}
+    plain, adaptive = (make_filter(kind, model, ensemble_size=8, **own, **given) for given in ({}, numbers))
+    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 10)
+    z[0, 4, 0] = np.nan
+    u, belief, n = np.zeros(model.inputs), adaptive.init(KEY), model.n
+    assert belief.extras.tolist() == [1.0] * n
+    taper = adaptive.tapers["taper"] if radius else np.ones((n, model.m))
+    for k in range(10):
+        factors, here = belief.extras.copy(), ~np.isnan(z[0, k])
+        forecast = adaptive.predict(belief, u)
+        other = plain.predict(belief._replace(extras=np.empty(0)), u)
+        mean = other.members.mean(axis=1, keepdims=True)
+        stretched = mean + factors[:, None] ** 0.5 * (other.members - mean)
+        np.testing.assert_allclose(forecast.members, stretched, rtol=1e-12)
+        belief, innovation = adaptive.update(forecast, z[0, k])
+        same, _ = plain.update(forecast._replace(extras=np.empty(0)), z[0, k])
+        np.testing.assert_allclose(belief.members, same.members, rtol=1e-12)
+        v, both = innovation.value[here], np.ix_(here, here)
+        y = np.array([model.functions.observe(tuple(x), model.constants) for x in forecast.members.T]).T[here]
+        r = model.measurement_noise_cov[both]
+        expected = naive_factors(
+            factors, forecast.members, y, v, innovation.cov[both], r, np.array(taper)[:, here]
+        )
+        np.testing.assert_allclose(belief.extras, expected, rtol=1e-5)
+    assert len(set(belief.extras)) > 1
+    again, _ = adaptive.update(adaptive.predict(belief, u), np.full(model.m, np.nan))
+    np.testing.assert_array_equal(again.extras, belief.extras)
 
 
 def walk(x, u, c):
@@ -95,8 +149,63 @@ def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
     assert abs(squares(0.1, 0.1) - 1.0) < 0.2
 
 
+@pytest.mark.usefixtures("as_python")
+def test_of_one_state_it_is_the_factor_of_all_however_many_channels_see_it():
+    model = random_affine(1, 3, 1, seed=2)
+    inputs, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 20)
+    own = {"ensemble_size": 8, "adaptive_inflation": DEVIATION}
+    settings = {"inflation_by_state": 1}, {}, {"adaptive_inflation": 0.0}
+    each, one, none = (run(make_filter("etkf", model, **own | given), None, inputs, z).covs for given in settings)
+    np.testing.assert_allclose(each, one, rtol=1e-10)
+    assert abs(none / one - 1.0).max() > 0.1
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_factor_grows_of_the_state_whose_q_is_too_small():
+    """Two bodies that do not touch: the noise of the second is a hundred times what the filter believes."""
+
+    def both(x, u, c):
+        return (*walk(x[:2], u, c), *walk(x[2:], u, c))
+
+    def places(x, c):
+        return (x[0], x[2])
+
+    def pair(noise):
+        return StateSpaceModel(
+            transition=both,
+            observe=places,
+            process_noise_cov=[1e-4, 0.001, 1e-4, noise],
+            measurement_noise_cov=[0.04, 0.04],
+            prior_mean=np.zeros(4),
+            prior_cov=[0.04, 0.1, 0.04, 0.1],
+            inputs=0,
+        )
+
+    _, z = simulated(pair(0.1), 150, count=4)
+
+    def squares(**own):
+        filter_ = make_filter("etkf", pair(0.001), ensemble_size=30, adaptive_inflation=0.3, **own)
+        found = run(filter_, None, None, z)
+        s = np.einsum("bkii->bki", found.innovation_covs)
+        return (found.innovations**2 / s)[:, 30:].mean(axis=(0, 1)), s[:, 30:, 0].mean()
+
+    (_, second), spread = squares(inflation_by_state=1)
+    (_, of_all), wide = squares()
+    assert second < 2.0 and of_all < 2.5
+    assert spread < 0.9 * wide  # the first body's forecast stays narrow
+
+
 def test_compiled_code_and_python_are_one():
     filter_ = make_filter("etkf", plane_model(), ensemble_size=9, adaptive_inflation=0.2, rotations=1)
+    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
+    with interpreted():
+        expected = run(filter_, None, inputs, z)
+    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_compiled_code_and_python_are_one_with_a_factor_for_each_state():
+    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, adaptive_inflation=0.2, inflation_by_state=1)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
     with interpreted():
         expected = run(filter_, None, inputs, z)
@@ -111,3 +220,7 @@ def test_pages_alone_and_wrong_numbers_are_refused():
             use(filter_)
     with pytest.raises(ValueError, match="adaptive_inflation must be zero or positive, but got -1"):
         make_filter("etkf", plane_model(), adaptive_inflation=-1)
+    with pytest.raises(ValueError, match="with inflation_by_state must be positive, but got 0"):
+        make_filter("etkf", plane_model(), inflation_by_state=1)
+    with pytest.raises(ValueError, match="inflation_by_state must be 0 or 1, but got 2"):
+        make_filter("etkf", plane_model(), adaptive_inflation=0.1, inflation_by_state=2)
