@@ -77,16 +77,16 @@ def window_stages(length: int) -> Callable:
         m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
         row = memory_places(memory.shape.n, m)
         Y, B = (
-            given(Place("table", at), (m,), member=True, beside=memory.x) for at in (places.slopes, places.pull)
+            given(Place("table", at), (m,), member=True, like=memory.x) for at in (places.slopes, places.pull)
         )
-        v = memory.beside("rows", places.innovation, m)
-        S = memory.beside("rows", places.innovation_cov, m, m, symmetric=True)
+        v = memory.read("rows", places.innovation, m)
+        S = memory.read("rows", places.innovation_cov, m, m, symmetric=True)
         first, _, first_v, first_S, R, level = compare(model, memory.x, z)
         later, later_v = seen_anew(model, expect(model, memory.x, z), z, Y, v, S, R)
         later_S = covariance(later, later) + R
         told = row.innovation, row.innovation_cov, row.log_likelihood
         plain = stages_of(page, memory, model)
-        noise = given(Place("table", places.moved), (memory.shape.n,), member=True, beside=memory.x)
+        noise = given(Place("table", places.moved), (memory.shape.n,), member=True, like=memory.x)
         return {
             **{name: plain[name] for name in ("start", "advance", "summarise")},
             "draw": stored((model.Q_root @ memory.w,), (noise,)),
