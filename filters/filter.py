@@ -40,6 +40,11 @@ class Filter:
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 
+    @property
+    def runs_again(self) -> bool:
+        """Whether an update runs earlier steps again, with the model's constants of now."""
+        return False
+
     def kernels(self) -> Kernels:
         """The plain functions of this filter type for the shape of its model."""
         raise TypeError(f"{type(self).__name__} has no kernels: use one of its subclasses")

@@ -16,6 +16,7 @@ from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places, own_place
 from thruster_env.numerics.checks import as_floats, covariance, finite, positive
 from thruster_env.numerics.direct import direct
+from thruster_env.plants.diffusion import same_dt
 from thruster_env.plants.layout import number_places, with_root
 from thruster_env.plants.steps import sample_time_place
 
@@ -134,9 +135,14 @@ class Session:
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
-        Raises ValueError for a model without such a constant, a filter of several models, or another number.
+        Raises ValueError for a model without such a constant, a filter of several models, one that runs earlier
+        steps again, if dt is not that of those, or another number.
         """
         place, parts = self._dt_place
+        if self._filter.runs_again and not same_dt(positive("dt", dt), self.sample_time):
+            raise ValueError(
+                f"dt of {self._name!r} with a window must stay {self.sample_time:g} s, but got {dt:g}"
+            )
         self._numbers[place] = positive("dt", dt) / parts
 
     @property

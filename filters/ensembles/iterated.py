@@ -58,7 +58,8 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     Attributes:
         iterations: evaluations of h by all members in an update, 1 to 20; with a window, each with its steps of f.
         window: steps L that an update estimates anew, 0 to 1000; 0 leaves the motion as predicted. With a window
-            inflation and relaxation act on x_0 and the noise, and there is no adaptive_inflation.
+            inflation and relaxation act on x_0 and the noise, there is no adaptive_inflation, and the sample time
+            stays.
             The others are those of `EnsembleFilter`.
 
     Raises:
@@ -90,6 +91,11 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     @property
     def by_parts(self) -> bool:
         """Whether an update runs the motion again, too, and is more than the page."""
+        return bool(self.window)
+
+    @property
+    def runs_again(self) -> bool:
+        """Whether an update runs earlier steps again: with a window."""
         return bool(self.window)
 
     def kernels(self) -> Kernels:
