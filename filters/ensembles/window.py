@@ -76,9 +76,7 @@ def window_stages(length: int) -> Callable:
     def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
         m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
         row = memory_places(memory.shape.n, m)
-        Y, B = (
-            given(Place("table", at), (m,), member=True, like=memory.x) for at in (places.slopes, places.pull)
-        )
+        Y, B = (given(Place("table", at), (m,), member=True, like=memory.x) for at in (places.slopes, places.pull))
         v = memory.read("rows", places.innovation, m)
         S = memory.read("rows", places.innovation_cov, m, m, symmetric=True)
         first, _, first_v, first_S, R, level = compare(model, memory.x, z)
