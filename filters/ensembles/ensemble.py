@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from filters.engine.belief import Kernels
+import numpy as np
+
+from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import own_place
 from filters.ensembles.adaptive import with_adaptive_inflation, with_inflation_by_state
 from filters.ensembles.inflation import inflated, relaxed
@@ -156,6 +158,10 @@ class EnsembleFilter(FilterWithPage):
         if inflation:
             page = page._replace(settle=inflated(page.settle))
         return page._replace(update=relaxed(page.update)) if relaxation else page
+
+    def sample(self, belief: Belief) -> np.ndarray:
+        """The members of a belief, (n, N), without what a filter keeps beside them."""
+        return belief.members[: self.kernel_model.n]
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""

@@ -59,7 +59,7 @@ def record_members(
                 session.step(inputs[b, k - 1], measurements[b, k])
             place, off = divmod(k - first, every)
             if place >= 0 and off == 0:
-                kept[b, place] = filter_.sample(session.belief())[:rows]
+                kept[b, place] = filter_.sample(session.belief())
     if rows == n:
         return Members(kept, None, steps)
     weights = np.exp(kept[:, :, n] - kept[:, :, n].max(axis=-1, keepdims=True))  # row n holds their logarithms
