@@ -7,7 +7,6 @@ import importlib.util
 import inspect
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
+from pages import filter_horizon, filter_particles
 from thruster_env.channels import CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -210,10 +210,12 @@ def test_the_table_of_info_is_that_of_the_wrapper():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["plant", "filters"])
-def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
+def test_pictures_and_tables_are_those_of_the_code(page, tmp_path, monkeypatch):
     pytest.importorskip("pygame")
+    monkeypatch.setattr(filter_particles, "SIZES", (20, 50))  # of a picture alone, which takes minutes otherwise
+    monkeypatch.setattr(filter_horizon, "LENGTHS", (5, 10))
     shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
-    subprocess.run([sys.executable, "-m", SCRIPTS[page], str(tmp_path)], cwd=ROOT, check=True)
+    importlib.import_module(SCRIPTS[page]).main([str(tmp_path)])
     anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))
     assert anew[::2] == here[::2]
     assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
