@@ -18,7 +18,7 @@ from thruster_env.rendering.history import Moment, Overlay
 def frames(monkeypatch):
     """What would go into the video."""
     kept = []
-    monkeypatch.setattr(episodes, "write_film", lambda path, pictures, rate: kept.append((path, pictures, rate)))
+    monkeypatch.setattr(episodes, "write_video", lambda path, pictures, rate: kept.append((path, pictures, rate)))
     return kept
 
 
@@ -37,7 +37,7 @@ def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
 def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
     seen = []
-    monkeypatch.setattr(episodes, "_shown", spy(episodes._shown, seen))
+    monkeypatch.setattr(episodes, "_played", spy(episodes._played, seen))
     found = as_json("play", *option, "--steps", 8, "--preset", "t200", "--seed", 3, "--out", "x.gif")
     assert found["steps"] == 8
     env = seen[0]
