@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from thruster_cli.output import (
     progress_console,
     table,
 )
+from thruster_env.numerics.checks import one_of
 from thruster_env.numerics.threads import cores
 from thruster_env.training.extras import check_installed
 
@@ -33,6 +35,11 @@ CAPTION = (
     "Goals are the most that a ratio, a multiple of the limit, or a time may be."
 )
 
+PARTS = (
+    *("steps", "vectors", "vector_filters", "batches", "c_code", "horizon", "vehicles", "trajectories"),
+    *("studies", "assimilation", "policies", "processes"),
+)
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
@@ -41,6 +48,9 @@ def command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Few rounds: shows that all runs; the times are rough.")
     ] = False,
+    part: Annotated[
+        list[str] | None, typer.Option(help=f"Measure these parts only: {', '.join(PARTS)}.", show_default=False)
+    ] = None,
     page: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the table into a page anew: docs/speed.md.")
     ] = None,
@@ -57,46 +67,24 @@ def command(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
     check_installed()
+    parts = [one_of("part", name, PARTS) for name in part or PARTS]
     if page is not None:
+        if part:
+            raise ValueError(f"--part must go without --page, which has all parts, but got --page {page}")
         if quick:
             raise ValueError(f"--quick must go without --page, for its times are rough, but got --page {page}")
         check_page(page)
     check_targets([page], json)
     # After the checks: they import FilterPy, or Stable-Baselines3.
-    from benchmarks import (
-        assimilation,
-        batches,
-        c_code,
-        horizon,
-        policies,
-        processes,
-        steps,
-        studies,
-        trajectories,
-        vector_filters,
-        vectors,
-        vehicles,
-    )
+    modules = [importlib.import_module(f"benchmarks.{name}") for name in parts]
+    from benchmarks import studies, vectors
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring the machine's arithmetic ...") as status:
-        for part in (
-            steps,
-            vectors,
-            vector_filters,
-            batches,
-            c_code,
-            horizon,
-            vehicles,
-            trajectories,
-            studies,
-            assimilation,
-            policies,
-            processes,
-        ):
+        for module in modules:
             measure_again()
-            for row in part.rows(seed, quick):
+            for row in module.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")
         status.update("memory of the study ...")
