@@ -120,7 +120,7 @@ def test_a_page_of_arrays_is_the_filter_by_calls(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["enkf", "etkf", "letkf"])
+@pytest.mark.parametrize("name", ["enkf", "letkf"])
 def test_a_page_of_arrays_is_the_filter_of_a_large_model(name):
     assert_page_is_the_filter(make_filter(name, random_affine(38, 8, 1), ensemble_size=45, **CHOICES[name]))
 

@@ -102,7 +102,7 @@ LIGHT = {  # each of the others is compiled for a second or two
         pytest.param(case, objective, marks=[] if (case, objective) in LIGHT else pytest.mark.slow)
         for case in CASES
         for objective in OBJECTIVE
-        if (case, objective) in LIGHT or objective in ("likelihood", "score")
+        if (case, objective) in LIGHT or objective == "likelihood"
     ],
 )
 def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_of_differences(case, objective):

@@ -80,7 +80,9 @@ def test_every_problem_of_the_panel_passes_the_checks_of_a_problem():
 
 
 @of_filters(PAGES)
-def test_a_filter_runs_with_what_its_user_had(page):
+def test_a_filter_runs_with_what_its_user_had(page, request):
+    if page not in QUICK and named(page) != "reactor":  # its substeps take minutes in Python
+        request.getfixturevalue("as_python")
     problem = page.problem
     data = problem.data(SEEDS)
     found = evaluate(make_filter("ekf", problem.model()), data, problem.scale)
