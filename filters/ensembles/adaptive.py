@@ -87,6 +87,17 @@ def moved_factor(factor, slope, deviation):
 
 
 @inlined
+def row_moments(table, i, size):
+    """Mean and sample variance of a row of the members."""
+    mean, squares = 0.0, 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(size):
+        squares += (table[i, j] - mean) ** 2
+    return mean, squares / (size - 1)
+
+
+@inlined
 def stretch_row(table, i, factor, size):
     """A row's distances from its mean, times a factor."""
     mean = 0.0

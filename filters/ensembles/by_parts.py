@@ -15,6 +15,7 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import own_place
+from filters.ensembles.adaptive import row_moments
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import compare
 from filters.ensembles.localised import LocalisedFilter
@@ -38,17 +39,6 @@ def look(model, x, z, e):
 
 
 @inlined
-def moments_of(table, i, size):
-    """Mean and sample variance of a row of the members."""
-    mean, squares = 0.0, 0.0
-    for j in range(size):
-        mean += table[i, j] / size
-    for j in range(size):
-        squares += (table[i, j] - mean) ** 2
-    return mean, squares / (size - 1)
-
-
-@inlined
 def transform_state(table, i, y, v, taper, size):
     """The transform filter for state i, with R of a channel over its taper; y (m, N) and v have the R of 1."""
     inner, along, near = np.zeros((size, size)), np.zeros(size), False
@@ -59,7 +49,7 @@ def transform_state(table, i, y, v, taper, size):
                 along[j] += taper[k] * y[k, j] * v[k]
                 for other in range(size):
                     inner[j, other] += taper[k] * y[k, j] * y[k, other]
-    mean, _ = moments_of(table, i, size)
+    mean, _ = row_moments(table, i, size)
     total = mean
     for j in range(size):
         inner[j, j] += size - 1.0
@@ -101,7 +91,7 @@ def regress(table, n, y, moves, tapers, k, size):
         squares += y[k, j] ** 2
     for i in range(n):
         if tapers[i, k] > 0.0 and squares > 0.0:
-            mean, _ = moments_of(table, i, size)
+            mean, _ = row_moments(table, i, size)
             slope = 0.0
             for j in range(size):
                 slope += (table[i, j] - mean) * y[k, j]
@@ -144,7 +134,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
             store(table, j, observe(state(table, j), c))
         silence(table, z, size)
         for k in range(m):
-            mean, _ = moments_of(table, n + k, size)
+            mean, _ = row_moments(table, n + k, size)
             v[k] = wrapped(z[k] - mean) if angles[k] else z[k] - mean
             for j in range(size):
                 y[k, j] = table[n + k, j] - mean
@@ -166,7 +156,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
         tapers = numbers[taper : taper + n * m].reshape((n, m))
         y, v, root, moves, before = np.empty((m, size)), np.empty(m), np.zeros((m, m)), np.empty(size), np.empty(n)
         for i in range(n):
-            _, before[i] = moments_of(table, i, size)
+            _, before[i] = row_moments(table, i, size)
         root_of(numbers, first, z, root)
         expect(table, z, numbers, size, root, y, v)
         if serial:
@@ -181,7 +171,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
                 transform_state(table, i, y, v, tapers[i], size)
         if numbers[relaxation] > 0.0:
             for i in range(n):
-                mean, after = moments_of(table, i, size)
+                mean, after = row_moments(table, i, size)
                 if after > 0.0:
                     factor = 1.0 + numbers[relaxation] * ((before[i] / after) ** 0.5 - 1.0)
                     for j in range(size):

@@ -57,7 +57,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
 
     Attributes:
         iterations: evaluations of h by all members in an update, 1 to 20; with a window, each with its steps of f.
-        window: steps L that an update estimates anew, 0 to 1000; 0 leaves the motion as predicted. With a window
+        window: steps L that an update estimates again, 0 to 1000; 0 leaves the motion as predicted. With a window
             inflation and relaxation act on x_0 and the noise, there is no adaptive_inflation, and the sample time
             stays.
             The others are those of `EnsembleFilter`.

@@ -1,4 +1,4 @@
-"""The iterated ensemble filter over a window of steps: its start and its process noise are estimated anew.
+"""The iterated ensemble filter over a window of steps, whose start and process noise it estimates again.
 
     window   x_0j the members L steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
     motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... L, so that y_j = h(x_Lj) is a function of all these
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
-from filters.ensembles.adaptive import stretch_row
+from filters.ensembles.adaptive import row_moments, stretch_row
 from filters.ensembles.ensemble import compare, expect
 from filters.pages.members import MembersMemory, stages_of, works_of
 from filters.pages.page import Page
@@ -124,17 +124,6 @@ def pull_row(table, source, target, slopes, pulls, count, size):
             table[target, j] += slope * table[pulls + k, j]
 
 
-@inlined
-def spread_of(table, i, size):
-    """Root mean square distance of a row from its mean."""
-    mean, squares = 0.0, 0.0
-    for j in range(size):
-        mean += table[i, j] / size
-    for j in range(size):
-        squares += (table[i, j] - mean) ** 2
-    return (squares / size) ** 0.5
-
-
 @lru_cache(maxsize=64)
 def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, iterations: int) -> Kernels:
     """Kernels of a window of `length` steps; the page's `model.own` has inflation and relaxation.
@@ -239,9 +228,13 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
                 for i in range(rows):
                     pull_row(table, window + i, moved + i, slopes, pulls, m, size)
                     if iteration == iterations and numbers[relaxation] > 0.0:
-                        before, after = spread_of(table, window + i, size), spread_of(table, moved + i, size)
+                        (_, before), (_, after) = (
+                            row_moments(table, window + i, size),
+                            row_moments(table, moved + i, size),
+                        )
                         if after > 0.0:
-                            stretch_row(table, moved + i, 1.0 + numbers[relaxation] * (before / after - 1.0), size)
+                            factor = 1.0 + numbers[relaxation] * ((before / after) ** 0.5 - 1.0)
+                            stretch_row(table, moved + i, factor, size)
                 run_window(memory, moved, numbers, size)
                 if iteration < iterations:
                     again(row, z, numbers, table, draws, size)

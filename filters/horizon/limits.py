@@ -68,7 +68,7 @@ def force(rows, adjoint, n, at):
 
 
 @inlined
-def set_changed(given, place, side, wrong, single):
+def change_side(given, place, side, wrong, single):
     """Let another bound hold, unless bounds change one by one and one has; returns how many were wrong."""
     if given[place] == side:
         return wrong
@@ -131,7 +131,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                 push = force(rows, at.after, n, holds + i * size)
                 rows[at.after + i] += push
                 if s > 0.0 and side * push * s**0.5 > ENOUGH:
-                    wrong = set_changed(given, held + i, 0.0, wrong, single)
+                    wrong = change_side(given, held + i, 0.0, wrong, single)
         return wrong
 
     @inlined
@@ -141,7 +141,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                 if given[held_states + i] == 0.0:
                     spread = rows[at.cov + i * n + i] ** 0.5
                     side = side_of(rows[at.found + i], lows[i], highs[i], spread)
-                    wrong = set_changed(given, held_states + i, side, wrong, single)
+                    wrong = change_side(given, held_states + i, side, wrong, single)
         return wrong
 
     @inlined
@@ -157,7 +157,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
             if given[held_disturbances + i] == 0.0:
                 spread = rows[at.spread + i]
                 side = side_of(rows[at.disturbance + i], -sigma * spread, sigma * spread, spread)
-                wrong = set_changed(given, held_disturbances + i, side, wrong, single)
+                wrong = change_side(given, held_disturbances + i, side, wrong, single)
         return wrong
 
     return Limits(clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set)

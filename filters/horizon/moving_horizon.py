@@ -42,7 +42,7 @@ class MovingHorizonFilter(Filter):
         huber      rho = r^2/2 up to the threshold k, from there on k r - k^2/2
         student    rho = (k^2 + d)/2 log(1 + r^2/k^2), of Student's t with k^2 degrees of freedom, for d channels
 
-    The latter two divide R by a weight rho'(r)/r, which each pass computes anew. Bounds of states are the model's
+    The latter two divide R by a weight rho'(r)/r, which each pass computes again. Bounds of states are the model's
     `bounds`; its `bounded_by` has no meaning here. Components that are at a bound are found by an active set. If
     bounds of states and disturbances leave no room between them, the states keep theirs.
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from filters.particles.motion import add_noise, ensemble_motion
+from filters.particles.motion import add_noise, clear_noise, ensemble_motion
 from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import (
@@ -62,22 +62,16 @@ def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> 
     )
 
     @inlined
-    def forget_noise(table):
-        for i in range(n):
-            for j in range(table.shape[1]):
-                table[noise + i, j] = 0.0
-
-    @inlined
     def start(memory, numbers, size):
         draw_prior(memory, numbers, size)
         set_equal(memory, size)
-        forget_noise(memory[1])
+        clear_noise(memory[1], noise, n)
 
     @inlined
     def predict(memory, u, numbers, size):
         _, table, draws = memory
         move(memory, u, numbers, size)
-        forget_noise(table)
+        clear_noise(table, noise, n)
         add_noise(table, noise, n, draws, numbers, q_root_place)  # of the very draws that moved the particles
 
     @inlined
@@ -120,7 +114,7 @@ def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> 
             for j in range(table.shape[1]):
                 table[logarithms, j] -= distance(observe(state(table, j), c), sensor)
             row[likelihood_place] = first_stage + weigh(memory, size) - math.log(size) + level(sensor)
-            forget_noise(table)
+            clear_noise(table, noise, n)
         else:
             summarise(memory, size)
 

@@ -27,6 +27,14 @@ def add_noise(table, first, count, draws, numbers, root):
                     table[first + i, j] += factor * draws[k * width + j]
 
 
+@inlined
+def clear_noise(table, first, count):
+    """Rows first ... become zero."""
+    for i in range(count):
+        for j in range(table.shape[1]):
+            table[first + i, j] = 0.0
+
+
 @cache
 def drawer(n: int, m: int) -> Callable:
     """Return `draw(draws, count, row, stream)`: fill draws with a stream's normals of the belief's step."""

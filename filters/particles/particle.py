@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 from filters.baselines.baselines import places_of
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
-from filters.particles.motion import add_noise, drawer, ensemble_motion
+from filters.particles.motion import add_noise, clear_noise, drawer, ensemble_motion
 from filters.particles.proposal import proposal_works
 from filters.particles.regularisation import constants_spreader, cov_spreader, kernel_spreader
 from filters.particles.weighted import ResampledFilter, anything_measured, particle_parts
@@ -115,9 +115,7 @@ def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
         row, table, _ = memory
         for i in range(n * n):
             row[noise_cov + i] = 0.0
-        for i in range(n):
-            for j in range(table.shape[1]):
-                table[noise + i, j] = 0.0
+        clear_noise(table, noise, n)
 
     @inlined
     def start_without_noise(memory, numbers, size):
@@ -167,7 +165,7 @@ class ParticleFilter(ResampledFilter):
                  ESS = 1/(sum of w_j^2)
         belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
-    That is the bootstrap filter. With the optimal proposal an update draws each particle anew, given z:
+    That is the bootstrap filter. With the optimal proposal an update draws each particle again, given z:
 
         v_j = z - h(mu_j),  S_j = H_j Q H_j' + R,  K_j = Q H_j' S_j^-1,  H_j = dh/dx at mu_j
         noise_j += K_j (v_j - H_j noise_j - r_j),  r_j ~ N(0, R),  x_j = mu_j + noise_j
@@ -178,7 +176,7 @@ class ParticleFilter(ResampledFilter):
     extended filter per particle, and the weight corrects what the tangent neglects. It needs the noise of the
     prediction: directly after the prior or another update, an update is the bootstrap filter's.
 
-    If `resampling` is "gaussian", particles are drawn anew from N(mean, cov), where others are resampled: the
+    If `resampling` is "gaussian", particles are drawn again from N(mean, cov), where others are resampled: the
     Gaussian particle filter, if the threshold is 1.
 
     If states are `smoothed`, the kernel spreads these alone, and draws them together, so that their covariance
