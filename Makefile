@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 CONSTRAINTS := constraints.txt
 # Python compiles a module when it is first imported; most of torch, scipy and others never are, and it is half of an install.
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile $(addprefix -c ,$(CONSTRAINTS))
-TEST_EXTRAS := rl,render,peers,db,samplers,nuts,parquet,recorders,units,frames,explore,dev,torch
+TEST_EXTRAS := rl,render,peers,db,samplers,nuts,parquet,recorders,units,frames,explore,dev,torch,learned
 BENCH_EXTRAS := rl,peers,bench
 DOCS_EXTRAS := docs,rl,frames
 ARGS :=

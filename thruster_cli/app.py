@@ -18,7 +18,7 @@ PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
     "Tune and evaluate a filter": ("tune", "explore", "ways", "evaluate", "report", "verify", "export", "compare"),
     "Recorded logs": ("log", "identify", "estimate"),
-    "Policies": ("train", "score", "play"),
+    "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
     "Published results and long studies": ("reproduce", "study"),
 }
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
@@ -59,7 +59,7 @@ class Commands(TyperGroup):
         if self._listing:
             return listed(name)
         if name not in self._made:
-            module = imported(f"thruster_cli.{name}")
+            module = imported(f"thruster_cli.{file_of(name)}")
             alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
             if hasattr(module, "app"):
                 alone = module.app
@@ -70,9 +70,14 @@ class Commands(TyperGroup):
         return self._made[name]
 
 
+def file_of(name: str) -> str:
+    """The name of a command's module."""
+    return name.replace("-", "_")
+
+
 def listed(name: str) -> TyperCommand:
     """A command with its name, panel and help alone, read from its file."""
-    tree = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
+    tree = ast.parse(Path(__file__).with_name(f"{file_of(name)}.py").read_text(encoding="utf-8"))
     functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == "command"]
     text = ast.get_docstring(functions[0] if functions else tree) or ""
     return TyperCommand(

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from filters.estimators.find import is_trained
 from filters.registry import FILTERS
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
@@ -28,7 +29,8 @@ from tuning.thruster.logs import of_preset
 
 def command(
     files: Annotated[
-        list[Path] | None, typer.Argument(metavar="FILE", help="Tuned files, as `thruster tune` writes them.")
+        list[Path] | None,
+        typer.Argument(metavar="FILE", help="Files of `thruster tune` and `thruster train-estimator`."),
     ] = None,
     filters: Annotated[
         list[str] | None,
@@ -81,14 +83,16 @@ def command(
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
-    chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
+    trained = [str(file) for file in files or [] if is_trained(file)]
+    files = [file for file in files or [] if not is_trained(file)]
+    chosen = [find_problem(name) for name in scenarios or []] or [_default(files)]
     chosen = [of_preset(one, preset) for one in chosen]
-    for file, problem in product(files or [], chosen):
+    for file, problem in product(files, chosen):
         read_choice(file, problem)  # a clear error for a file that is for another plant
-    names = filters or ([] if files else list(DEFAULT_FILTERS))
+    names = [*trained, *(filters or ([] if files or trained else DEFAULT_FILTERS))]
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(unknown_in, augment or []))
     knows = knowledge_on(chosen) if knows is None else knows
-    some, left_out = without_unfit([*(files or []), *names], chosen)
+    some, left_out = without_unfit([*files, *names], chosen)
     contenders = contenders_of(some, knows, unknown, sizes, seed)
     for problem in chosen:
         problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs

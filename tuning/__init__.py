@@ -8,6 +8,8 @@
     explore     a page on which one tunes by hand, and sees at once what comes of it
     report      a page on a tuned filter that any browser shows
 
+    train_estimator   an estimator with a network, trained on a problem's runs
+
 Each does what the command of its name does, in one call. A problem is a name, such as "mismatch" or "auv:motion",
 a `Problem`, "module:object", or a pair (model, data) of a model and recorded runs.
 """
@@ -24,9 +26,10 @@ if TYPE_CHECKING:
     from tuning.api.explore import explore
     from tuning.api.identify import identify
     from tuning.api.report import report
+    from tuning.api.train_estimator import train_estimator
     from tuning.api.tune import tune
 
-__all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "tune"]
+__all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "train_estimator", "tune"]
 
 
 def __getattr__(name: str) -> Any:

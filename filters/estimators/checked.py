@@ -125,6 +125,8 @@ def log_likelihoods(
         gaussian: whether the likelihood is Gaussian.
     """
     there = ~np.isnan(measurements)
+    if not gaussian:
+        return np.where(there.any(axis=-1), np.nan, 0.0)
     pairs = there[..., :, None] & there[..., None, :]
     s = np.where(pairs, covs, np.eye(covs.shape[-1]))
     v = np.where(there, innovations, 0.0)
@@ -134,7 +136,7 @@ def log_likelihoods(
     s = np.where(definite[..., None, None], s, np.eye(covs.shape[-1]))
     squares = (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(axis=-1)
     found = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + there.sum(axis=-1) * math.log(2.0 * math.pi))
-    return np.where(there.any(axis=-1), np.where(definite & gaussian, found, np.nan), 0.0)
+    return np.where(there.any(axis=-1), np.where(definite, found, np.nan), 0.0)
 
 
 def without_missing(output: Output, z: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -1,7 +1,8 @@
-"""Estimators that a user gives: an object, what makes one for a model, or "module:object" for either."""
+"""Estimators that a user gives: an object, what makes one for a model, "module:object", or a trained file."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from filters.estimators.estimator import is_estimator
@@ -11,14 +12,27 @@ from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import is_code, object_named, said
 from thruster_env.plants.state_space import StateSpaceModel
 
+TRAINED = ".safetensors"  # the end of the name of a trained estimator's file
+
+
+def is_trained(given) -> bool:
+    """Whether something is the name of a file of `thruster train-estimator`."""
+    return isinstance(given, str | Path) and str(given).endswith(TRAINED)
+
 
 def is_foreign(given) -> bool:
     """Whether something stands for an estimator of another package, and is not the name of a filter."""
-    return is_code(given) or (not isinstance(given, str) and (is_estimator(given) or callable(given)))
+    return (
+        is_trained(given)
+        or is_code(given)
+        or (not isinstance(given, str) and (is_estimator(given) or callable(given)))
+    )
 
 
 def label_of(given) -> str:
-    """The label of a user's estimator: "module:object", its own name, or the name of its factory."""
+    """The label of a user's estimator: "module:object", its own name, that of its factory, or of its file."""
+    if is_trained(given):
+        return Path(given).stem
     if isinstance(given, str):
         return given
     for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
@@ -38,7 +52,7 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
 
     Args:
         given: an estimator; a function, or class, of a model (and of `numbers`) that makes one, or a `Filter`; or
-            "module:object" for any of these.
+            "module:object" for any of these; or the file of a trained estimator.
         model: of states, inputs and measurements: what a function gets, and where names and angles come from.
         **numbers: further arguments of the function.
 
@@ -57,7 +71,11 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
 
 
 def estimator_named(given) -> Any:
-    """A user's estimator argument: the object of "module:object", or the object itself."""
+    """A user's estimator argument: what a trained one's file makes, the object of "module:object", or itself."""
+    if is_trained(given):
+        from filters.learned import read_estimator
+
+        return read_estimator(given)
     return object_named(given, "estimator") if isinstance(given, str) else given
 
 

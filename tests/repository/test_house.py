@@ -46,7 +46,7 @@ TUNING_OF_PLANTS = {
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
 PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
-OF_TENSORS = "filters/tensors"  # filters for models with a network in them
+OF_TENSORS = "filters/tensors/", "filters/learned/", "tuning/learning/"  # networks in models and estimators
 
 
 @cache
@@ -133,9 +133,9 @@ def test_only_training_imports_packages_that_learn_policies():
     assert not those(lambda path: packages_of(path) & LEARNING - {"torch"} and own_package_of(path) != TRAINING)
 
 
-def test_torch_is_imported_by_training_and_by_filters_on_tensors_alone():
+def test_torch_is_imported_by_training_and_where_networks_are_alone():
     knowing = those(lambda path: "torch" in packages_of(path) and own_package_of(path) != TRAINING)
-    assert knowing and all(name.startswith(f"{OF_TENSORS}/") for name in knowing)
+    assert knowing and all(name.startswith(OF_TENSORS) for name in knowing)
     outside = [path for path in FILES if not path.relative_to(ROOT).as_posix().startswith(OF_TENSORS)]
     of_tensors = {name for path in outside for name in imports_of(path) if name.startswith("filters.tensors")}
     assert of_tensors == {"filters.tensors", "filters.tensors.torch"}  # which imports torch when it is called

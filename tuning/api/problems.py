@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from filters.estimators.find import is_foreign
+from filters.estimators.find import is_foreign, is_trained
 from filters.registry import FILTERS, filter_class
 from filters.tuned_file import read_tuned_file
 from thruster_env.numerics.checks import short_repr
@@ -77,9 +77,13 @@ def given_for(file: str | Path, problem: Any = None, model: str | None = None, *
 def is_filter(given: Any) -> bool:
     """Whether something is a filter or an estimator, not a tuned file (a `Path`, or a text that ends in .json).
 
+    The file of a trained estimator is an estimator.
+
     Raises:
         ValueError: for an unknown name, or any other object.
     """
+    if is_trained(given):
+        return True
     if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
         return False
     if isinstance(given, str) or is_foreign(given):

@@ -1,0 +1,46 @@
+"""Estimators with a network in them, trained on runs whose states are known; this needs torch and safetensors.
+
+equations   a model's equations over whole steps, on batches of tensors
+networks    recurrent networks for gains and for roots of covariances
+estimator   what all have in common: one trajectory step by step, or many at once
+gains       `kalmannet` and `recursive-kalmannet`, which learn a filter's gain
+recurrent   `gru`, a network without a model
+ensemble    `differentiable-enkf`, an ensemble filter that learns its noise
+file        trained estimators as files of numbers
+
+`tuning.train_estimator` and `thruster train-estimator` train them.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thruster_env.numerics.extras import to_install
+
+if TYPE_CHECKING:
+    from filters.learned.file import TrainedEstimator
+
+NEEDED = ("torch", "safetensors")
+
+
+def check_installed() -> None:
+    """Raise ValueError unless what learned estimators need is installed."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(
+            f"a learned estimator needs {' and '.join(missing)}, but got none: {to_install('learned')}"
+        )
+
+
+def read_estimator(path: str | Path) -> TrainedEstimator:
+    """The trained estimator of a file, which makes an estimator for a model.
+
+    Raises:
+        ValueError: if torch or safetensors is not installed, or the file is none of `thruster train-estimator`.
+    """
+    check_installed()
+    from filters.learned.file import read  # torch takes seconds to import
+
+    return read(path)

@@ -1,0 +1,83 @@
+"""Recurrent networks of learned estimators."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+INPUT_WIDTH, OUTPUT_WIDTH = 5, 40  # factors on sizes of inputs and outputs, those of Revach et al. (2022)
+HIDDEN = 3  # recurrent layers of a `GainNetwork`
+
+
+def compressed(x: Tensor) -> Tensor:
+    """Features whose large values, such as an outlier's, enter by their logarithm: asinh(x)."""
+    return torch.asinh(x)
+
+
+def dense(size: int, width: int) -> nn.Sequential:
+    """A layer with a rectified linear output."""
+    return nn.Sequential(nn.Linear(size, width), nn.ReLU())
+
+
+def starting_at_zero(layer: nn.Linear) -> nn.Linear:
+    """The same layer, with weights and biases of zero: a network that begins by changing nothing."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class GainNetwork(nn.Module):
+    """Three recurrent layers in the places of Q, P and S, whose output is a vector for each step.
+
+    The structure is that of a Kalman filter's covariances, each layer fed by what drives its covariance:
+
+        q = GRU(moved);  p = GRU(q, corrected);  s = GRU(p, measured, innovation);  output = dense(p, s)
+
+    and p goes back into the next step, after a correction by s and the output.
+
+    Args:
+        n: states.
+        m: measurements.
+        outputs: entries of the output, such as n m of a gain.
+
+    Source: Revach et al. (2022), "KalmanNet", IEEE Transactions on Signal Processing 70, fig. 4 (architecture 2).
+    """
+
+    def __init__(self, n: int, m: int, outputs: int):
+        """Make the layers, the last one with weights of zero."""
+        super().__init__()
+        states, channels = n * n, m * m
+        self.of_moved, self.of_corrected = dense(n, INPUT_WIDTH * n), dense(n, INPUT_WIDTH * n)
+        self.of_measured = dense(2 * m, 2 * INPUT_WIDTH * m)
+        self.q = nn.GRUCell(INPUT_WIDTH * n, states)
+        self.p = nn.GRUCell(states + INPUT_WIDTH * n, states)
+        self.s = nn.GRUCell(channels + 2 * INPUT_WIDTH * m, channels)
+        self.from_p = dense(states, channels)
+        self.wide = dense(states + channels, OUTPUT_WIDTH * (states + channels))
+        self.last = starting_at_zero(nn.Linear(OUTPUT_WIDTH * (states + channels), outputs))
+        self.back = dense(channels + outputs, states)
+        self.back_to_p = dense(2 * states, states)
+        self.sizes = states, states, channels
+
+    def start(self, batch: int) -> tuple[Tensor, ...]:
+        """Hidden states of a batch at its first step."""
+        return tuple(torch.zeros(batch, size, dtype=torch.float64) for size in self.sizes)
+
+    def forward(
+        self, hidden: tuple[Tensor, ...], moved: Tensor, corrected: Tensor, measured: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The output (B, outputs) and the next hidden states.
+
+        Args:
+            hidden: of the step before.
+            moved: change of the estimate over the last step, (B, n).
+            corrected: the last correction of an estimate, (B, n).
+            measured: change of the measurement and innovation, (B, 2 m).
+        """
+        q, p, s = hidden
+        q = self.q(self.of_moved(moved), q)
+        p = self.p(torch.cat([q, self.of_corrected(corrected)], -1), p)
+        s = self.s(torch.cat([self.from_p(p), self.of_measured(measured)], -1), s)
+        output = self.last(self.wide(torch.cat([p, s], -1)))
+        back = self.back(torch.cat([s, output], -1))
+        return output, (q, self.back_to_p(torch.cat([p, back], -1)), s)

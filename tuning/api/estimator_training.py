@@ -1,0 +1,154 @@
+"""`EstimatorTraining`: a trained estimator beside the filters that it has to beat, on held-out runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from filters.consistency.intervals import Interval
+from filters.plot_styles import colour_of
+from thruster_env.numerics.characters import verbatim
+from thruster_env.numerics.plots import panels
+from thruster_env.numerics.text_tables import plain_text, table
+from tuning.api.showing import about, drawn, frame, html, number
+from tuning.evaluation.baselines import ORACLE
+from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, Standing
+from tuning.learning.training import Check
+from tuning.problems.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+COLUMNS = "filter", "score", "over {first}", LONGER, NOISIER, "NEES"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EstimatorTraining:
+    """A training and its result.
+
+    Attributes:
+        kind: of the estimator.
+        problem: on whose runs it was trained.
+        file: where the trained estimator is.
+        checks: scores of validation runs during the training.
+        standings: on held-out runs; the trained estimator comes last, the others are compared with the first.
+        seconds: that the training took.
+        interrupted: whether Ctrl-C ended it; the file has the best weights so far.
+    """
+
+    kind: str
+    problem: Problem
+    file: Path
+    checks: tuple[Check, ...]
+    standings: tuple[Standing, ...]
+    seconds: float
+    interrupted: bool = False
+
+    @property
+    def ratio(self) -> Interval:
+        """The trained estimator's score over that of the best other filter, paired on held-out runs."""
+        return self.standings[-1].ratio(self.best_other)
+
+    @property
+    def best_other(self) -> Standing:
+        """The filter with the lowest held-out score, without the oracle, which knows the plant's Q and R."""
+        others = (one for one in self.standings[:-1] if not one.label.endswith(ORACLE))
+        return min(others, key=lambda one: one.evaluations[HELD_OUT].score.value)
+
+    def sentences(self) -> list[str]:
+        """Whether training paid."""
+        ratio, other = self.ratio, self.best_other.label
+        said = f"{self.kind} has {about(ratio)} of the score of {other}"
+        if ratio.low > 1.0:
+            verdict = f"{said}: it is significantly worse. Take {other}."
+        elif ratio.high < 1.0:
+            verdict = f"{said}: it is significantly better."
+        else:
+            verdict = f"{said}: no significant difference. {other} is cheaper."
+        stopped = ["Interrupted: these are the best weights so far."] if self.interrupted else []
+        return [verdict, *stopped]
+
+    def rows(self) -> list[list[str]]:
+        """Cells of the table, by `COLUMNS`."""
+        first, rows = self.standings[0], []
+        for one in self.standings:
+            ratios = (one.ratio(first, name) for name in (HELD_OUT, LONGER, NOISIER))
+            cells = ["" if one is first else "-" if np.isnan(ratio.value) else about(ratio) for ratio in ratios]
+            found = one.evaluations[HELD_OUT]
+            rows.append([one.label, number(found.score.value), *cells, number(found.nees.value, ".3g")])
+        return rows
+
+    def columns(self) -> list[str]:
+        """Heads of the table."""
+        return [one.format(first=self.standings[0].label) for one in COLUMNS]
+
+    @property
+    def title(self) -> str:
+        """Of the table."""
+        count = len(self.standings[0].evaluations[HELD_OUT].mean_squares)
+        return f"{count} held-out {self.problem.seed_word} of {self.problem.name}"
+
+    def table(self) -> Table:
+        """The table for a terminal."""
+        caption = f"{LONGER}, {NOISIER}: score over {self.standings[0].label} on such runs."
+        return table(self.title, self.columns(), self.rows(), caption=caption)
+
+    def as_data(self) -> dict[str, Any]:
+        """The same as plain data, for JSON."""
+        first = self.standings[0]
+        rows = []
+        for one in self.standings:
+            row: dict[str, Any] = {"filter": one.label, "nees": one.evaluations[HELD_OUT].nees.value}
+            for name, found in one.evaluations.items():
+                row[name] = {"score": found.score.value, "ratio": one.ratio(first, name)._asdict()}
+            rows.append(row)
+        return {
+            "kind": self.kind,
+            "problem": self.problem.name,
+            "file": str(self.file),
+            "checks": [one._asdict() for one in self.checks],
+            "standings": rows,
+            "seconds": self.seconds,
+            "interrupted": self.interrupted,
+        }
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row for each filter: scores on held-out, longer and noisier runs, with their ratios to the first."""
+        rows = []
+        for one in self.as_data()["standings"]:
+            row = {"filter": one["filter"], "NEES": one["nees"]}
+            for name in (HELD_OUT, LONGER, NOISIER):
+                found = one.get(name, {"score": np.nan, "ratio": {"value": np.nan, "low": np.nan, "high": np.nan}})
+                row[name] = found["score"]
+                row |= {f"{name}, ratio {key}": value for key, value in found["ratio"].items()}
+            rows.append(row)
+        return frame({name: [row[name] for row in rows] for name in rows[0]})
+
+    def plot_training(self) -> Figure:
+        """Validation score over updates, beside the held-out score of the first filter."""
+        figure, (axis,) = panels(1, 1, (6.0, 3.6))
+        steps, scores = [one.step for one in self.checks], [one.score for one in self.checks]
+        axis.plot(steps, scores, "o-", color=colour_of(self.kind), label=f"{self.kind}, validation")
+        first = self.standings[0]
+        level = first.evaluations[HELD_OUT].score.value
+        axis.axhline(level, color=colour_of(first.name), linestyle="--", label=f"{first.label}, held out")
+        axis.set_xlabel("updates of the weights")
+        axis.set_ylabel("score: mean RMSE over scale [-]")
+        axis.set_title(verbatim(self.problem.name), fontsize=11)
+        axis.legend()
+        return drawn(figure)
+
+    def __str__(self) -> str:
+        """The table that `thruster train-estimator` prints."""
+        return plain_text([self.table(), *self.sentences()])
+
+    def __repr__(self) -> str:
+        return f"EstimatorTraining({self.kind} on {self.problem.name}, {self.file})"
+
+    def _repr_html_(self) -> str:
+        return html(self.title, self.columns(), self.rows(), " ".join(self.sentences()))

@@ -1,0 +1,175 @@
+"""The training of an estimator with a network: windows of many runs, and checks on runs of their own."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filters.estimators.foreign import ForeignFilter
+from filters.learned.estimator import LearnedEstimator, Track
+from tuning.evaluation.evaluate import values_of
+from tuning.learning.loss import Loss
+from tuning.problems.data import Data
+
+LARGEST_GRADIENT = 1.0  # its norm is cut to this: one outlier shall not undo what was learned
+
+
+class Settings(NamedTuple):
+    """How an estimator is trained.
+
+    Attributes:
+        steps: updates of the network's weights.
+        batch: runs in each.
+        window: steps of a run over which gradients go back; the next window begins where the last one ended.
+        rate: Adam's step size at first; it falls to a hundredth along half a cosine.
+        checks: evaluations on validation runs.
+    """
+
+    steps: int = 2000
+    batch: int = 32
+    window: int = 50
+    rate: float = 2e-3
+    checks: int = 20
+
+
+class Check(NamedTuple):
+    """An evaluation on validation runs.
+
+    Attributes:
+        step: updates so far.
+        loss: mean over the updates since the last check; NaN at first.
+        score: of the validation runs, the problem's.
+        best: whether it is the lowest so far.
+    """
+
+    step: int
+    loss: float
+    score: float
+    best: bool
+
+
+def train(
+    estimator: LearnedEstimator,
+    data: Data,
+    validation: Data,
+    scale,
+    settings: Settings,
+    seed: int = 0,
+    on_step: Callable[[int], None] = lambda step: None,
+    on_check: Callable[[Check], None] = lambda check: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Check]:
+    """Train an estimator in place; it ends with the weights of its best check, the untrained ones included.
+
+    Args:
+        estimator: to be trained.
+        data: training runs with true states.
+        validation: other runs, on which the best weights are chosen.
+        scale: (n,) of the problem's score.
+        settings: how.
+        seed: of the order of the runs.
+        on_step: called after each update.
+        on_check: called after each check.
+        stopped: whether to end now, with the best weights so far.
+
+    Returns:
+        All checks.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the fastest for such small networks
+    try:
+        return _train(estimator, data, validation, scale, settings, seed, on_step, on_check, stopped)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    estimator: LearnedEstimator,
+    data: Data,
+    validation: Data,
+    scale,
+    settings: Settings,
+    seed: int,
+    on_step: Callable[[int], None],
+    on_check: Callable[[Check], None],
+    stopped: Callable[[], bool],
+) -> list[Check]:
+    loss, filter_ = Loss(estimator, scale), ForeignFilter(model=estimator.model, estimator=estimator)
+    optimiser = torch.optim.Adam(estimator.parameters(), settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps, 0.01 * settings.rate)
+    checks: list[Check] = []
+    best = None
+
+    def check(step: int, values: list[float]) -> None:
+        nonlocal best
+        with np.errstate(over="ignore"):  # of a network that has got worse
+            score = values_of(filter_, validation, scale).score.value
+        is_best = np.isfinite(score) and all(not score >= one.score for one in checks)
+        if is_best:
+            best = copy.deepcopy(estimator.state_dict())
+        checks.append(Check(step, float(np.mean(values)) if values else np.nan, score, bool(is_best)))
+        on_check(checks[-1])
+
+    check(0, [])
+    recent: list[float] = []
+    windows = _windows(estimator, data, settings, np.random.default_rng(seed))
+    for step in range(1, settings.steps + 1):
+        window = next(windows)
+        value = window(loss)
+        optimiser.zero_grad()
+        value.backward()
+        norm = torch.nn.utils.clip_grad_norm_(estimator.parameters(), LARGEST_GRADIENT)
+        if torch.isfinite(norm):
+            optimiser.step()
+            recent.append(value.item())
+        schedule.step()
+        on_step(step)
+        if step * settings.checks // settings.steps > (step - 1) * settings.checks // settings.steps:
+            check(step, recent)
+            recent = []
+        if stopped():
+            break
+    if best is not None:
+        estimator.load_state_dict(best)
+    return checks
+
+
+def _windows(
+    estimator: LearnedEstimator, data: Data, settings: Settings, generator: np.random.Generator
+) -> Iterator[Callable[[Loss], Tensor]]:
+    """Endless windows of batches, in the order of time within a batch; each is a function of the loss.
+
+    Steps before the first one that is scored have no derivatives.
+    """
+    seen, scored = data.seen, torch.tensor(data.scored)
+    u, z, truth = (torch.tensor(part) for part in (seen.inputs, seen.measurements, data.known_states))
+    count, times = scored.shape
+    first, width = data.first_scored, settings.window
+    while True:
+        some = torch.tensor(generator.permutation(count)[: settings.batch])
+        track: list[Track] = []
+        with torch.no_grad():
+            track.append(estimator.begin(seen.filter_keys[some], z[some, 0]))
+            for k in range(1, min(first, times)):
+                track[0] = estimator.advance(track[0], u[some, k - 1], z[some, k])
+        for begin in range(max(first, 1), times, width):
+            steps = range(begin, min(begin + width, times))
+            counted = scored[some][:, begin : begin + width].sum()
+            if not counted:
+                break
+
+            def window(loss: Loss, some=some, steps=steps, counted=counted, track=track) -> Tensor:
+                total = torch.zeros((), dtype=torch.float64)
+                now = track[0].detach()
+                for k in steps:
+                    now = estimator.advance(now, u[some, k - 1], z[some, k])
+                    total = total + loss(now, truth[some, k], scored[some, k])
+                track[0] = now.detach()
+                return total / counted
+
+            yield window
