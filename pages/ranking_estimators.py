@@ -1,21 +1,30 @@
-"""Make the tables of docs/ranking.md on other people's estimators: a recurrent network beside tuned filters.
+"""Make the tables of docs/ranking.md on other people's estimators, and on those with a network beside tuned filters.
 
     python -m pages.ranking_estimators [PAGE] [--table NAME]...
 
-The networks are trained first, each in some minutes on one core, and kept in out/networks; this needs torch (the
-extra "rl"). The filters are tuned anew each time.
+The networks are trained first, each in some minutes on one core, and stored in out/estimators; this needs the extra
+"learned". The filters are tuned each time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from filters.estimators.find import foreign_filter
 from filters.filter import Filter
-from pages.ranking_tables import SEEDS, leaderboard, main, ratio_cell, table_of
+from pages.page import digits, table
+from pages.ranking_tables import SEEDS, leaderboard, main, marked, ratio_cell, table_of
 from pages.tuning_mismatch import UNKNOWNS, tuned_augmented
+from tuning.api.train_estimator import FOLDER, train_estimator
 from tuning.evaluation.compare import Contender, Row, contender
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.check import data_of
+from tuning.problems.problem import Problem
+from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import open_study, quiet_optuna, run_study
@@ -24,6 +33,13 @@ from tuning.thruster.scenario import Scenario
 
 TRIALS = 50
 TRAINED_ON = ("mismatch", "outliers")
+TRAININGS: dict[str, dict[str, Any]] = {
+    "gru": {"runs": 512, "steps": 2000, "batch": 64, "window": 150, "options": {"width": 32}},
+    "kalmannet": {"runs": 512},
+    "recursive-kalmannet": {"runs": 512},
+    "differentiable-enkf": {"runs": 512, "steps": 200, "window": 20},
+}
+PAPERS = {"runs": 1000, "steps": 1000, "batch": 30, "window": 100, "rate": 1e-3}  # of KalmanNet, but for the steps
 ELSEWHERE = (
     "nominal",
     "mismatch",
@@ -39,7 +55,7 @@ FILTERPY = "filters.estimators.filterpy:unscented"
 
 
 def network_mismatch() -> str:
-    """A wrong model: filters that believe in it, and a network that never saw it."""
+    """A wrong model: filters that believe in it, and networks, of which one never saw it."""
     return _problem_of_network("mismatch")
 
 
@@ -49,16 +65,49 @@ def network_outliers() -> str:
 
 
 def network_elsewhere() -> str:
-    """Scores of the networks over that of the EKF, on scenarios of which they have seen none or one."""
-    lines = [
-        "| scenario | " + " | ".join(f"gru, trained on `{name}`" for name in TRAINED_ON) + " |",
-        "|---" * (len(TRAINED_ON) + 1) + "|",
-    ]
+    """Scores of two networks over that of the EKF, on scenarios of which they have seen none or one."""
+    pairs = [(kind, name) for kind in ("gru", "kalmannet") for name in TRAINED_ON]
+    rows = []
     for name in ELSEWHERE:
-        networks = [_network(trained, f"gru {trained}") for trained in TRAINED_ON]
-        _, *rows = leaderboard(find_scenario(name), [contender("ekf"), *networks]).rows
-        lines.append(f"| `{name}` | {' | '.join(map(ratio_cell, rows))} |")
-    return "\n".join(lines)
+        networks = [_network(trained, kind)._replace(label=f"{kind} {trained}") for kind, trained in pairs]
+        _, *found = leaderboard(find_scenario(name), [contender("ekf"), *networks]).rows
+        rows.append([f"`{name}`", *map(ratio_cell, found)])
+    return table(["scenario", *(f"{kind}, trained on `{name}`" for kind, name in pairs)], rows)
+
+
+def network_further() -> str:
+    """Scores over the tuned EKF's on held-out runs, on runs twice as long, and with four times the R."""
+    from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings
+
+    rows = []
+    for name in TRAINED_ON:
+        problem = find_scenario(name)
+        filters = {"ekf, tuned": _tuned("ekf", name).filter(problem)}
+        filters |= {"ekf-robust, oracle": contender("ekf-robust").filter(problem)}
+        filters |= {kind: _network(name, kind).filter(problem) for kind in TRAININGS}
+        first, *others = standings(filters, problem, held_out_seeds(0, SEEDS))
+        for place, one in enumerate(others):
+            ratios = (one.ratio(first, runs) for runs in (HELD_OUT, LONGER, NOISIER))
+            nees = one.evaluations[HELD_OUT].nees.value
+            cells = [*map(marked, ratios), "" if np.isnan(nees) else digits(nees)]
+            rows.append(["" if place else f"`{name}`", one.label, *cells])
+    return table(["scenario", "filter", HELD_OUT, LONGER, NOISIER, "NEES"], rows)
+
+
+def network_papers() -> str:
+    """The settings of the paper on KalmanNet: mean square errors in dB."""
+    from thruster_env.studies import kalmannet
+
+    rows = []
+    for problem in (kalmannet.linear, kalmannet.lorenz):
+        data = data_of(problem, problem.held_out_seeds(0, SEEDS))
+        oracle_of = contender("ekf").filter(problem)
+        filters = {"ekf, oracle": oracle_of} | {
+            kind: foreign_filter(_trained(kind, problem, PAPERS), problem.model()) for kind in TRAININGS
+        }
+        found = [evaluate(one, data, problem.scale) for one in filters.values()]
+        rows.append([problem.name, *(digits(kalmannet.decibels(one.mean_squares)) for one in found)])
+    return table(["setting", "ekf, oracle", *TRAININGS], rows)
 
 
 def filterpy() -> str:
@@ -79,7 +128,9 @@ def _problem_of_network(name: str) -> str:
     others = [contender("ekf-robust"), contender("enkf", ensemble_size=100)]
     oracles = [one._replace(label=f"{one.label}, oracle") for one in (contender("ekf"), *others)]
     told = [RIGHT, LEARNING] if name == "mismatch" else []
-    found = leaderboard(find_scenario(name), [*oracles, *tuned, *told, _network(name, "gru 32")], SEEDS)
+    found = leaderboard(
+        find_scenario(name), [*oracles, *tuned, *told, *(_network(name, kind) for kind in TRAININGS)], SEEDS
+    )
     return table_of(found)
 
 
@@ -109,10 +160,16 @@ def _tuned(kind: str, name: str) -> Choice:
     return run_study(open_study("page", plan, None), plan, TRIALS).choice
 
 
-def _network(name: str, label: str) -> Contender:
-    from pages.ranking_network import trained_on  # torch takes seconds to import
+def _network(name: str, kind: str) -> Contender:
+    return contender(_trained(kind, find_scenario(name), TRAININGS[kind]))._replace(label=kind)
 
-    return contender(trained_on(name))._replace(label=label)
+
+def _trained(kind: str, problem: Problem, arguments: dict[str, Any]) -> str:
+    """The file of an estimator trained on a problem; trained now if there is none."""
+    file = FOLDER / f"{kind}-{problem.name}.safetensors"
+    if not file.exists():
+        train_estimator(kind, problem, file=file, seeds=2, progress=True, **arguments)
+    return str(file)
 
 
 def _nine_digits(row: Row) -> str:
@@ -121,9 +178,8 @@ def _nine_digits(row: Row) -> str:
     return " | ".join(f"{value:.9g}" for value in values)
 
 
-TABLES: dict[str, Callable[[], str]] = {
-    table.__name__: table for table in (network_mismatch, network_outliers, network_elsewhere, filterpy)
-}
+NETWORKS = network_mismatch, network_outliers, network_elsewhere, network_further, network_papers
+TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (*NETWORKS, filterpy)}
 
 
 def run_main(arguments: Sequence[str] | None = None) -> None:

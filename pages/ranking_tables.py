@@ -144,8 +144,13 @@ def table_of(board: Leaderboard) -> str:
 
 def ratio_cell(row: Row) -> str:
     """The ratio of scores; bold where the filter is significantly better, in brackets where no worse either."""
-    text = f"{row.score_ratio.value:.3f}"
-    return {"better": f"**{text}**", "worse": text, "tie": f"({text})"}[row.verdict]
+    return marked(row.score_ratio)
+
+
+def marked(ratio: Interval) -> str:
+    """A ratio, bold where it is significantly below one, in brackets where it is not significantly above either."""
+    text = f"{ratio.value:.3f}"
+    return f"**{text}**" if ratio.high < 1 else text if ratio.low > 1 else f"({text})"
 
 
 def _about(value: Interval, digits: int) -> str:

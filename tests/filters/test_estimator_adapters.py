@@ -9,7 +9,6 @@ from filters.estimators.stonesoup import StoneSoupEstimator
 from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
 from tuning.evaluation.compare import compare, contender
-from tuning.problems.data import Data
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
@@ -105,27 +104,3 @@ def test_stone_soup_s_extended_filter_gives_what_ours_gives():
     model = problem.model(**problem.true)
     ours, theirs = (run(make_filter(kind, model), *short("mismatch", 2, 30)) for kind in ("ekf", extended))
     assert_equal(ours, theirs, 1e-6)
-
-
-def test_a_network_learns_from_data_alone_and_gives_the_same_with_the_same_seed():
-    torch = pytest.importorskip("torch")
-    from pages.ranking_network import trained
-
-    problem = find_scenario("outliers").replace(steps=80)
-    data = problem.data(range(24))
-    threads, drawn = torch.get_num_threads(), torch.random.get_rng_state()
-    first, again = (trained("net", data, 3, units=8, updates=25, on_loss=str) for _ in range(2))
-    assert torch.get_num_threads() == threads and (torch.random.get_rng_state() == drawn).all()
-    few = Data(data.seeds[:2], data.inputs[:2], data.measurements[:2].copy(), data.filter_keys[:2])
-    few.measurements[0, 5] = np.nan
-    given = few.filter_keys, few.inputs, few.measurements
-    means = [run(make_filter(one, problem.model()), *given).means for one in (first, again)]
-    np.testing.assert_array_equal(*means)
-    first.run = None  # step by step
-    np.testing.assert_allclose(
-        run(make_filter(first, problem.model()), *given).means, means[0], rtol=1e-4, atol=1e-4
-    )
-    untrained = trained("net", data, 3, units=8, updates=1, on_loss=str)
-    errors = [((one.run(None, data.inputs, data.measurements) - data.states) ** 2).mean(axis=(0, 1))
-              for one in (again, untrained)]  # fmt: skip
-    assert (errors[0] < 0.8 * errors[1]).all()

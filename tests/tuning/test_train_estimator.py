@@ -92,11 +92,12 @@ def test_longer_runs_begin_as_the_others_and_larger_noise_has_four_times_r():
 
 def test_training_lowers_the_score_and_the_same_seed_gives_the_same_weights(runs):
     filter_, data, validation = runs
-    found = []
+    threads, drawn, found = torch.get_num_threads(), torch.random.get_rng_state(), []
     for _ in range(2):
         estimator = new_estimator("gru", filter_, data, seed=1, width=8)
         checks = train(estimator, data, validation, PROBLEM.scale, SETTINGS._replace(steps=60, rate=0.02), seed=3)
         found.append((estimator.state_dict(), checks))
+    assert torch.get_num_threads() == threads and torch.equal(torch.random.get_rng_state(), drawn)
     (weights, checks), (again, _) = found
     assert all(torch.equal(weights[name], again[name]) for name in weights)
     assert min(one.score for one in checks) < 0.7 * checks[0].score
