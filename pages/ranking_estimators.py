@@ -1,9 +1,9 @@
-"""Make the tables of docs/ranking.md on other people's estimators, and on those with a network beside tuned filters.
+"""Make the tables of docs/ranking.md on estimators of other packages and on those with a network.
 
     python -m pages.ranking_estimators [PAGE] [--table NAME]...
 
-The networks are trained first, each in some minutes on one core, and stored in out/estimators; this needs the extra
-"learned". The filters are tuned each time.
+The networks are trained first, each in some minutes on one core, and stored in out/estimators; this needs the
+extra "learned". The filters are tuned each time.
 """
 
 from __future__ import annotations
@@ -98,12 +98,13 @@ def network_papers() -> str:
     """The settings of the paper on KalmanNet: mean square errors in dB."""
     from thruster_env.studies import kalmannet
 
-    rows = []
+    own, rows = {"differentiable-enkf": {"steps": 200, "window": 20}}, []
     for problem in (kalmannet.linear, kalmannet.lorenz):
         data = data_of(problem, problem.held_out_seeds(0, SEEDS))
         oracle_of = contender("ekf").filter(problem)
         filters = {"ekf, oracle": oracle_of} | {
-            kind: foreign_filter(_trained(kind, problem, PAPERS), problem.model()) for kind in TRAININGS
+            kind: foreign_filter(_trained(kind, problem, PAPERS | own.get(kind, {})), problem.model())
+            for kind in TRAININGS
         }
         found = [evaluate(one, data, problem.scale) for one in filters.values()]
         rows.append([problem.name, *(digits(kalmannet.decibels(one.mean_squares)) for one in found)])
@@ -128,10 +129,8 @@ def _problem_of_network(name: str) -> str:
     others = [contender("ekf-robust"), contender("enkf", ensemble_size=100)]
     oracles = [one._replace(label=f"{one.label}, oracle") for one in (contender("ekf"), *others)]
     told = [RIGHT, LEARNING] if name == "mismatch" else []
-    found = leaderboard(
-        find_scenario(name), [*oracles, *tuned, *told, *(_network(name, kind) for kind in TRAININGS)], SEEDS
-    )
-    return table_of(found)
+    networks = [_network(name, kind) for kind in TRAININGS]
+    return table_of(leaderboard(find_scenario(name), [*oracles, *tuned, *told, *networks], SEEDS))
 
 
 class _Made(NamedTuple):

@@ -148,7 +148,7 @@ def ratio_cell(row: Row) -> str:
 
 
 def marked(ratio: Interval) -> str:
-    """A ratio, bold where it is significantly below one, in brackets where it is not significantly above either."""
+    """A ratio, bold if it is significantly below one, in brackets if it is not significantly above either."""
     text = f"{ratio.value:.3f}"
     return f"**{text}**" if ratio.high < 1 else text if ratio.low > 1 else f"({text})"
 
