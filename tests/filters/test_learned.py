@@ -4,18 +4,20 @@ import copy
 import json
 import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
-from filters import make_filter, run, thruster_model
+from filters import EstimateState, make_filter, run, thruster_model
 from filters.estimators.find import foreign_filter, is_foreign, label_of
 from filters.learned.equations import Equations
 from filters.learned.estimator import unit_scales
 from filters.learned.file import LEARNED, read, write_estimator
 from filters.learned.gains import KalmanNet
 from filters.learned.networks import GainNetwork
+from filters.wrappers.vector import EstimateStates
 from tests.models import KEY, pendulum, plane_model, simulated
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
@@ -253,6 +255,27 @@ def test_a_file_has_numbers_alone_and_stands_for_the_estimator(tmp_path, data, a
     assert filter_.name == "gru" and not filter_.has_covariance
     np.testing.assert_array_equal(run(filter_, KEYS, inputs, z).means, estimator.run(KEYS, inputs, z).mean)
     assert read(path).about["training"] == {"problem": "plane"} and read(path) is read(path)
+
+
+def test_beside_an_env_and_copies_of_it_a_file_is_an_estimator(tmp_path, as_python):
+    path, model = str(tmp_path / "gain.safetensors"), thruster_model()
+    write_estimator(path, made("recursive-kalmannet", model), {})
+    env = EstimateState(gym.make("BowThruster-v0"), filter=path)
+    envs = EstimateStates(gym.make_vec("BowThruster-v0", num_envs=2), filter=path)
+    told, several = [env.reset(seed=4)[1]], [envs.reset(seed=3)[1]]
+    for _ in range(3):
+        told.append(env.step(np.array([2.0], dtype=np.float32))[4])
+        several.append(envs.step(np.full((2, 1), 2.0, dtype=np.float32))[4])
+    z = np.array([info["measurement"] for info in told])[None]
+    found = read(path)(env.unwrapped.state_space_model()).run(KEYS[:1], np.full((1, 3, 1), 2.0), z)
+    for k, (one, both) in enumerate(zip(told, several, strict=True)):
+        for name, part in (
+            ("estimate", found.mean),
+            ("estimate_cov", found.cov),
+            ("innovation", found.innovation),
+        ):
+            np.testing.assert_allclose(one[name], part[0, k], rtol=1e-9)
+            np.testing.assert_allclose(both[name][1], one[name], rtol=1e-9)
 
 
 def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):

@@ -169,6 +169,12 @@ def test_the_command_line_starts_without_packages_that_learn_policies():
     assert result.stdout.strip() == "[]"
 
 
+def test_training_of_estimators_imports_torch_when_it_is_called():
+    code = "import sys, tuning.api.train_estimator, thruster_cli.train_estimator; print('torch' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
 def test_importing_the_env_stays_light():
     heavy = ["numba", "scipy", "matplotlib", "optuna", "torch", "filters", "tuning"]
     code = f"import sys, thruster_env; print([name for name in {heavy} if name in sys.modules])"
