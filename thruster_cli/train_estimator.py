@@ -10,11 +10,13 @@ import typer
 from rich.console import RenderableType
 
 from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, RUNS, JsonOption, OfPresetOption, SeedOption
-from thruster_cli.output import announce_compilation, emit
+from thruster_cli.output import announce_compilation, check_targets, emit
 from thruster_cli.problems import PROBLEMS
 from tuning.api.train_estimator import BATCH, FOLDER, RATE, STEPS, WINDOW, train_estimator
 from tuning.api.train_estimator import RUNS as TRAINING_RUNS
 from tuning.search.plan import HELD_OUT_SEEDS
+
+PAGE = ".html"  # the end of a page's name
 
 
 def command(
@@ -67,6 +69,10 @@ def command(
             rich_help_panel=OUTPUT,
         ),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write a page on it, ending in .html.", rich_help_panel=OUTPUT),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Train an estimator with a network on a problem's runs, and compare it with filters on held-out ones.
@@ -81,6 +87,9 @@ def command(
 
     Example: thruster train-estimator recursive-kalmannet --problem outliers --steps 500
     """
+    if report is not None and report.suffix != PAGE:
+        raise ValueError(f"--report must end in {PAGE}, but got {report}")
+    check_targets([report, out], json, [start, *(against or [])])
     given = {"width": width, "ensemble_size": ensemble_size}
     announce_compilation()
     training = train_estimator(
@@ -107,6 +116,8 @@ def command(
         f"Trained estimator: {training.file}",
     ]
     told.append(f"Use it: thruster compare {training.file} --filter ekf --problem {training.problem.name}")
+    if report is not None:
+        told.append(f"Page: {training.report(report)}")
     emit(told, training.as_data(), json)
     if training.interrupted:
         sys.exit(130)

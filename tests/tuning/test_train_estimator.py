@@ -139,6 +139,10 @@ def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_py
     frame = training.to_frame()
     assert list(frame["filter"]) == [one.label for one in training.standings] and np.isfinite(frame["NEES"]).all()
     assert training.plot_training().axes[0].get_xlabel() == "updates of the weights"
+    page = training.report(tmp_path / "page.html").read_text()
+    assert "recursive-kalmannet trained on plane" in page and page.count("<svg") == 2
+    with pytest.raises(ValueError, match="must be a file that ends in .html"):
+        training.report(tmp_path / "page.pdf")
     comparison = tuning.compare(["ekf", path], PROBLEM, seeds=6)
     assert comparison.filters == ("ekf", "mine")
     score = comparison.boards[0].rows[1].evaluation.score

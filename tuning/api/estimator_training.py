@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from filters.consistency.intervals import Interval
+from filters.filter import Filter
 from filters.plot_styles import colour_of
 from thruster_env.numerics.characters import verbatim
 from thruster_env.numerics.plots import panels
@@ -19,6 +21,8 @@ from tuning.evaluation.baselines import ORACLE
 from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, Standing
 from tuning.learning.training import Check
 from tuning.problems.problem import Problem
+from tuning.reporting.page import Table as PageTable
+from tuning.reporting.training_report import write_training_report
 
 if TYPE_CHECKING:
     import pandas
@@ -38,6 +42,8 @@ class EstimatorTraining:
         checks: scores of validation runs during the training.
         standings: on held-out runs; the trained estimator comes last, the others are compared with the first.
         seconds: that the training took.
+        filters: the same by label.
+        seed: of the study to which all runs belong.
         interrupted: whether Ctrl-C ended it; the file has the best weights so far.
     """
 
@@ -47,6 +53,8 @@ class EstimatorTraining:
     checks: tuple[Check, ...]
     standings: tuple[Standing, ...]
     seconds: float
+    filters: Mapping[str, Filter]
+    seed: int = 0
     interrupted: bool = False
 
     @property
@@ -142,6 +150,17 @@ class EstimatorTraining:
         axis.set_title(verbatim(self.problem.name), fontsize=11)
         axis.legend()
         return drawn(figure)
+
+    def report(self, page: str | Path) -> Path:
+        """Write a page, an .html file, with the table, the course of the training and one held-out run."""
+        if Path(page).suffix != ".html":
+            raise ValueError(f"a page must be a file that ends in .html, but got {page}")
+        labels = self.standings[0].label, self.standings[-1].label
+        pair = {name: self.filters[name] for name in labels}
+        found = PageTable(self.title, self.columns(), self.rows())
+        title, seed = f"{self.kind} trained on {self.problem.name}", self.problem.held_out_seeds(self.seed, 2)[0]
+        course, advice = self.plot_training(), self.sentences()
+        return write_training_report(page, title, advice, found, course, pair, self.problem, seed)
 
     def __str__(self) -> str:
         """The table that `thruster train-estimator` prints."""

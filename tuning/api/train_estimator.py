@@ -82,7 +82,7 @@ def train_estimator(
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
-        `EstimatorTraining`: `file`, `checks`, `standings`, `sentences()`, `to_frame()`, `plot_training()`.
+        `EstimatorTraining`: `file`, `checks`, `standings`, `to_frame()`, `plot_training()`, `report(page)`.
 
     Raises:
         ValueError: states the rule and the value.
@@ -127,7 +127,7 @@ def train_estimator(
     filters[kind] = _as_filter(estimator)
     with console.status("held-out runs ..."):
         rows = standings(filters, found, found.held_out_seeds(seed, seeds))
-    return EstimatorTraining(kind, found, target, tuple(checks), tuple(rows), seconds, interrupted)
+    return EstimatorTraining(kind, found, target, tuple(checks), tuple(rows), seconds, filters, seed, interrupted)
 
 
 def _trained(
