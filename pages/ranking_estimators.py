@@ -39,7 +39,7 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "recursive-kalmannet": {"runs": 512},
     "differentiable-enkf": {"runs": 512, "steps": 200, "window": 20},
 }
-PAPERS = {"runs": 1000, "steps": 1000, "batch": 30, "window": 100, "rate": 1e-3}  # of KalmanNet, but for the steps
+PAPERS = {"runs": 1000, "steps": 1000, "batch": 30, "window": 100, "rate": 1e-3}  # of the paper, but for the steps
 ELSEWHERE = (
     "nominal",
     "mismatch",

@@ -35,7 +35,7 @@ class KalmanNet(LearnedEstimator):
         x~ = f(x', u),  v = z - h(x~),  x = x~ + K v
         K = K_0 + D_x N(z - z', v, x' - x'', x' - x~') D_v^-1
 
-    where ' is the step before, D are the sizes of corrections and innovations, K_0 is the mean gain of the filter
+    where ' is the step before, D are the sizes of errors and innovations, K_0 is the mean gain of the filter
     that training starts from, and N the network (`GainNetwork`).
 
     Two things differ from the paper: inputs are divided by their sizes, where the paper divides each vector by its
@@ -77,7 +77,7 @@ class KalmanNet(LearnedEstimator):
         of_z = torch.cat([measured / self.scale_measured, innovation / self.scale_innovation], -1)
         features = tuple(map(compressed, (moved / self.scale_moved, corrected / self.scale_corrected, of_z)))
         output, hidden = self.gain(memory[3 : 3 + HIDDEN], *features)
-        learned = self.scale_corrected[:, None] * output.unflatten(-1, self.scale_gain.shape)
+        learned = self.scale_error[:, None] * output.unflatten(-1, self.scale_gain.shape)
         gain = self.scale_gain + learned / self.scale_innovation
         correction = (gain @ innovation[..., None])[..., 0]
         mean = equations.of_state(predicted + correction)

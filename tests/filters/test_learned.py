@@ -146,7 +146,7 @@ def test_the_gain_is_the_mean_one_and_the_scaled_output_of_what_changed(data, as
         change = np.zeros(2) if before is None else z[2, k] - before
         features = moved, corrected / 0.3, np.concatenate([change, v])
         output, hidden = estimator.gain(hidden, *tensors(*(np.arcsinh(one)[None] for one in features)))
-        gain = 0.2 + 0.3 * output[0].detach().numpy().reshape(2, 2)
+        gain = 0.2 + 0.7 * output[0].detach().numpy().reshape(2, 2)
         x = predicted + gain @ v
         moved, corrected, before = x - last, gain @ v, z[2, k]
         np.testing.assert_allclose(found.mean[2, k], x, rtol=1e-11)

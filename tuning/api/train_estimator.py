@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tuning.learning.training import Check
 
 FOLDER = Path("out") / "estimators"
-RUNS, STEPS, BATCH, WINDOW, RATE = 200, 1000, 32, 50, 2e-3
+RUNS, STEPS, BATCH, WINDOW, RATE = 200, 1000, 32, 50, 5e-3
 MOST = 1_000_000
 
 

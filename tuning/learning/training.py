@@ -30,10 +30,10 @@ class Settings(NamedTuple):
         checks: evaluations on validation runs.
     """
 
-    steps: int = 2000
+    steps: int = 1000
     batch: int = 32
     window: int = 50
-    rate: float = 2e-3
+    rate: float = 5e-3
     checks: int = 20
 
 
