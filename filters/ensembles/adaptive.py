@@ -16,16 +16,28 @@ moves:
 
 so that of a single state it is the same, if h is linear.
 
-Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters", for
+With an inverse gamma prior, p(t') ~ t'^-(a+1) exp(-(a+1) t/t'), whose mode is t, the standard deviation follows
+the measurements, too. It is kept in the belief as the width p = 1/(a+1), behind the factors:
+
+    (deviation/t)^2 = p/((1 - 2p)^2 (1 - 3p)),  p at first that of `adaptive_inflation`, later between it and
+                      that of `least_deviation`
+    update:  t+ = t (1 + e), the mode of (1 + g (t' - t)) p(t');  p+ = p/(1 - 2d + d^2/p),  d = 1 - t/t+,
+             the inverse gamma density with the posterior's mode and its curvature there;  t = max(1, t+)
+
+Sources: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters", for
 one factor; the linear likelihood and factors of states are those of Anderson (2009), "Spatially and temporally
-varying adaptive covariance inflation for ensemble filters", here of all channels at once.
+varying adaptive covariance inflation for ensemble filters", here of all channels at once. The inverse gamma prior:
+El Gharamti (2018), "Enhanced adaptive inflation algorithm for ensemble filters", Monthly Weather Review 146, which
+finds the new deviation from a second point of the posterior instead of its curvature.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
+from scipy.optimize import brentq
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
@@ -86,6 +98,49 @@ def moved_factor(factor, slope, deviation):
     return max(factor + move, 1.0) if abs(move) < np.inf else 1.0
 
 
+def width_of(deviation: float) -> float:
+    """The width p of an inverse gamma density, below 1/3, with a standard deviation over its mode."""
+    return brentq(lambda p: p**0.5 - deviation * (1.0 - 2.0 * p) * (1.0 - 3.0 * p) ** 0.5, 0.0, 1.0 / 3.0)
+
+
+@inlined
+def relative_move(h, p):
+    """Return e where the mode is 1 + e of (1 + h e) times an inverse gamma density of mode 1 and width p."""
+    # The root with the sign of h of (1 - p) h e^2 + (1 - 2 p h) e - p h.
+    along = 1.0 - 2.0 * p * h
+    return 2.0 * p * h / (along + (along * along + 4.0 * p * (1.0 - p) * h * h) ** 0.5)
+
+
+def adapter(deviation_place: int, count: int, updates_deviation: bool) -> tuple[Callable, Callable]:
+    """Return `begin(row, place, numbers)` and `adapt(row, place, slope, numbers)`, of one of `count` factors.
+
+    Where the deviation is updated, its numbers are the widest and the narrowest width.
+    """
+    widest, narrowest = deviation_place, deviation_place + 1
+
+    @inlined
+    def begin(row, place, numbers):
+        row[place] = 1.0
+        if updates_deviation:
+            row[place + count] = numbers[widest]
+
+    @inlined
+    def adapt(row, place, slope, numbers):
+        if not updates_deviation:
+            row[place] = moved_factor(row[place], slope, numbers[deviation_place])
+            return
+        p = row[place + count]
+        e = relative_move(row[place] * slope, p)
+        if abs(e) < np.inf:
+            d = e / (1.0 + e)
+            row[place] = max(row[place] * (1.0 + e), 1.0)
+            row[place + count] = min(max(p / (1.0 - 2.0 * d + d * d / p), numbers[narrowest]), numbers[widest])
+        else:
+            begin(row, place, numbers)
+
+    return begin, adapt
+
+
 @inlined
 def row_moments(table, i, size):
     """Mean and sample variance of a row of the members."""
@@ -123,17 +178,18 @@ def correlation_of(table, i, k, size):
 
 
 @lru_cache(maxsize=64)
-def with_adaptive_inflation(kernels: Kernels, deviation_place: int) -> Kernels:
+def with_adaptive_inflation(kernels: Kernels, deviation_place: int, updates_deviation: bool) -> Kernels:
     """An ensemble's kernels that inflate each forecast by a factor that is kept in the belief, and adapt it."""
     n, m = kernels.n, kernels.m
     places = memory_places(n, m)
     factor, innovation, cov, r = places.extras, places.innovation, places.innovation_cov, number_places(n, m).r
     start_plainly, predict_plainly, update_plainly = kernels.start, kernels.predict, kernels.update
+    begin, adapt = adapter(deviation_place, 1, updates_deviation)
 
     @inlined
     def start(memory, numbers, size):
         start_plainly(memory, numbers, size)
-        memory[0][factor] = 1.0
+        begin(memory[0], factor, numbers)
 
     @inlined
     def predict(memory, u, numbers, size):
@@ -151,14 +207,19 @@ def with_adaptive_inflation(kernels: Kernels, deviation_place: int) -> Kernels:
         write_scores(row, innovation, cov, numbers, r, z, np.zeros((m, m)), scores)
         for k in range(m):
             total += scores[k]
-        row[factor] = moved_factor(row[factor], 0.5 * total / row[factor], numbers[deviation_place])
+        adapt(row, factor, 0.5 * total / row[factor], numbers)
 
-    return kernels._replace(start=start, predict=predict, update=update, extras=1)
+    return kernels._replace(start=start, predict=predict, update=update, extras=1 + updates_deviation)
 
 
 @lru_cache(maxsize=64)
 def with_inflation_by_state(
-    kernels: Kernels, functions: Functions, shape: Shape, deviation_place: int, taper_place: int | None
+    kernels: Kernels,
+    functions: Functions,
+    shape: Shape,
+    deviation_place: int,
+    updates_deviation: bool,
+    taper_place: int | None,
 ) -> Kernels:
     """The same with a factor for each state; tapers (n, m) of states and channels are among the numbers, if any.
 
@@ -171,12 +232,13 @@ def with_inflation_by_state(
     constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     observe, silence = functions.observe, silencer(n, shape.measurement_angles)
     tapers = -1 if taper_place is None else taper_place
+    begin, adapt = adapter(deviation_place, n, updates_deviation)
 
     @inlined
     def start(memory, numbers, size):
         start_plainly(memory, numbers, size)
         for i in range(n):
-            memory[0][first + i] = 1.0
+            begin(memory[0], first + i, numbers)
 
     @inlined
     def predict(memory, u, numbers, size):
@@ -202,7 +264,7 @@ def with_inflation_by_state(
             root, slope = row[first + i] ** 0.5, 0.0
             for k in range(m):
                 slope += 0.5 * scores[k] * near[i, k] / (root * (1.0 + near[i, k] * (root - 1.0)))
-            row[first + i] = moved_factor(row[first + i], slope, numbers[deviation_place])
+            adapt(row, first + i, slope, numbers)
 
-    rows = max(kernels.table_rows, n + m)
-    return kernels._replace(start=start, predict=predict, update=update, extras=n, table_rows=rows)
+    rows, extras = max(kernels.table_rows, n + m), n * (1 + updates_deviation)
+    return kernels._replace(start=start, predict=predict, update=update, extras=extras, table_rows=rows)

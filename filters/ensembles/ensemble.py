@@ -10,7 +10,7 @@ import numpy as np
 
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import own_place
-from filters.ensembles.adaptive import with_adaptive_inflation, with_inflation_by_state
+from filters.ensembles.adaptive import width_of, with_adaptive_inflation, with_inflation_by_state
 from filters.ensembles.inflation import inflated, relaxed
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
@@ -28,6 +28,7 @@ OF_THE_ENGINE = (  # parameters that no page reads
     "radius",
     "adaptive_inflation",
     "inflation_by_state",
+    "least_deviation",
     "window",
 )
 
@@ -99,6 +100,8 @@ class EnsembleFilter(FilterWithPage):
             is learnt from the innovations and never below 1, in steps of any length; 0 for none. See
             `filters.ensembles.adaptive`.
         inflation_by_state: 1 if adaptive_inflation learns a factor for each state, 0 if it is one for all.
+        least_deviation: if positive, the factor's prior is an inverse gamma density, and adaptive_inflation is its
+            first standard deviation, which measurements change and never take below this; both over the factor.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
@@ -110,6 +113,7 @@ class EnsembleFilter(FilterWithPage):
     relaxation: float = 0.0
     adaptive_inflation: float = 0.0
     inflation_by_state: int = 0
+    least_deviation: float = 0.0
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
@@ -127,6 +131,11 @@ class EnsembleFilter(FilterWithPage):
         switch("inflation_by_state", self.inflation_by_state)
         if self.inflation_by_state and not deviation:
             raise ValueError("adaptive_inflation of a filter with inflation_by_state must be positive, but got 0")
+        least = positive("least_deviation", self.least_deviation, zero_allowed=True)
+        if least > deviation:
+            rule = f"least_deviation must be at most adaptive_inflation, {deviation:g}"
+            raise ValueError(f"{rule}, but got {short_repr(self.least_deviation)}")
+        object.__setattr__(self, "least_deviation", least)
 
     @property
     def by_parts(self) -> bool:
@@ -141,8 +150,11 @@ class EnsembleFilter(FilterWithPage):
     @property
     def parameters(self) -> Mapping[str, Any]:
         """Fields that the page reads, and the deviation of an adaptive inflation, if it is chosen."""
-        deviation = {"deviation": self.adaptive_inflation} if self.adaptive_inflation else {}
-        return {**super().parameters, **deviation}
+        if not self.adaptive_inflation:
+            return super().parameters
+        limits = self.adaptive_inflation, self.least_deviation
+        deviation = np.array([width_of(one) for one in limits]) if self.least_deviation else limits[0]
+        return {**super().parameters, "deviation": deviation}
 
     def _fields(self) -> Iterator[str]:
         return (name for name in super()._fields() if name not in OF_THE_ENGINE)
@@ -173,11 +185,11 @@ class EnsembleFilter(FilterWithPage):
         if not self.adaptive_inflation:
             return kernels
         model = self.kernel_model
-        places = page.places(own_place(model.shape))
+        places, updates_deviation = page.places(own_place(model.shape)), self.least_deviation > 0.0
         if self.inflation_by_state:
-            chosen = model.functions, model.shape, places["deviation"], places.get("taper")
-            return with_inflation_by_state(kernels, *chosen)
-        return with_adaptive_inflation(kernels, places["deviation"])
+            chosen = places["deviation"], updates_deviation, places.get("taper")
+            return with_inflation_by_state(kernels, model.functions, model.shape, *chosen)
+        return with_adaptive_inflation(kernels, places["deviation"], updates_deviation)
 
     def analysis(self, functions: Functions, shape: Shape) -> Callable:
         """Return `analyse(memory, z, numbers, size)`: the update of a model's members, without relaxation."""

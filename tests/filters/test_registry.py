@@ -42,7 +42,7 @@ def test_filters_go_by_their_names():
 
 
 def test_a_filter_is_made_by_name_with_its_own_numbers():
-    spread = "inflation", "relaxation", "adaptive_inflation", "inflation_by_state"
+    spread = "inflation", "relaxation", "adaptive_inflation", "inflation_by_state", "least_deviation"
     ensemble = "ensemble_size", *spread, "radius", "centred_perturbations"
     assert [tunable_numbers(name) for name in ("ekf", "enkf")] == [("form",), ensemble]
     made = make_filter("enkf", thruster_model(), ensemble_size=7)

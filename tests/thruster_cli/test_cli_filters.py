@@ -69,7 +69,7 @@ def test_the_list_goes_to_json(thruster):
     told = {one["name"]: one for one in json.loads(out)["filters"]}
     assert code == 0 and list(told) == list(FILTERS)
     size, *others = told["enkf"]["numbers"]
-    assert size["name"] == "ensemble_size" and size["default"] == 100 and len(others) == 6
+    assert size["name"] == "ensemble_size" and size["default"] == 100 and len(others) == 7
     assert told["low-pass"]["covariance"] is False and told["low-pass"]["ensemble"] is False
 
 
