@@ -24,7 +24,7 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.compiled import CompiledOrPython, inlined, is_interpreting
 from thruster_env.numerics.truncated import truncated_normal
 from thruster_env.plants.state_bounds import Bound
 
@@ -44,7 +44,7 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
     mean, free = places.mean, places.extras + kernels.extras + kernels.scratch
     size = n + n * n  # mean and covariance are neighbours
     plain_start, plain_predict, plain_update = kernels.start, kernels.predict, kernels.update
-    constrain = (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, places.cov, bounds)
+    constrain = _constraint(n, mean, places.cov, bounds, bounded_by)
 
     @inlined
     def tell(row):
@@ -76,6 +76,32 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
 
     kept = kernels.extras + kernels.scratch + size
     return kernels._replace(start=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
+
+
+def constrained(
+    means: np.ndarray, covs: np.ndarray, bounds: tuple[Bound, ...], bounded_by: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means (..., n) and covariances (..., n, n) within bounds, of Gaussians that know of none."""
+    n = means.shape[-1]
+    rows = np.concatenate([means.reshape(-1, n), covs.reshape(-1, n * n)], axis=1)
+    _constrain_rows(n, bounds, bounded_by, is_interpreting())(rows)
+    return rows[:, :n].reshape(means.shape), rows[:, n:].reshape(covs.shape)
+
+
+@lru_cache(maxsize=64)
+def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpreting: bool) -> CompiledOrPython:
+    constrain = _constraint(n, 0, n, bounds, bounded_by)
+
+    def constrain_rows(rows):
+        for i in range(len(rows)):
+            constrain(rows[i])
+
+    return CompiledOrPython(constrain_rows)
+
+
+def _constraint(n: int, mean: int, cov: int, bounds: tuple[Bound, ...], bounded_by: str) -> Callable:
+    """The function that constrains the mean and the covariance in a row at these places."""
+    return (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, cov, bounds)
 
 
 def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.engine.batch import run, trajectories
+from filters.engine.bounded import constrained
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
@@ -50,6 +52,9 @@ def smooth(
         G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
         P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
 
+    Bounds of states hold for what is told of each step: the recursion knows of none, as the filter's does, and its
+    estimates are constrained at the end, by truncation or projection.
+
     With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates a step, so give
     it a lag of as many steps as the system remembers.
 
@@ -80,6 +85,10 @@ def smooth(
             raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
         found = smooth_modes(filter_, keys, inputs, measurements)
         return Smoothed(found.means, found.covs)
+    bounds, by = filter_.model.bounds, filter_.model.bounded_by
+    if bounds:
+        filter_ = dataclasses.replace(filter_, model=filter_.model.replace(bounds=()))
     relation = relation_of(filter_, "a smoother", ", imm, mmae or an ensemble Kalman filter")
     assert isinstance(filter_, PageFilter)
-    return Smoothed(*smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag))
+    free = smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag)
+    return Smoothed(*(constrained(*free, bounds, by) if bounds else free))

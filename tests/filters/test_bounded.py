@@ -9,6 +9,7 @@ from scipy.stats import truncnorm
 from filters import ExtendedKalmanFilter, augmented_model, linearize, make_filter, run, smooth
 from filters.augmented import Unknown
 from filters.consistency.intervals import mean_interval
+from filters.smoothers.online import WithSmoother
 from tests.models import KEY, scalar_model, simulated, wide_model
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.truncated import truncated_normal
@@ -117,6 +118,21 @@ def test_the_filter_goes_on_as_it_was_and_tells_what_is_within(by, naive, bounds
     assert np.linalg.eigvalsh(found.covs[0]).min() > 0.0
 
 
+@pytest.mark.parametrize("by, naive", [("truncation", naive_truncation), ("projection", naive_projection)])
+@pytest.mark.parametrize("name, lag", [("ekf", None), ("ukf", 3)])
+@pytest.mark.usefixtures("as_python")
+def test_the_smoother_goes_back_as_without_bounds_and_tells_what_is_within(name, lag, by, naive):
+    model, bounds = wide_model(), {0: (0.0, INF)}
+    inputs, measurements = simulated(model, 25, level=1.0, missing=0.2)
+    free = smooth(make_filter(name, model), None, inputs, measurements, lag)
+    bounded = make_filter(name, model.replace(bounds=bounds, bounded_by=by))
+    found = smooth(bounded, None, inputs, measurements, lag)
+    expected = [naive(x, p, bounds) for x, p in zip(free.means[0], free.covs[0], strict=True)]
+    np.testing.assert_allclose(found.means[0], [x for x, _ in expected], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(found.covs[0], [p for _, p in expected], rtol=1e-6, atol=1e-8)
+    assert (free.means[0, :, 0] < 0.0).sum() > 3 and (found.means[..., 0] >= 0.0).all()
+
+
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.usefixtures("as_python")
 def test_each_filter_with_a_page_keeps_the_bounds_on_all_paths(name):
@@ -213,7 +229,6 @@ def test_wrong_bounds_and_what_cannot_keep_them_are_refused():
             model.replace(bounds={1: pair})
     with pytest.raises(ValueError, match="bounded_by must be one of truncation, projection"):
         model.replace(bounded_by="clipping")
-    bounded = model.replace(bounds=BY_NAME)
-    inputs, z = simulated(model, 3)
-    with interpreted(), pytest.raises(ValueError, match="a smoother needs a model without bounds, but got"):
-        smooth(ExtendedKalmanFilter(model=bounded), None, inputs, z)
+    bounded = ExtendedKalmanFilter(model=model.replace(bounds=BY_NAME))
+    with interpreted(), pytest.raises(ValueError, match="a smoothing_lag needs a model without bounds, but got"):
+        WithSmoother(bounded.session(), bounded, 1)
