@@ -37,7 +37,7 @@ WORDS = {
         "belief nearly Gaussian", "mean, P", "2", "strong nonlinearity: the gain is that of a wide average"
     ),
     "ckf": Words("belief nearly Gaussian", "mean, P", "1", "as `ukf`"),
-    "mhe": Words("one mode", "L steps, mean, P", "300", "two modes"),
+    "mhe": Words("one mode", "L steps, mean, P", "100", "two modes"),
     "fading": Words(
         "f and h nearly linear; the model drifts", "mean, P", "1", "a model that is right: it forgets too soon"
     ),

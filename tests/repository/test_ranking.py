@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from filters.registry import FILTERS
 from pages import ranking_estimators, ranking_horizon, ranking_particles
 from pages.page import with_tables
-from pages.ranking_tables import TABLES, main, scenarios
+from pages.ranking_tables import DISCUSSED, TABLES, by_default, main, ratios_of, scenarios
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.seeds import held_out_seeds
@@ -77,7 +78,11 @@ PAGE = (Path(__file__).parents[2] / "docs" / "ranking.md").read_text()
 
 def table(name):
     """Cells of a table of the page, by filter or scenario."""
-    text = re.search(rf"<!-- table {name} -->\n(.*?)\n<!-- end -->", PAGE, flags=re.DOTALL)[1]
+    return cells_of(re.search(rf"<!-- table {name} -->\n(.*?)\n<!-- end -->", PAGE, flags=re.DOTALL)[1])
+
+
+def cells_of(text):
+    """Cells of a table, by the first one of a row."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
     return {cells[0]: cells[1:] for cells in rows}
 
@@ -119,6 +124,17 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
         float(one[0]) for name, one in batches.items() if "kf" in name
     )
     assert batches["mhe, L = 30"][2:] == ["0", "0 of 200"] and float(batches["ekf"][2]) < 0
+
+
+def test_the_table_of_all_filters_has_each_of_them_and_the_script_s_numbers():
+    page, problems = table("every_filter"), ("nominal", "outliers")
+    assert set(page) == {by_default(name).label for name in FILTERS}
+    without_places = contender("letkf", radius=2.0, ensemble_size=4)  # of which the thruster has none
+    filters = [*map(by_default, ("kf", "iekf", "ekf-robust", "inversion")), without_places]
+    found = cells_of(ratios_of(filters, problems))
+    assert found.pop(without_places.label)[:2] == ["-", "-"]
+    for label, (*cells, _) in found.items():
+        assert cells == [page[label][DISCUSSED.index(name)] for name in problems]
 
 
 def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):
