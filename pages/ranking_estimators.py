@@ -39,7 +39,7 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "recursive-kalmannet": {"runs": 512},
     "differentiable-enkf": {"runs": 512, "steps": 200, "window": 20},
 }
-PAPERS = {"runs": 1000, "steps": 1000, "batch": 30, "window": 100, "rate": 1e-3}  # of the paper, but for the steps
+PAPERS = {"runs": 1000, "steps": 600, "batch": 30, "window": 100, "rate": 1e-3}  # of the paper, but for the steps
 ELSEWHERE = (
     "nominal",
     "mismatch",
@@ -98,7 +98,7 @@ def network_papers() -> str:
     """The settings of the paper on KalmanNet: mean square errors in dB."""
     from thruster_env.studies import kalmannet
 
-    own, rows = {"differentiable-enkf": {"steps": 200, "window": 20}}, []
+    own, rows = {"differentiable-enkf": {"steps": 100, "window": 20}}, []
     for problem in (kalmannet.linear, kalmannet.lorenz):
         data = data_of(problem, problem.held_out_seeds(0, SEEDS))
         oracle_of = contender("ekf").filter(problem)
