@@ -100,7 +100,12 @@ def moved_factor(factor, slope, deviation):
 
 def width_of(deviation: float) -> float:
     """The width p of an inverse gamma density, below 1/3, with a standard deviation over its mode."""
-    return brentq(lambda p: p**0.5 - deviation * (1.0 - 2.0 * p) * (1.0 - 3.0 * p) ** 0.5, 0.0, 1.0 / 3.0)
+
+    def excess(root):
+        p = root * root
+        return root - deviation * (1.0 - 2.0 * p) * max(1.0 - 3.0 * p, 0.0) ** 0.5
+
+    return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # of the root, so that small ones are exact, too
 
 
 @inlined
