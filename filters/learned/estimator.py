@@ -10,8 +10,10 @@ from torch import Tensor, nn
 
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
-from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.checks import at_least, one_of
 from thruster_env.plants.state_space import StateSpaceModel
+
+MOST = 10_000  # members, or hidden states
 
 
 class Track(NamedTuple):
@@ -111,12 +113,12 @@ class LearnedEstimator(nn.Module):
             **options: in place of the defaults.
 
         Raises:
-            ValueError: for an unknown option, or a model that it cannot use.
+            ValueError: for an unknown or wrong option, or a model that it cannot use.
         """
         super().__init__()
         for name in options:
             one_of(f"an option of {self.kind}", name, tuple(self.options))
-        self.chosen = {**self.options, **options}
+        self.chosen = {name: at_least(name, value, 2, MOST) for name, value in {**self.options, **options}.items()}
         self.equations = Equations(model)
         self.name = self.kind
         for name, value in (unit_scales(model) if scales is None else scales)._asdict().items():

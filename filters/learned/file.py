@@ -46,7 +46,8 @@ class TrainedEstimator:
             with safe_open(self.path, framework="pt") as file:
                 self.about = json.loads((file.metadata() or {})[DESCRIPTION])
                 self._numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-            kind = self.about["kind"]
+            kind, self._options = str(self.about["kind"]), dict(self.about["options"])
+            self._made_for = {True: self.about["model"], False: self.about["sizes"]}
         except (SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"an estimator's file must be one of `thruster train-estimator`, but {self.path} is not: {error}"
@@ -56,14 +57,12 @@ class TrainedEstimator:
     def __call__(self, model: StateSpaceModel) -> LearnedEstimator:
         """The estimator for a model; ValueError for another model than that of the training."""
         kind = LEARNED[self.name]
-        own, found = self.about["model"], model.digest if kind.needs_model else sizes_of(model)
-        if not kind.needs_model:
-            own = self.about["sizes"]
+        own, found = self._made_for[kind.needs_model], model.digest if kind.needs_model else sizes_of(model)
         if own != found:
             raise ValueError(
                 f"{self.path} must be used with the model that it was trained with, {own}, but got {found}"
             )
-        made = kind(model, **self.about["options"])
+        made = kind(model, **self._options)
         try:
             made.load_state_dict(self._numbers)
         except RuntimeError as error:

@@ -12,6 +12,8 @@ from torch.nn.functional import softplus
 from filters.learned.estimator import LearnedEstimator, Track
 from filters.learned.networks import HIDDEN, GainNetwork, compressed
 
+MOST = 16  # states or measurements: weights grow with the sixth power, some ten million here
+
 
 class Correction(NamedTuple):
     """A correction of predictions x~: the track after it, and what it is made of.
@@ -50,6 +52,10 @@ class KalmanNet(LearnedEstimator):
     def build(self) -> None:
         """Make the network of the gain."""
         n, m = self.model.n, self.model.m
+        if max(n, m) > MOST:
+            raise ValueError(
+                f"{self.kind} must have a model of at most {MOST} states and measurements, but got {n} and {m}"
+            )
         self.gain = GainNetwork(n, m, n * m)
 
     def begin(self, keys: np.ndarray, z: Tensor) -> Track:

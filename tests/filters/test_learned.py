@@ -18,7 +18,7 @@ from filters.learned.file import LEARNED, read, write_estimator
 from filters.learned.gains import KalmanNet
 from filters.learned.networks import GainNetwork
 from filters.wrappers.vector import EstimateStates
-from tests.models import KEY, pendulum, plane_model, simulated
+from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6
@@ -290,11 +290,12 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
     with pytest.raises(ValueError, match="must be one of `thruster train-estimator`"):
         read(tmp_path / "text.safetensors")
     numbers = load_file(path)
-    for about in ({}, {"estimator": json.dumps({"kind": "os.system"})}, {"estimator": "[]"}):
+    known = read(path).about
+    wrong = {"kind": "os.system"}, {"options": 3}, {"options": {"width": 10**9}}, {"sizes": None}, {"model": "0"}
+    for about in ({}, {"estimator": "[]"}, *({"estimator": json.dumps(known | one)} for one in wrong)):
         save_file(numbers, tmp_path / "other.safetensors", about)
         with pytest.raises(ValueError, match="must be"):
-            read(tmp_path / "other.safetensors")
-    known = json.loads(json.dumps(read(path).about))
+            read(tmp_path / "other.safetensors")(plane_model(state_offset=[0.0, 0.0]))
     save_file(
         {**numbers, "gain.last.bias": np.zeros(3)}, tmp_path / "odd.safetensors", {"estimator": json.dumps(known)}
     )
@@ -302,6 +303,10 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
         read(tmp_path / "odd.safetensors")(plane_model())
 
 
-def test_unknown_options_are_refused():
+def test_unknown_and_wrong_options_are_refused():
+    with pytest.raises(ValueError, match="width must be a whole number of at least 2, but got 1"):
+        LEARNED["gru"](plane_model(), width=1)
     with pytest.raises(ValueError, match="an option of kalmannet"):
         KalmanNet(plane_model(), size=3)
+    with pytest.raises(ValueError, match="at most 16 states and measurements, but got 17 and 2"):
+        KalmanNet(random_affine(n=17))
