@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 from filters.learned.estimator import LearnedEstimator, Track
 from filters.learned.networks import HIDDEN, GainNetwork, compressed
 
-MOST = 16  # states or measurements: weights grow with the sixth power, some ten million here
+MOST = 16  # states or measurements: weights grow with the fourth power, to sixteen million here
 
 
 class Correction(NamedTuple):
