@@ -80,15 +80,9 @@ def _which() -> Which:
         asked=_asked.__contains__,
         marked=_marked.__contains__,
         called=_called.__contains__,
-        large=_is_large,
         apart=_apart.__contains__,
         narrow=_narrow.__contains__,
     )
-
-
-def _is_large(function: Callable) -> bool:
-    """Whether a function calls one that is called and not inlined."""
-    return not _called.isdisjoint(_callees(function))
 
 
 def overloaded(function: Callable) -> Callable:

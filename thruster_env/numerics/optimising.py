@@ -14,10 +14,6 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, NamedTuple
 
-LEVEL = 2  # of LLVM's optimisation of large functions: of the third, loops over long rows gain a tenth
-
-LEVEL_INSIDE = 1  # of what becomes part of these, and is then optimised once more
-
 WIDE = '"prefer-vector-width"="512"'  # as LLVM writes it among the attributes of a function
 
 RARELY = 1_000_000  # new objects after which garbage is collected meanwhile
@@ -29,7 +25,6 @@ class Which(NamedTuple):
     asked: Callable[[Callable], bool]  # whether it is ours to compile; of others' functions nothing is changed
     marked: Callable[[Callable], bool]  # whether it is one that becomes part of these
     called: Callable[[Callable], bool]  # whether it is one of those to leave as it is
-    large: Callable[[Callable], bool]  # whether it calls such functions
     apart: Callable[[Callable], bool]  # whether it is called, and never to become part of a caller
     narrow: Callable[[Callable], bool]  # whether its vectors are as wide as LLVM prefers
 
@@ -44,7 +39,7 @@ def optimise_once(which: Which) -> None:
     from numba.core import codegen, event
 
     library = getattr(codegen, "CPUCodeLibrary", None)
-    if not hasattr(library, "_optimize_final_module"):
+    if not hasattr(library, "_optimize_final_module") or not hasattr(library, "_optimize_functions"):
         return
     compiling = _listener(event.Listener, which.asked)
     event.register("numba:compile", compiling)
@@ -114,28 +109,26 @@ def _widen_vectors(library: Any, compiling, which: Which) -> None:
 
 
 def _optimise_outermost(library: Any, compiling, which: Which) -> None:
-    optimise = library._optimize_final_module
+    optimise, optimise_functions = library._optimize_final_module, library._optimize_functions
 
     @wraps(optimise)
     def optimise_outermost(self):
         function = compiling.function_of(self)
-        if compiling.outermost is None or not which.large(compiling.outermost):
+        if compiling.outermost in (None, function) or not which.called(function):
             optimise(self)
-        elif function is None or not which.called(function):
-            options = self._codegen
-            before = getattr(options, "_opt_level", None)
-            try:
-                level = LEVEL if len(compiling.dispatchers) == 1 else LEVEL_INSIDE
-                options._opt_level = before and min(before, level)
-                optimise(self)
-            finally:
-                options._opt_level = before
         elif which.apart(function):
             for part in self._final_module.functions:
                 if not part.is_declaration and function.__name__ in part.name:
                     part.add_function_attribute("noinline")
 
-    library._optimize_final_module = optimise_outermost
+    @wraps(optimise_functions)
+    def optimise_other_functions(self, module):
+        if compiling.outermost is None or compiling.function_of(self) is not compiling.outermost:
+            optimise_functions(self, module)
+        else:  # the passes over the whole module do this once more: with both, filters take a tenth longer
+            module.data_layout = self._codegen._data_layout
+
+    library._optimize_final_module, library._optimize_functions = optimise_outermost, optimise_other_functions
 
 
 def _emit_outermost(library: Any, codegen: Any, compiling, which: Which) -> None:
