@@ -29,7 +29,7 @@ from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.replay import ReplayEnv
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
-SANITIZERS = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SANITIZERS = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 OWN = {
     "kf": {},
     "kf information": {"form": "information"},
