@@ -9,15 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from filters.learned.estimator import LearnedEstimator, Track
-from filters.learned.networks import compressed, starting_at_zero
+from filters.learned.networks import starting_at_zero
 
 
 class GatedRecurrentUnit(LearnedEstimator):
     """A recurrent network from inputs and measurements to the states, without a model and without a covariance.
 
-        h = GRU(u, z, which of z are there; h'),  x = mean + D A h
+        g = (u, z, which of z are there),  h = GRU(g; h'),  x = mean + D (A h + B g)
 
-    It begins with the mean of the true states. It is the baseline that shows what the model contributes.
+    Inputs and measurements are standardised. It begins with the mean of the true states, and is the baseline that
+    shows what the model contributes.
 
     Source: Cho et al. (2014), "Learning phrase representations using RNN encoder-decoder", EMNLP.
     """
@@ -29,8 +30,9 @@ class GatedRecurrentUnit(LearnedEstimator):
     def build(self) -> None:
         """Make the layers, with so many hidden states as `width` says."""
         width = self.chosen["width"]
-        self.cell = nn.GRUCell(self.model.inputs + 2 * self.model.m, width)
-        self.last = starting_at_zero(nn.Linear(width, self.model.n))
+        size = self.model.inputs + 2 * self.model.m
+        self.cell = nn.GRUCell(size, width)
+        self.last = starting_at_zero(nn.Linear(width + size, self.model.n))
 
     def begin(self, keys: np.ndarray, z: Tensor) -> Track:
         """The estimates at the first measurements, with inputs at their mean."""
@@ -44,7 +46,8 @@ class GatedRecurrentUnit(LearnedEstimator):
     def _moved(self, hidden: Tensor, u: Tensor, z: Tensor) -> Track:
         seen = ~torch.isnan(z)
         measured = torch.where(seen, (z - self.scale_measurement_mean) / self.scale_measurement, 0.0)
-        given = (u - self.scale_input_mean) / self.scale_input
-        hidden = self.cell(torch.cat([compressed(given), compressed(measured), seen.double()], -1), hidden)
-        mean = self.equations.of_state(self.scale_state_mean + self.scale_state * self.last(hidden))
+        given = torch.cat([(u - self.scale_input_mean) / self.scale_input, measured, seen.double()], -1)
+        hidden = self.cell(given, hidden)
+        standardised = self.last(torch.cat([hidden, given], -1))
+        mean = self.equations.of_state(self.scale_state_mean + self.scale_state * standardised)
         return Track(mean, None, None, None, (hidden,))
