@@ -110,7 +110,8 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert max(upper(table("ambient")["ekf + U_0"][i]) for i in (1, 3)) < 1
     assert upper(table("reference")["pf 1000"][3]) < 1.02
     elsewhere = table("network_elsewhere")
-    assert all(float(cell) > 5 for cell in elsewhere["`dropout`"]) and "**" in elsewhere["`mismatch`"][0]
+    *networks, gain = map(float, elsewhere["`dropout`"])
+    assert min(networks) > 5 > 1.05 > gain and "**" in elsewhere["`mismatch`"][0]
     conditional, accurate = table("conditional"), table("accurate")
     assert all(center(conditional["rbpf 100"][i]) < 1.01 * center(conditional["pf 1000"][i]) for i in range(4))
     assert all(center(accurate["pf 1000 optimal"][i]) <= center(accurate["pf 10000"][i]) for i in range(4))
