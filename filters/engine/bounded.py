@@ -24,7 +24,7 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from thruster_env.numerics.compiled import CompiledOrPython, inlined, is_interpreting
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.numerics.truncated import truncated_normal
 from thruster_env.plants.state_bounds import Bound
 
@@ -91,8 +91,10 @@ def constrained(
 @lru_cache(maxsize=64)
 def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpreting: bool) -> CompiledOrPython:
     constrain = _constraint(n, 0, n, bounds, bounded_by)
+    fingerprint = function_fingerprint(constrain, within=__name__)
 
     def constrain_rows(rows):
+        fingerprint  # noqa: B018 - part of the cache's key
         for i in range(len(rows)):
             constrain(rows[i])
 
