@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, RUNS, JsonOption, OfPresetOption, SeedOption
 from thruster_cli.output import announce_compilation, check_targets, emit
 from thruster_cli.problems import PROBLEMS
-from tuning.api.train_estimator import BATCH, FOLDER, RATE, STEPS, WINDOW, train_estimator
+from tuning.api.train_estimator import DEFAULT, FOLDER, train_estimator
 from tuning.api.train_estimator import RUNS as TRAINING_RUNS
 from tuning.search.plan import HELD_OUT_SEEDS
 
@@ -30,12 +30,14 @@ def command(
     problem: Annotated[str, typer.Option(help=PROBLEMS, rich_help_panel=INPUT)] = "nominal",
     preset: OfPresetOption = None,
     runs: Annotated[int, typer.Option(help="Number of training runs.", rich_help_panel=LEARNING)] = TRAINING_RUNS,
-    steps: Annotated[int, typer.Option(help="Updates of the weights.", rich_help_panel=LEARNING)] = STEPS,
-    batch: Annotated[int, typer.Option(help="Runs in each update.", rich_help_panel=LEARNING)] = BATCH,
+    steps: Annotated[int, typer.Option(help="Updates of the weights.", rich_help_panel=LEARNING)] = DEFAULT.steps,
+    batch: Annotated[int, typer.Option(help="Runs in each update.", rich_help_panel=LEARNING)] = DEFAULT.batch,
     window: Annotated[
         int, typer.Option(help="Steps of a run over which gradients go back.", rich_help_panel=LEARNING)
-    ] = WINDOW,
-    rate: Annotated[float, typer.Option(help="Adam's step size at first.", rich_help_panel=LEARNING)] = RATE,
+    ] = DEFAULT.window,
+    rate: Annotated[
+        float, typer.Option(help="Adam's step size at first.", rich_help_panel=LEARNING)
+    ] = DEFAULT.rate,
     width: Annotated[
         int | None,
         typer.Option(

@@ -37,7 +37,6 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
@@ -104,6 +103,8 @@ def width_of(deviation: float) -> float:
     def excess(root):
         p = root * root
         return root - deviation * (1.0 - 2.0 * p) * max(1.0 - 3.0 * p, 0.0) ** 0.5
+
+    from scipy.optimize import brentq  # loads half of SciPy, for this line
 
     return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # of the root, so that small ones are exact, too
 

@@ -10,7 +10,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from filters.estimators.find import TRAINED
 from filters.learned.ensemble import DifferentiableEnsembleFilter
 from filters.learned.estimator import LearnedEstimator
 from filters.learned.gains import KalmanNet, RecursiveKalmanNet
@@ -18,8 +17,6 @@ from filters.learned.recurrent import GatedRecurrentUnit
 from thruster_env.numerics.checks import one_of
 from thruster_env.numerics.files import write_whole
 from thruster_env.plants.state_space import StateSpaceModel
-
-__all__ = ["LEARNED", "TRAINED", "TrainedEstimator", "read", "write_estimator"]
 
 LEARNED = {
     one.kind: one for one in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)
@@ -46,6 +43,8 @@ class TrainedEstimator:
             with safe_open(self.path, framework="pt") as file:
                 self.about = json.loads((file.metadata() or {})[DESCRIPTION])
                 self._numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            if self.about["format"] != FORMAT:
+                raise ValueError(f"its format is not {FORMAT}")
             kind, self._options = str(self.about["kind"]), dict(self.about["options"])
             self._made_for = {True: self.about["model"], False: self.about["sizes"]}
         except (SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -107,13 +107,14 @@ def _uncorrelated(seen: Tensor, r: Tensor) -> Tensor:
     return torch.where(seen[..., :, None] & seen[..., None, :] | alone, r, 0.0)
 
 
-def _factor(s: Tensor) -> Tensor:
+def factor(s: Tensor) -> Tensor:
     """The lower triangular L with L L' = s; NaN where s is not positive definite."""
     lower, failed = torch.linalg.cholesky_ex(s)
     return torch.where((failed == 0)[..., None, None], lower, math.nan)
 
 
-def _density(v: Tensor, root: Tensor, seen: Tensor) -> Tensor:
+def density(v: Tensor, root: Tensor, seen: Tensor) -> Tensor:
+    """Log N(v; 0, L L') of the entries that are seen, for L = root, (...)."""
     scaled = _forward_quotient(root, v)
     logs = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)) + densities.LEVEL
     return -0.5 * (scaled * scaled).sum(-1) - torch.where(seen, logs, 0.0).sum(-1)
@@ -143,8 +144,8 @@ def where(condition: Tensor, a: Tensor, b: Tensor, dimensions: int) -> Tensor:
     return torch.where(condition[(..., *[None] * dimensions)], a, b)
 
 
-def _multiple(dimensions: int, a: Tensor, factor: Tensor | float) -> Tensor:
-    return a * (factor[(..., *[None] * dimensions)] if isinstance(factor, Tensor) else factor)
+def _multiple(dimensions: int, a: Tensor, by: Tensor | float) -> Tensor:
+    return a * (by[(..., *[None] * dimensions)] if isinstance(by, Tensor) else by)
 
 
 def _reciprocal(a: Tensor) -> Tensor:
@@ -198,11 +199,11 @@ def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
     """`geometric.geometric_mean`."""
     if a.shape[-1] == 1:
         return (a * b).sqrt()
-    of_a, of_b = _unit(_factor(a)), _unit(_factor(b))
+    of_a, of_b = _unit(factor(a)), _unit(factor(b))
     a, b = a / of_a, b / of_b
     for _ in range(geometric.rounds(a.shape[-1])):
         both = a + b
-        of = _factor(both)
+        of = factor(both)
         unit = _unit(of)
         a, b = both / unit, _symmetric(_quotient(2, a, of) @ b) * unit
     return a * (of_a * of_b).sqrt()
@@ -232,8 +233,8 @@ RULES: dict[Operation, Callable] = {
     operations.congruence: lambda a, p, pa: _symmetric(a @ pa),
     operations.present: lambda z: z == z,
     operations.uncorrelated: _uncorrelated,
-    operations.factor: _factor,
-    densities.density: _density,
+    operations.factor: factor,
+    densities.density: density,
     densities.dot: lambda a, b: (a * b).sum(-1),
     points.root: root,
     points.outer: lambda a, b: a[..., :, None] * b[..., None, :],

@@ -16,9 +16,10 @@ from tests.models import plane_model
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.loss import Loss
+from tuning.learning.settings import Settings
 from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings
 from tuning.learning.starting import new_estimator, scales_of, starting_filter
-from tuning.learning.training import Settings, train
+from tuning.learning.training import train
 from tuning.learning.variants import twice_as_long, with_larger_noise
 from tuning.problems.check import data_of
 from tuning.problems.model_problem import ModelProblem
@@ -54,6 +55,8 @@ def test_the_loss_is_the_weighted_square_or_the_log_density_of_the_states_that_c
     e = (mean - truth)[0]
     density = 0.5 * e @ np.linalg.solve(cov[0], e) + 0.5 * np.log(np.linalg.det(2.0 * np.pi * cov[0]))
     assert Loss(LEARNED["recursive-kalmannet"](MODEL, scales), [1.0, 2.0])(*given).item() == pytest.approx(density)
+    indefinite = track._replace(cov=-track.cov)
+    assert np.isnan(Loss(LEARNED["recursive-kalmannet"](MODEL, scales), [1.0, 2.0])(indefinite, *given[1:]).item())
     alone = Loss(LEARNED["recursive-kalmannet"](MODEL, scales), [np.inf, 2.0])(*given).item()
     assert alone == pytest.approx(0.5 * e[1] ** 2 / 1.0 + 0.5 * np.log(2.0 * np.pi))
 

@@ -65,7 +65,7 @@ class EstimatorTraining:
     @property
     def best_other(self) -> Standing:
         """The filter with the lowest held-out score, without the oracle, which knows the plant's Q and R."""
-        others = (one for one in self.standings[:-1] if not one.label.endswith(ORACLE))
+        others = (one for one in self.standings[:-1] if not one.label.endswith(f" {ORACLE}"))
         return min(others, key=lambda one: one.evaluations[HELD_OUT].score.value)
 
     def sentences(self) -> list[str]:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from filters.estimators.find import TRAINED
+from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.learned import check_installed
 from thruster_env.numerics.checks import at_least, one_of, positive
@@ -21,6 +23,7 @@ from tuning.api.progress import console_for
 from tuning.api.run import file_name
 from tuning.evaluation.baselines import ORACLE, oracle
 from tuning.evaluation.tuned import read_choice
+from tuning.learning.settings import Settings
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
 from tuning.search.interruption import STOPPING, stop_on_interrupt
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
     from tuning.learning.training import Check
 
 FOLDER = Path("out") / "estimators"
-RUNS, STEPS, BATCH, WINDOW, RATE = 200, 1000, 32, 50, 5e-3
+RUNS, DEFAULT = 200, Settings()
 MOST = 1_000_000
 
 
@@ -41,10 +44,10 @@ def train_estimator(
     problem: Any = "nominal",
     *,
     runs: int = RUNS,
-    steps: int = STEPS,
-    batch: int = BATCH,
-    window: int = WINDOW,
-    rate: float = RATE,
+    steps: int = DEFAULT.steps,
+    batch: int = DEFAULT.batch,
+    window: int = DEFAULT.window,
+    rate: float = DEFAULT.rate,
     options: Mapping[str, int] | None = None,
     start: str | Path | None = None,
     against: Sequence[str | Path] = (),
@@ -88,11 +91,10 @@ def train_estimator(
         ValueError: states the rule and the value.
     """
     check_installed()
-    from filters.learned.file import LEARNED, TRAINED  # torch takes seconds to import
+    from filters.learned.file import LEARNED  # torch takes seconds to import
     from tuning.api.estimator_training import EstimatorTraining
     from tuning.learning.standings import standings
     from tuning.learning.starting import new_estimator, starting_filter
-    from tuning.learning.training import Settings
 
     one_of("an estimator", kind, tuple(LEARNED))
     found = problem_of(problem, preset)
@@ -124,7 +126,7 @@ def train_estimator(
     filters: dict[str, Filter] = {first: filter_, **others}
     if known is not None:
         filters[f"{filter_.name} {ORACLE}"] = known.filter(found)
-    filters[kind] = _as_filter(estimator)
+    filters[kind] = ForeignFilter(model=estimator.model, estimator=estimator)
     with console.status("held-out runs ..."):
         rows = standings(filters, found, found.held_out_seeds(seed, seeds))
     return EstimatorTraining(kind, found, target, tuple(checks), tuple(rows), seconds, filters, seed, interrupted)
@@ -155,12 +157,6 @@ def _trained(
                 write_estimator(target, estimator, {**told, **settings._asdict(), "step": check.step})
 
         return train(estimator, data, validation, problem.scale, settings, seed, on_step, on_check, stopped)
-
-
-def _as_filter(estimator: LearnedEstimator) -> Filter:
-    from filters.estimators.foreign import ForeignFilter
-
-    return ForeignFilter(model=estimator.model, estimator=estimator)
 
 
 @contextmanager

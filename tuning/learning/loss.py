@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from filters.learned.estimator import LearnedEstimator, Track
+from filters.tensors.algebra import density, factor
 
 
 class Loss:
@@ -18,6 +17,8 @@ class Loss:
 
         sum over states of w e^2,  w = 1/(scale * error of the starting filter)
         (e' P^-1 e + log det 2 pi P)/2
+
+    It is NaN where P is not positive definite; the training then leaves out the update.
     """
 
     def __init__(self, estimator: LearnedEstimator, scale):
@@ -38,8 +39,5 @@ class Loss:
         if not self._has_covariance:
             return torch.where(scored, (self._weights * error**2).sum(-1), 0.0).sum()
         assert track.cov is not None
-        part = track.cov[:, self._states[:, None], self._states]
-        root = torch.linalg.cholesky(part)
-        scaled = torch.linalg.solve_triangular(root, error[..., None], upper=False)[..., 0]
-        logs = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)) + 0.5 * math.log(2.0 * math.pi)
-        return torch.where(scored, (0.5 * scaled**2 + logs).sum(-1), 0.0).sum()
+        root = factor(track.cov[:, self._states[:, None], self._states])
+        return torch.where(scored, -density(error, root, torch.ones_like(error, dtype=torch.bool)), 0.0).sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from filters.consistency.intervals import Interval
@@ -35,18 +35,12 @@ class Standing(NamedTuple):
         return score_ratio(self.evaluations[runs], first.evaluations[runs])
 
 
-def standings(
-    filters: Mapping[str, Filter],
-    problem: Problem,
-    seeds: Sequence[int],
-    on_filter: Callable[[str], None] = lambda label: None,
-) -> list[Standing]:
+def standings(filters: Mapping[str, Filter], problem: Problem, seeds: Sequence[int]) -> list[Standing]:
     """Filters by label on held-out seeds of a problem, and on the same with longer runs and larger noise."""
     data = data_of(problem, seeds)
     runs = {HELD_OUT: data, LONGER: twice_as_long(problem, seeds), NOISIER: with_larger_noise(problem, data)}
     found = []
     for label, filter_ in filters.items():
-        on_filter(label)
         some = {name: evaluate(filter_, one, problem.scale) for name, one in runs.items() if one is not None}
         found.append(Standing(label, filter_.name, some))
     return found

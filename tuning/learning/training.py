@@ -11,30 +11,13 @@ import torch
 from torch import Tensor
 
 from filters.estimators.foreign import ForeignFilter
-from filters.learned.estimator import LearnedEstimator, Track
+from filters.learned.estimator import LearnedEstimator
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.loss import Loss
+from tuning.learning.settings import Settings
 from tuning.problems.data import Data
 
 LARGEST_GRADIENT = 1.0  # its norm is cut to this: one outlier shall not undo what was learned
-
-
-class Settings(NamedTuple):
-    """How an estimator is trained.
-
-    Attributes:
-        steps: updates of the network's weights.
-        batch: runs in each.
-        window: steps of a run over which gradients go back; the next window begins where the last one ended.
-        rate: Adam's step size at first; it falls to a hundredth along half a cosine.
-        checks: evaluations on validation runs.
-    """
-
-    steps: int = 1000
-    batch: int = 32
-    window: int = 50
-    rate: float = 5e-3
-    checks: int = 20
 
 
 class Check(NamedTuple):
@@ -99,7 +82,7 @@ def _train(
     on_check: Callable[[Check], None],
     stopped: Callable[[], bool],
 ) -> list[Check]:
-    loss, filter_ = Loss(estimator, scale), ForeignFilter(model=estimator.model, estimator=estimator)
+    filter_ = ForeignFilter(model=estimator.model, estimator=estimator)
     optimiser = torch.optim.Adam(estimator.parameters(), settings.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps, 0.01 * settings.rate)
     checks: list[Check] = []
@@ -117,10 +100,9 @@ def _train(
 
     check(0, [])
     recent: list[float] = []
-    windows = _windows(estimator, data, settings, np.random.default_rng(seed))
+    losses = _losses(estimator, data, settings, Loss(estimator, scale), np.random.default_rng(seed))
     for step in range(1, settings.steps + 1):
-        window = next(windows)
-        value = window(loss)
+        value = next(losses)
         optimiser.zero_grad()
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(estimator.parameters(), LARGEST_GRADIENT)
@@ -139,37 +121,28 @@ def _train(
     return checks
 
 
-def _windows(
-    estimator: LearnedEstimator, data: Data, settings: Settings, generator: np.random.Generator
-) -> Iterator[Callable[[Loss], Tensor]]:
-    """Endless windows of batches, in the order of time within a batch; each is a function of the loss.
+def _losses(
+    estimator: LearnedEstimator, data: Data, settings: Settings, loss: Loss, generator: np.random.Generator
+) -> Iterator[Tensor]:
+    """Endless losses, each of a window of a batch of runs, in the order of time within a batch.
 
     Steps before the first one that is scored have no derivatives.
     """
     seen, scored = data.seen, torch.tensor(data.scored)
     u, z, truth = (torch.tensor(part) for part in (seen.inputs, seen.measurements, data.known_states))
     count, times = scored.shape
-    first, width = data.first_scored, settings.window
+    first = max(data.first_scored, 1)
     while True:
         some = torch.tensor(generator.permutation(count)[: settings.batch])
-        track: list[Track] = []
         with torch.no_grad():
-            track.append(estimator.begin(seen.filter_keys[some], z[some, 0]))
+            track = estimator.begin(seen.filter_keys[some], z[some, 0])
             for k in range(1, min(first, times)):
-                track[0] = estimator.advance(track[0], u[some, k - 1], z[some, k])
-        for begin in range(max(first, 1), times, width):
-            steps = range(begin, min(begin + width, times))
-            counted = scored[some][:, begin : begin + width].sum()
-            if not counted:
-                break
-
-            def window(loss: Loss, some=some, steps=steps, counted=counted, track=track) -> Tensor:
-                total = torch.zeros((), dtype=torch.float64)
-                now = track[0].detach()
-                for k in steps:
-                    now = estimator.advance(now, u[some, k - 1], z[some, k])
-                    total = total + loss(now, truth[some, k], scored[some, k])
-                track[0] = now.detach()
-                return total / counted
-
-            yield window
+                track = estimator.advance(track, u[some, k - 1], z[some, k])
+        for begin in range(first, times, settings.window):
+            steps = slice(begin, begin + settings.window)
+            total, track = torch.zeros((), dtype=torch.float64), track.detach()
+            for k in range(*steps.indices(times)):
+                track = estimator.advance(track, u[some, k - 1], z[some, k])
+                total = total + loss(track, truth[some, k], scored[some, k])
+            if counted := scored[some, steps].sum():
+                yield total / counted
