@@ -38,7 +38,7 @@ STEPS = (
     Step("Does the noise of the sensor change?", ("vb", "sage-husa"), "they estimate R as they run"),
     Step("More states than you can afford members?", ("letkf",), "localised by distance"),
     Step("Are there dozens of states, or no Jacobian?", ("etkf", "enkf-n"), "enkf-n needs no inflation"),
-    Step("Is it wrong, with runs of known states?", ("kalmannet",), "a network learns the gain"),
+    Step("Is the model wrong, and are states recorded?", ("gru", "kalmannet"), "networks trained on those runs"),
     Step("Is the model wrong in an unknown way?", ("fading", "h-infinity"), "they trust it less; or tune Q"),
 )
 OTHERWISE = Step("Otherwise", ("ekf",), "the least cost, gradients, C code")
