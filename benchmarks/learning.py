@@ -32,8 +32,8 @@ def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
+    from filters.learned.threads import one_thread
     from thruster_env.training.environments import make_environments
-    from thruster_env.training.torch_settings import one_thread
 
     numbers = dict(setup.hyperparameters)
     envs = VecNormalize(

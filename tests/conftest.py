@@ -11,6 +11,8 @@ from thruster_env.numerics.compiled import interpreted
 # Before anything imports matplotlib or pygame.
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+# Each worker is a core's; threads of torch and of BLAS would wait for one another there.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 class MissingPackages:

@@ -7,6 +7,7 @@ gains       `kalmannet` and `recursive-kalmannet`, which learn a filter's gain
 recurrent   `gru`, a network without a model
 ensemble    `differentiable-enkf`, an ensemble filter that learns its noise
 file        trained estimators as files of numbers
+threads     how many threads of torch evaluate and train them
 
 `tuning.train_estimator` and `thruster train-estimator` train them.
 """

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
+from filters.learned.threads import one_thread
 from thruster_env.numerics.checks import at_least, one_of
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -163,7 +164,7 @@ class LearnedEstimator(nn.Module):
     def run(self, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Output:
         """All estimates of trajectories at once: keys (B, 2), inputs (B, K, p), measurements (B, K + 1, m)."""
         u, z = (torch.tensor(one, dtype=torch.float64) for one in (inputs, measurements))
-        with torch.no_grad():
+        with torch.no_grad(), one_thread():
             track = self.begin(keys, z[:, 0])
             tracks = [track]
             for k in range(u.shape[1]):

@@ -6,24 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.distributions import Distribution
 
+from filters.learned.threads import one_thread
 from thruster_env.numerics.wait_policy import PASSIVE, waiting
 from thruster_env.training.rollouts import epoch_minibatches
 from thruster_env.training.tanh import numpys_tanh
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Within this context torch uses one thread, which is fastest for such small networks."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import LearnedEstimator
+from filters.learned.threads import one_thread
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.loss import Loss
 from tuning.learning.settings import Settings
@@ -63,12 +64,8 @@ def train(
     Returns:
         All checks.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the fastest for such small networks
-    try:
+    with one_thread():
         return _train(estimator, data, validation, scale, settings, seed, on_step, on_check, stopped)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _train(

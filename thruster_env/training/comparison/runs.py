@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.learned.threads import one_thread
 from thruster_env.numerics.files import write_whole
 from thruster_env.numerics.modules import safe_paths
 from thruster_env.numerics.threads import cores
@@ -25,7 +26,6 @@ from thruster_env.training.learn import train
 from thruster_env.training.plants.plant import Part
 from thruster_env.training.saved import FINAL, load
 from thruster_env.training.score import Policy, Scores, score
-from thruster_env.training.torch_settings import one_thread
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.interruption import without_interrupts
 
