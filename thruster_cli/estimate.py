@@ -15,22 +15,16 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from filters.logs.verdict import ALPHA, verdict
+from thruster_cli.log_options import GridOptions, with_groups
 from thruster_cli.options import (
     A_LOG,
     FILTER,
     FILTER_HELP,
     OUTPUT,
     RUNS,
-    ClockOption,
-    ColumnOption,
-    DtOption,
     JsonOption,
-    LogPresetOption,
-    ModelOption,
     MonitorOption,
-    NoGridOption,
     SeedOption,
-    SensorOption,
     asked_monitor,
     filter_option,
     one_file,
@@ -42,6 +36,7 @@ from tuning.logs.read import read_named
 MOST_EPISODES = 8  # that are shown
 
 
+@with_groups
 def command(
     log: Annotated[Path, typer.Argument(metavar="LOG", help=A_LOG)],
     file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Tuned file, with filter, Q and R.")] = None,
@@ -52,13 +47,8 @@ def command(
     tuned: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The same as the argument.", rich_help_panel=FILTER)
     ] = None,
-    preset: LogPresetOption = None,
-    model: ModelOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    clock_offset: ClockOption = None,
-    dt: DtOption = None,
-    no_grid: NoGridOption = False,
+    *,
+    reading: GridOptions,
     ensemble_size: Annotated[
         int | None,
         typer.Option(help="Ensemble size; 100 by default, 1000 for particles.", rich_help_panel=FILTER),
@@ -121,8 +111,8 @@ def command(
     watch = asked_monitor(monitor, tuned)
     if isolate and watch is None:
         raise ValueError("--isolate must come with --monitor STEPS, whose alarms it counts")
-    recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt, grid=not no_grid)
-    check_targets((out, plot), json, read=(log, tuned, preset))
+    recorded, offer = read_named(log, **reading.named())
+    check_targets((out, plot), json, read=(log, tuned, reading.preset))
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
     options: dict[str, Any] = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}

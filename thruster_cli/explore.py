@@ -7,29 +7,17 @@ import tempfile
 import webbrowser
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from thruster_cli.log_options import BlockOptions, GridOptions, with_groups
 from thruster_cli.log_problems import problems_of
 from thruster_cli.options import (
     FILTER_HELP,
     INPUT,
     RUNS,
-    BlocksOption,
-    ClockOption,
-    ColumnOption,
-    DtOption,
-    HeldOutOption,
-    HoldGapsOption,
-    LeadOption,
-    LogOption,
-    LogPresetOption,
-    ModelOption,
-    NoGridOption,
     SeedOption,
-    SensorOption,
-    StartOption,
     filter_option,
 )
 from thruster_cli.output import announce_compilation, working
@@ -42,6 +30,7 @@ FORWARD = '<!doctype html><meta charset="utf-8"><meta name="referrer" content="n
 FORWARD += '<meta http-equiv="refresh" content="0; url={url}"><title>thruster explore</title>'
 
 
+@with_groups
 def command(
     file: Annotated[
         Path | None,
@@ -52,19 +41,9 @@ def command(
         str | None,
         typer.Option("--problem", "--scenario", help=f"outliers by default. {PROBLEMS}", rich_help_panel=INPUT),
     ] = None,
-    log: LogOption = None,
-    held_out: HeldOutOption = None,
-    blocks: BlocksOption = None,
-    lead: LeadOption = None,
-    hold_gaps: HoldGapsOption = False,
-    start: StartOption = None,
-    preset: LogPresetOption = None,
-    model: ModelOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    clock_offset: ClockOption = None,
-    dt: DtOption = None,
-    no_grid: NoGridOption = False,
+    *,
+    logs: BlockOptions,
+    reading: GridOptions,
     seeds: Annotated[int, typer.Option(min=1, max=64, help="Number of runs at once.", rich_help_panel=RUNS)] = 8,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page; 0 for a free one.", rich_help_panel=RUNS)
@@ -99,10 +78,7 @@ def command(
 
     Example: thruster explore --log run1.csv --filter ekf
     """
-    of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
-    of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
-    of_logs |= {"hold_gaps": hold_gaps or None, "start": start, "grid": False if no_grid else None}
-    bench = _bench(file, filter_name, scenario, log, of_logs, seed)
+    bench = _bench(file, filter_name, scenario, logs, reading, seed)
     try:
         from tuning.exploring.page.document import page_of
         from tuning.exploring.page.server import Server
@@ -125,18 +101,18 @@ def _bench(
     file: Path | None,
     filter_name: str | None,
     scenario: str | None,
-    log: list[Path] | None,
-    of_logs: dict[str, Any],
+    logs: BlockOptions,
+    reading: GridOptions,
     seed: int,
 ) -> Bench:
     if file is None:
-        (problem,) = problems_of([scenario] if scenario else None, log, of_logs, "outliers")
+        (problem,) = problems_of([scenario] if scenario else None, logs, reading, "outliers")
         return Bench(problem, filter_name or "ekf", seed=seed)
     if filter_name is not None:
         raise ValueError(f"give either a tuned file or --filter NAME, but got both, {file} and {filter_name}")
-    if log:
-        raise ValueError(f"give either a tuned file or --log, but got both, {file} and {log[0]}")
-    choice, problem, _ = subject_of(file, scenario, of_logs["preset"], of_logs["model"])
+    if logs.log:
+        raise ValueError(f"give either a tuned file or --log, but got both, {file} and {logs.log[0]}")
+    choice, problem, _ = subject_of(file, scenario, reading.preset, reading.model)
     return Bench(problem, choice.name, choice, seed)
 
 

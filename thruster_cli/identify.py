@@ -11,22 +11,16 @@ import typer
 from rich.text import Text
 
 from thruster_cli.identified import as_json, report, write_files
+from thruster_cli.log_options import GridOptions, with_groups
 from thruster_cli.options import (
     A_LOG,
     FILTER,
     INPUT,
     OUTPUT,
     SEARCH,
-    ClockOption,
-    ColumnOption,
-    DtOption,
     HoldGapsOption,
     JsonOption,
-    LogPresetOption,
-    ModelOption,
-    NoGridOption,
     SeedOption,
-    SensorOption,
     filter_option,
 )
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, progress_console
@@ -42,6 +36,7 @@ INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
 
 
+@with_groups
 def command(
     logs: Annotated[list[Path] | None, typer.Argument(metavar="LOG...", help=f"Recorded runs. {A_LOG}")] = None,
     free: Annotated[
@@ -51,13 +46,8 @@ def command(
             rich_help_panel=SEARCH,
         ),
     ] = None,
-    preset: LogPresetOption = None,
-    model: ModelOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    clock_offset: ClockOption = None,
-    dt: DtOption = None,
-    no_grid: NoGridOption = False,
+    *,
+    reading: GridOptions,
     range_: Annotated[
         list[str] | None,
         typer.Option(
@@ -164,34 +154,27 @@ def command(
 
         for_logs: dict[str, Any] = {
             "--free": free,
-            "--model": model,
-            "--sensor": sensor,
+            "--model": reading.model,
+            "--sensor": reading.sensor,
             "--range": range_,
-            "--start": start,
         }
-        for_logs |= {
-            "--hold-noise": hold_noise,
-            "--no-grid": no_grid,
-            "--held-out": held_out,
-            "--use-all": use_all,
-            "--plot": plot,
-        }
-        check_of_table(for_logs | {"--predicted": predicted})
-        reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
-        return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
+        for_logs |= {"--start": start, "--hold-noise": hold_noise, "--no-grid": reading.no_grid}
+        for_logs |= {"--held-out": held_out, "--use-all": use_all, "--plot": plot, "--predicted": predicted}
+        check_of_table(for_logs)
+        of_step = {"columns": reading.column, "clock_offset": reading.clock_offset, "dt": reading.dt}
+        return identify_bollard(bollard, step, logs, reading.preset, out or DEFAULT_OUT, json, **of_step)
     if step is not None:
         raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
-    whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor}
-    options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt, "grid": not no_grid}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
     out = out or DEFAULT_OUT
-    runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **options)
-    family = family_of(runs, names_of(free), **whose, noise=not hold_noise, filter=filter_name)
+    runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **reading.named())
+    plant: dict[str, Any] = {"preset": reading.preset, "model": reading.model, "sensors": reading.sensor}
+    family = family_of(runs, names_of(free), **plant, noise=not hold_noise, filter=filter_name)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
-    check_targets((out, plot), json, read=(*logs, *(held_out or []), preset))
+    check_targets((out, plot), json, read=(*logs, *(held_out or []), reading.preset))
     announce_compilation()
     search: dict[str, Any] = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts}
     whole = identified(

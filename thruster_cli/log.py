@@ -10,17 +10,12 @@ import typer
 from rich.console import RenderableType
 
 from thruster_cli.fields import as_json, as_table, found_in, is_listed
+from thruster_cli.log_options import ReadingOptions, with_groups
 from thruster_cli.options import (
     A_LOG,
     INPUT,
     OUTPUT,
-    ClockOption,
-    ColumnOption,
-    DtOption,
     JsonOption,
-    LogPresetOption,
-    ModelOption,
-    SensorOption,
 )
 from thruster_cli.output import check_picture, check_targets, console, emit, table
 from thruster_env.plants.logs.findings import sentences
@@ -28,14 +23,11 @@ from thruster_env.plants.logs.log import Log
 from tuning.logs.read import read_named
 
 
+@with_groups
 def command(
     log: Annotated[Path, typer.Argument(metavar="LOG", help=A_LOG)],
-    preset: LogPresetOption = None,
-    model: ModelOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    clock_offset: ClockOption = None,
-    dt: DtOption = None,
+    *,
+    reading: ReadingOptions,
     only: Annotated[
         str | None,
         typer.Option(
@@ -67,7 +59,7 @@ def command(
 
     Example: thruster log flight.ulg --only actuator
     """
-    if is_listed(log, only, any(one for one in (preset, model, sensor, column, clock_offset, dt, plot))):
+    if is_listed(log, only, any((*reading.named().values(), plot))):
         check_targets((), json, read=(log,))
         some = found_in(log, only)
         shown = as_table(log, some, console.is_terminal)
@@ -77,8 +69,8 @@ def command(
         return
     if plot is not None:
         check_picture(plot, "--plot")
-    recorded, _ = read_named(log, preset, model, sensor, column, clock_offset, dt)
-    check_targets((plot,), json, read=(log, preset))
+    recorded, _ = read_named(log, **reading.named())
+    check_targets((plot,), json, read=(log, reading.preset))
     if plot is not None:
         from thruster_env.plants.logs.figure import findings_figure
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
+from thruster_cli.log_options import BlockOptions, GridOptions
 from thruster_env.numerics.checks import short_repr
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
@@ -13,14 +13,17 @@ from tuning.thruster.logs import of_preset
 
 
 def problems_of(
-    names: Sequence[str] | None, logs: Sequence[Path] | None, options: Mapping, default: str
+    names: Sequence[str] | None, logs: BlockOptions, reading: GridOptions, default: str
 ) -> tuple[Problem, ...]:
     """The problems of a study: logs with their options, or problems by name."""
+    options = {**reading.named(), **logs.named()}
     given = {name: value for name, value in options.items() if value is not None}
-    if logs:
+    if logs.log:
         if names:
-            raise ValueError(f"a study must be of --log or of --problem, but got both, {logs[0]} and {names[0]}")
-        return (log_problem(logs, **given),)
+            raise ValueError(
+                f"a study must be of --log or of --problem, but got both, {logs.log[0]} and {names[0]}"
+            )
+        return (log_problem(logs.log, **given),)
     preset = given.pop("preset", None)
     if given:
         first = next(iter(given))

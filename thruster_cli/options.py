@@ -1,6 +1,7 @@
 """Options that several commands share, and the panels that group them in `--help`.
 
 Each command lists its options in its own signature, because Typer reads them there; their texts are here alone.
+Those of recorded logs, which go together, are in `thruster_cli/log_options.py`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import typer
 from filters.monitoring.monitor import Monitor, monitor_of
 from filters.monitoring.stored import tuned_monitor
 from filters.registry import FILTERS
-from filters.starts import STARTS
 from thruster_env.channels import CHANNELS
 from thruster_env.numerics.checks import any_case
 from thruster_env.parameters import PRESETS
@@ -93,16 +93,6 @@ LogPresetOption = Annotated[
         "--preset", help=f"The thruster of the log: {A_PRESET}", callback=spelt(PRESETS), rich_help_panel=INPUT
     ),
 ]
-ModelOption = Annotated[
-    str | None,
-    typer.Option(
-        "--model",
-        metavar="MODULE:OBJECT",
-        help="Instead of a thruster: a StateSpaceModel, or a function that returns one (called with dt if it has "
-        "that argument).",
-        rich_help_panel=INPUT,
-    ),
-]
 SensorOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -120,32 +110,6 @@ ColumnOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
-ClockOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--clock-offset",
-        metavar="NAME=SECONDS",
-        help="Offset of a channel's clock, positive if it is ahead.",
-        rich_help_panel=INPUT,
-    ),
-]
-DtOption = Annotated[
-    float | None,
-    typer.Option(
-        "--dt",
-        help="Sample time [s] of a log without times, or of the grid for irregular ones. Variances are per "
-        "step of it.",
-        rich_help_panel=INPUT,
-    ),
-]
-NoGridOption = Annotated[
-    bool,
-    typer.Option(
-        "--no-grid",
-        help="Use the log's own time stamps, for a model in continuous time; variances are per step of --dt.",
-        rich_help_panel=INPUT,
-    ),
-]
 TUNED = "tuned"  # of --monitor
 MonitorOption = Annotated[
     str | None,
@@ -157,52 +121,11 @@ MonitorOption = Annotated[
         rich_help_panel=RUNS,
     ),
 ]
-LogOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--log",
-        help=f"Instead of a problem: a recorded run; may be repeated. {A_LOG}",
-        rich_help_panel=INPUT,
-    ),
-]
-HeldOutOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--held-out",
-        help="Held-out recorded run, never used by the study; by default every third one.",
-        rich_help_panel=INPUT,
-    ),
-]
-BlocksOption = Annotated[
-    int | None,
-    typer.Option(
-        "--blocks",
-        help="Number of blocks per run; about 24 in total by default.",
-        rich_help_panel=INPUT,
-    ),
-]
-LeadOption = Annotated[
-    int | None,
-    typer.Option(
-        "--lead",
-        help="Number of rows at the beginning of a block that are not scored; 50 by default.",
-        rich_help_panel=INPUT,
-    ),
-]
 HoldGapsOption = Annotated[
     bool,
     typer.Option(
         "--hold-gaps",
         help="Hold the last input over gaps of a log; by default runs are split there.",
-        rich_help_panel=INPUT,
-    ),
-]
-StartOption = Annotated[
-    str | None,
-    typer.Option(
-        "--start",
-        help="Initial state of blocks: prior, or measurement, from their first measurement.",
-        callback=spelt(STARTS),
         rich_help_panel=INPUT,
     ),
 ]

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from thruster_cli.log_options import BlockOptions, GridOptions, with_groups
 from thruster_cli.log_problems import problems_of
 from thruster_cli.options import (
     FILTER,
@@ -16,21 +17,8 @@ from thruster_cli.options import (
     OUTPUT,
     RUNS,
     SEARCH,
-    BlocksOption,
-    ClockOption,
-    ColumnOption,
-    DtOption,
-    HeldOutOption,
-    HoldGapsOption,
     JsonOption,
-    LeadOption,
-    LogOption,
-    LogPresetOption,
-    ModelOption,
-    NoGridOption,
     SeedOption,
-    SensorOption,
-    StartOption,
     filter_option,
     spelt,
 )
@@ -50,6 +38,7 @@ NONE_CONSISTENT = 3  # exit code
 TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 
 
+@with_groups
 def command(
     filter_name: Annotated[str, filter_option(TUNED_FILTER_HELP)] = "enkf",
     scenario: Annotated[
@@ -156,19 +145,9 @@ def command(
             rich_help_panel=OUTPUT,
         ),
     ] = DEFAULT_STORAGE,
-    log: LogOption = None,
-    held_out: HeldOutOption = None,
-    blocks: BlocksOption = None,
-    lead: LeadOption = None,
-    hold_gaps: HoldGapsOption = False,
-    start: StartOption = None,
-    preset: LogPresetOption = None,
-    model: ModelOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    clock_offset: ClockOption = None,
-    dt: DtOption = None,
-    no_grid: NoGridOption = False,
+    *,
+    logs: BlockOptions,
+    reading: GridOptions,
     study: Annotated[
         str | None,
         typer.Option(help="Name of the study; by default from the options above.", rich_help_panel=OUTPUT),
@@ -220,12 +199,11 @@ def command(
     """
     aim = aim_of(method, objective)
     check_keepable(filter_name)
-    of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
-    of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
-    of_logs |= {"hold_gaps": hold_gaps or None, "start": start, "grid": False if no_grid else None}
     unknown = unknowns_of(augment or ())
-    scenarios = tuple(augmented(one, unknown) for one in problems_of(scenario, log, of_logs, "mismatch"))
-    check_targets((out,), json, read=(*(log or []), *(held_out or []), *(scenario or []), preset))
+    scenarios = tuple(augmented(one, unknown) for one in problems_of(scenario, logs, reading, "mismatch"))
+    check_targets(
+        (out,), json, read=(*(logs.log or []), *(logs.held_out or []), *(scenario or []), reading.preset)
+    )
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(
         filter_name,

@@ -14,9 +14,8 @@ import thruster_cli.explore as command
 import tuning
 from tests.linear_problem import LinearProblem
 from thruster_cli.explore import _bench, _forward
+from thruster_cli.log_options import BlockOptions, GridOptions
 from tuning.exploring.page.server import Server
-
-NOTHING = dict.fromkeys(("preset", "model", "sensors"))
 
 
 def test_a_notebook_shows_the_page_in_a_frame_until_it_is_closed(as_python):
@@ -59,9 +58,9 @@ def test_what_cannot_be_explored_is_refused(arguments, says):
 
 def test_a_tuned_file_comes_without_a_filter_or_a_log(tmp_path):
     with pytest.raises(ValueError, match="give either a tuned file or --filter NAME"):
-        _bench(tmp_path / "tuned.json", "ekf", None, None, NOTHING, 0)
+        _bench(tmp_path / "tuned.json", "ekf", None, BlockOptions(), GridOptions(), 0)
     with pytest.raises(ValueError, match="give either a tuned file or --log"):
-        _bench(tmp_path / "tuned.json", None, None, [tmp_path / "run.csv"], NOTHING, 0)
+        _bench(tmp_path / "tuned.json", None, None, BlockOptions(log=[tmp_path / "run.csv"]), GridOptions(), 0)
 
 
 def test_the_browser_is_led_to_the_page_by_a_file_that_others_cannot_read(tmp_path):
