@@ -12,17 +12,24 @@ Q, R = np.diag([0.05, 0.2]), np.diag([0.4, 0.1])
 P0 = np.diag([1.0, 0.5])
 
 
+def root_of(cov):
+    """The matrix M by which NumPy's `multivariate_normal` multiplies a row of normals: M' M = cov."""
+    _, variances, axes = np.linalg.svd(np.asarray(cov))
+    return np.sqrt(variances)[:, None] * axes
+
+
 def drawn(a, c, q, r, p0, steps, runs, seed, missing=0.0):
     """Runs of a linear model as mappings of measurements and states."""
     rng = np.random.default_rng(seed)
+    of_start, of_state, of_sensor = (root_of(cov) for cov in (p0, q, r))
     found = []
     for _ in range(runs):
-        x = rng.multivariate_normal(np.zeros(len(a)), p0)
+        x = rng.standard_normal(len(a)) @ of_start
         states, seen = [], []
         for _ in range(steps + 1):
             states.append(x)
-            seen.append(c @ x + rng.multivariate_normal(np.zeros(len(c)), r))
-            x = a @ x + rng.multivariate_normal(np.zeros(len(a)), q)
+            seen.append(c @ x + rng.standard_normal(len(c)) @ of_sensor)
+            x = a @ x + rng.standard_normal(len(a)) @ of_state
         z = np.array(seen)
         z[rng.random(z.shape) < missing] = np.nan
         found.append({"measurements": z, "states": np.array(states)})
