@@ -217,6 +217,7 @@ def test_a_users_filter_is_that_of_run(which, tmp_path):
     assert_same(found, [one[0] for one in run(filter_, None, inputs, z)[:5]], 1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_a_vehicle_and_many_states(name, tmp_path):

@@ -106,7 +106,10 @@ def assert_compiled_as_python(filter_, *data, **noise):
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [*((name, "thruster") for name in FILTERS), *((name, "wide affine") for name in OF_EACH_KIND)],
+    [
+        *((name, "thruster") for name in FILTERS),
+        *(pytest.param(name, "wide affine", marks=pytest.mark.slow) for name in OF_EACH_KIND),
+    ],
 )
 def test_compiled_and_interpreted_agree(name, kind):
     model = MODELS[kind]()

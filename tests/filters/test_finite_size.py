@@ -77,6 +77,7 @@ def test_a_missing_channel_takes_no_part():
     np.testing.assert_allclose(analysis.members, expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_needs_no_inflation_where_the_transform_filter_loses_the_truth():
     data = lorenz63.problem.data(range(8))
 

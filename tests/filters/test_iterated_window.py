@@ -200,6 +200,7 @@ def whole_filter():
     return filter_, *simulated(model, 12, missing=0.2)
 
 
+@pytest.mark.slow
 def test_compiled_code_is_python_s():
     filter_, inputs, z = whole_filter()
     noise = varying_noise(filter_.model, 12)

@@ -108,7 +108,7 @@ def test_van_loan_is_the_integral(dt):
         np.testing.assert_allclose(oscillator().noise(dt), noise_for_dt(S, 1.0, dt), rtol=2e-2, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "ekf-robust", "pf"])
+@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "ekf-robust", pytest.param("pf", marks=pytest.mark.slow)])
 def test_late_samples_give_what_the_right_order_gives(name):
     plant = oscillator()
     filter_ = make_filter(name, plant.at(0.05))

@@ -105,6 +105,7 @@ def test_a_function_may_make_a_model_in_continuous_time():
     assert in_discrete_time(thruster_model) is thruster_model
 
 
+@pytest.mark.slow
 def test_alarms_and_isolation_work_on_own_stamps():
     rng = np.random.default_rng(5)
     stamps = np.cumsum(rng.uniform(0.01, 0.09, size=300))

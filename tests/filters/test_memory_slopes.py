@@ -155,6 +155,7 @@ def test_on_a_scenario_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_scenario("outliers"), name, 100)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NAMES[:1])
 def test_on_a_vehicle_the_gradient_is_that_of_differences(name):

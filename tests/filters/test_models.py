@@ -287,6 +287,7 @@ def means():
 """
 
 
+@pytest.mark.slow
 def test_a_model_that_was_edited_is_never_served_from_the_old_cache(tmp_path):
     """numba's cache looks at the outermost function only; the models of two folders may bear one name, too."""
     root = Path(__file__).parents[2]

@@ -136,7 +136,8 @@ def test_auxiliary_cycles_are_the_naive_ones_with_the_same_draws(width):
             np.testing.assert_array_equal(belief.members[3:], 0.0)
 
 
-@pytest.mark.parametrize("kind", [ParticleFilter, pytest.param(AuxiliaryParticleFilter, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [ParticleFilter, AuxiliaryParticleFilter])
 def test_it_converges_to_the_kalman_filter_like_one_over_root_n(kind):
     model = line_model()
     inputs, measurements = simulated(model, 30, count=60, seed=0, level=1.0, compiled=True)

@@ -183,6 +183,7 @@ def slope_measurements(steps):
     return np.array(found)[None, :, None]
 
 
+@pytest.mark.slow
 def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_the_optimal_proposal():
     model = scalar_model(measurement_noise_cov=[1e-4])
     inputs, z = simulated(model, 60, missing=0.1)

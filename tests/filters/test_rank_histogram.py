@@ -140,6 +140,7 @@ def test_channels_with_correlated_noise_are_made_independent():
     np.testing.assert_allclose(alone, updated(second, x, [-0.5]), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_compiled_code_and_python_are_one_and_pages_alone_are_refused():
     filter_ = make_filter("rhf", plane_model(), ensemble_size=9, relaxation=0.3, inflation=1.02)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)

@@ -11,6 +11,7 @@ from thruster_env.model import thruster_model
 NO_MORE = {"fading": {"fading": 1.0}, "h-infinity": {"theta": 1e-12}, "schmidt": {}}
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NO_MORE)
 @pytest.mark.parametrize("make", [thruster_model, wide_model])
 def test_without_its_number_each_is_the_extended_filter(name, make):

@@ -67,6 +67,7 @@ def test_a_copy_is_the_single_env_with_its_seed(mode):
     assert ends.all()  # some were terminated, some truncated
 
 
+@pytest.mark.slow
 def test_compiled_copies_of_several_blocks_are_single_envs():
     ends = assert_copies_are_single_envs("Cart-v0", 130, NEXT_STEP, 12, 5, [0, 127, 129], inputs=2, **LOSING)
     assert ends.any()

@@ -17,7 +17,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
-from pages import filter_horizon, filter_particles
+from pages import filter_gaussian, filter_horizon, filter_particles
 from thruster_env.channels import CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -215,6 +215,7 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path, monkeypatch):
     pytest.importorskip("pygame")
     monkeypatch.setattr(filter_particles, "SIZES", (20, 50))  # of a picture alone, which takes minutes otherwise
     monkeypatch.setattr(filter_horizon, "LENGTHS", (5, 10))
+    monkeypatch.setattr(filter_gaussian, "RUNS", 4)
     shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
     importlib.import_module(SCRIPTS[page]).main([str(tmp_path)])
     anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))

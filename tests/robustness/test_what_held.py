@@ -57,6 +57,7 @@ def test_with_a_fifth_of_all_samples_missing_all_paths_agree(name):
         np.testing.assert_allclose([info[key] for info in infos], part[0], rtol=5e-13, atol=5e-13)
 
 
+@pytest.mark.slow
 def test_the_band_of_the_mean_nis_holds_95_percent_of_logs():
     model, steps = scalar_model(), 60
     rng, inputs, x = np.random.default_rng(8), np.zeros((LOGS, steps, 1)), np.empty((LOGS, steps + 1, 1))

@@ -143,6 +143,7 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
         run_panel(Panel(runs.PANEL[:2], ("ekf",), 3), tmp_path)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done(monkeypatch, tmp_path):
     real = runs.tuned_case
 

@@ -95,6 +95,7 @@ def test_the_protocol_names_all_groups_and_was_predicted():
     assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
 
 
+@pytest.mark.slow
 def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
     case = next(case for case in CASES if case.name == "targets")._replace(runs=4)
     q = case.make().true["process_noise_cov"]
@@ -111,6 +112,7 @@ def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
     assert found.score < 1.01 * oracle.score < 0.9 * start.score
 
 
+@pytest.mark.slow
 def test_a_ring_is_tuned_by_its_inflation_alone():
     case = next(case for case in CASES if case.make is ring)._replace(make=lambda: ring(100), runs=2)
     starts = [start_of(case, place) for place in range(3)]

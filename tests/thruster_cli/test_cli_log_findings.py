@@ -84,6 +84,7 @@ def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json): 
     assert "is stuck at" in mine._repr_html_()
 
 
+@pytest.mark.slow
 def test_identify_names_the_gate_and_cuts_at_gaps(folder, thruster, as_json):  # noqa: F811
     options = ("--free", "gain", "--hold-noise", "--starts", 1, "--use-all", *MODEL)
     wild = as_json("identify", "wild.csv", *options)

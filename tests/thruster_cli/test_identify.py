@@ -129,6 +129,7 @@ def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_pa
     assert not list(tmp_path.rglob("*.toml"))
 
 
+@pytest.mark.slow
 def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):  # noqa: F811
     truth = OTHER.thruster._replace(
         **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
@@ -239,6 +240,7 @@ motor = ContinuousModel(
 """
 
 
+@pytest.mark.slow
 def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
     rng, speed, rows = np.random.default_rng(1), 0.0, []
     (tmp_path / "plant.py").write_text(MOTOR)

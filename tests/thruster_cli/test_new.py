@@ -46,6 +46,7 @@ def new(thruster, monkeypatch, tmp_path):  # noqa: F811
             del sys.modules[name]
 
 
+@pytest.mark.slow
 def test_a_problem_can_be_tuned(new, as_json):  # noqa: F811
     name = new("problem", "a_new_problem")
     found = as_json("tune", "--problem", f"{name}:problem", "--filter", "ekf", "--trials", 2)

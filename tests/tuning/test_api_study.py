@@ -119,6 +119,7 @@ def test_baselines_are_filters_that_go_around_an_env(study):
     np.testing.assert_allclose(wrapped.filter.model.process_noise_cov.diagonal(), q)
 
 
+@pytest.mark.slow
 def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
     storage = tmp_path / "studies.journal"
     options = {"storage": storage, "progress": True}

@@ -136,6 +136,7 @@ def test_what_is_wrong_is_one_clear_line(change, line):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scenario = short("auv:motion").replace(name="mine.toml")

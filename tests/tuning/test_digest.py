@@ -170,13 +170,14 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "form",
     [
         pytest.param((), id="class"),
         pytest.param(WRAPPED, id="wrapped"),
-        pytest.param(REGISTERED, id="id", marks=pytest.mark.slow),
-        pytest.param(MADE, id="object", marks=pytest.mark.slow),
+        pytest.param(REGISTERED, id="id"),
+        pytest.param(MADE, id="object"),
     ],
 )
 def test_another_class_of_an_env_is_another_problem(form, tmp_path):

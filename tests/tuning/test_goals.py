@@ -131,6 +131,7 @@ def test_the_numbers_of_a_model_are_found_together_whatever_they_move():
     assert (abs(distances) < 3.5 * found.standard_errors).all() and (found.standard_errors < 0.2).all()
 
 
+@pytest.mark.slow
 def test_a_full_q_is_at_least_as_likely_as_a_diagonal_one_and_a_study_tries_it():
     plan = Plan("ekf", (MISMATCH,), objectives=("log-score",), full_q=True)
     data = plan.training_data()

@@ -51,6 +51,7 @@ def found(data):
     return identify(data, pendulum, FREE, starts=3)
 
 
+@pytest.mark.slow
 def test_constants_and_noise_are_found_together_within_their_standard_errors(found):
     for name, truth in TRUTH.items():
         assert abs(found.values[name] - truth) < 3 * found.standard_errors[name], name
@@ -126,6 +127,7 @@ def test_a_single_run_has_standard_errors_from_its_blocks():
         assert abs(found.values[name] - truth) < 3.5 * found.standard_errors[name], name
 
 
+@pytest.mark.slow
 def test_outliers_beyond_a_gate_are_left_out(data, found):
     rng, spoilt = np.random.default_rng(0), data.measurements.copy()
     outliers = rng.random(spoilt.shape) < 0.02

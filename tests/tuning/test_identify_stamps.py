@@ -124,6 +124,7 @@ def objective_of(data, grid):
     return Objective(family.data, family.model, Coordinates(family.free))
 
 
+@pytest.mark.slow
 def test_gradients_along_constants_and_the_numbers_of_the_grid():
     even = recorded(DT * np.arange(60), 2)
     own, on_grid = (objective_of(even, grid) for grid in (False, True))

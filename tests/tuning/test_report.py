@@ -134,6 +134,7 @@ def test_without_its_study_a_tuned_file_still_has_a_page():
         assert "Error against ensemble size" not in page.headings
 
 
+@pytest.mark.slow
 def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
     plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)

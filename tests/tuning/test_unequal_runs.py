@@ -92,6 +92,7 @@ def test_intervals_resample_whole_runs_with_their_lengths():
     assert likelihood_gain(found, worse).value == pytest.approx(found.log_likelihood - worse.log_likelihood)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("junk", [np.nan, np.inf, 1e300, -3.0])
 def test_nothing_in_the_padding_changes_any_number(junk):
     clean, dirty = (data_of(runs_of(), GAPS, given) for given in (None, junk))

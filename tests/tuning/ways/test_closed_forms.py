@@ -123,6 +123,7 @@ def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(way):
     assert np.log(task.best.model["measurement_noise_cov"]) == pytest.approx(mean, abs=error)
 
 
+@pytest.mark.slow
 def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budget():
     pytest.importorskip("nutpie")
     problem, found = linear(runs=4), {}

@@ -129,6 +129,7 @@ def test_it_listens_on_the_loopback_address_alone_and_tokens_are_long_and_new():
         each.close()
 
 
+@pytest.mark.slow
 def test_it_ends_when_the_last_page_was_left(monkeypatch):
     monkeypatch.setattr(module, "LEFT_FOR", 0.2)
     made = Server(page)
