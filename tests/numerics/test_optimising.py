@@ -75,6 +75,23 @@ def test_a_function_that_is_kept_apart_is_called(outermost):
     assert not any("13checked_total" in name for name in calls)
 
 
+@inlined
+def twice(x):
+    return 2.0 * x
+
+
+@not_inlined
+def ice(x):  # part of the name of what it calls, which is inlined all the same
+    return twice(x) + 1.0
+
+
+def test_a_function_that_is_kept_apart_contains_what_it_calls():
+    outermost = compiled(lambda x: ice(x) + ice(x + 1.0))
+    assert outermost(1.0) == 8.0
+    (text,) = outermost.inspect_llvm().values()
+    assert "3ice" in text and "5twice" not in text
+
+
 def test_a_refusal_leaves_garbage_collection_as_it_was():
     before = gc.get_threshold()
     refused = compiled(lambda x: total(x) + object())

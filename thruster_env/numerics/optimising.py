@@ -118,7 +118,7 @@ def _optimise_outermost(library: Any, compiling, which: Which) -> None:
             optimise(self)
         elif which.apart(function):
             for part in self._final_module.functions:
-                if not part.is_declaration and function.__name__ in part.name:
+                if not part.is_declaration and b"alwaysinline" not in b" ".join(part.attributes):
                     part.add_function_attribute("noinline")
 
     @wraps(optimise_functions)

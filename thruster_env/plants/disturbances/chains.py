@@ -1,11 +1,14 @@
-"""Chains of effects in compiled code: packed parameters of effects that act one after the other."""
+"""Chains of effects in compiled code: packed parameters of effects that act one after the other.
+
+Effects are called, not inlined: each loops over all copies of a block, and a plant's two kernels share them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.compiled import not_inlined
 from thruster_env.numerics.tuples import written_out
 from thruster_env.plants.disturbances.effects import (
     EFFECT_KIND,
@@ -20,9 +23,9 @@ from thruster_env.plants.disturbances.effects import (
 def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:
     """Write out `run(kind, ...)`, which calls the function of one of some effects."""
     arguments = "memory, b, target, rows, number, numbers, at, begin"
-    functions: dict[str, Any] = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
+    functions: dict[str, Any] = {f"act_{i}": not_inlined(effect.act) for i, effect in enumerate(effects)}
     lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
-    return written_out("run", f"kind, {arguments}", *lines, "None", **functions)
+    return written_out("run_effect", f"kind, {arguments}", *lines, "None", **functions)
 
 
 def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
@@ -36,8 +39,8 @@ def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
     """
     dispatch = _dispatch(effects)
 
-    @inlined
-    def run(memory, b, numbers, at, begin):
+    @not_inlined
+    def run_chain(memory, b, numbers, at, begin):
         for _ in range(int(numbers[count])):
             kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
             rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
@@ -45,4 +48,4 @@ def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
             at += int(numbers[at])
         return at
 
-    return run
+    return run_chain
