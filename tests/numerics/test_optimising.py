@@ -67,10 +67,15 @@ def test_an_error_within_what_is_called_reaches_the_caller(outermost):
         outermost(np.zeros(0))
 
 
+def calls_in(function):
+    """Names of the functions that machine code calls."""
+    (text,) = function.inspect_llvm().values()
+    return [line.split("@")[1] for line in text.splitlines() if " call " in line and "@" in line]
+
+
 def test_a_function_that_is_kept_apart_is_called(outermost):
     outermost(np.arange(5.0))
-    (text,) = outermost.inspect_llvm().values()
-    calls = [line.split("@")[1] for line in text.splitlines() if " call " in line and "@" in line]
+    calls = calls_in(outermost)
     assert any("5total" in name for name in calls)
     assert not any("13checked_total" in name for name in calls)
 
@@ -88,8 +93,8 @@ def ice(x):  # part of the name of what it calls, which is inlined all the same
 def test_a_function_that_is_kept_apart_contains_what_it_calls():
     outermost = compiled(lambda x: ice(x) + ice(x + 1.0))
     assert outermost(1.0) == 8.0
-    (text,) = outermost.inspect_llvm().values()
-    assert "3ice" in text and "5twice" not in text
+    calls = calls_in(outermost)
+    assert any("3ice" in name for name in calls) and not any("5twice" in name for name in calls)
 
 
 def test_a_refusal_leaves_garbage_collection_as_it_was():
