@@ -195,6 +195,7 @@ def test_the_factor_grows_of_the_state_whose_q_is_too_small():
     assert spread < 0.9 * wide  # the first body's forecast stays narrow
 
 
+@pytest.mark.slow
 def test_compiled_code_and_python_are_one():
     filter_ = make_filter("etkf", plane_model(), ensemble_size=9, adaptive_inflation=0.2, rotations=1)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)

@@ -92,6 +92,7 @@ def test_constants_of_a_tuple_go_by_number():
     assert belief.mean.tolist() == [3.0, 0.9]
 
 
+@pytest.mark.slow
 def test_it_recovers_an_unknown_ambient_flow_and_beats_the_filter_that_ignores_it():
     runs, actual = 40, 0.6
     inputs = held_voltages(runs, 30)

@@ -40,6 +40,12 @@ def in_session(filter_, key, inputs, measurements):
 OF_EACH_KIND = ("kf-steady", "ekf-robust", "ukf", "vb", "enkf", "ensrf", "pf", "gsf", "fuzzy", "inversion")
 
 
+SLOW = pytest.mark.slow
+compiled_names = pytest.mark.parametrize(
+    "name", [name if name in OF_EACH_KIND else pytest.param(name, marks=SLOW) for name in FILTERS]
+)
+
+
 @pytest.fixture(params=list(FILTERS))
 def name(request):
     return request.param
@@ -107,8 +113,8 @@ def assert_compiled_as_python(filter_, *data, **noise):
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        *((name, "thruster") for name in FILTERS),
-        *(pytest.param(name, "wide affine", marks=pytest.mark.slow) for name in OF_EACH_KIND),
+        *(pytest.param(name, "thruster", marks=() if name in OF_EACH_KIND else SLOW) for name in FILTERS),
+        *(pytest.param(name, "wide affine", marks=SLOW) for name in OF_EACH_KIND),
     ],
 )
 def test_compiled_and_interpreted_agree(name, kind):
@@ -139,6 +145,7 @@ def test_compiled_and_interpreted_agree_however_rules_are_blended(blending):
     assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
 
 
+@compiled_names
 def test_compiled_batch_loop_and_session_agree_over_500_steps(name):
     model = thruster_model()
     inputs, measurements = simulated(model, 500, level=8.0)
@@ -146,6 +153,7 @@ def test_compiled_batch_loop_and_session_agree_over_500_steps(name):
     assert_paths_agree(small(name, model), KEY, inputs, measurements)
 
 
+@compiled_names
 def test_a_wrapped_run_is_the_batch_run(name):
     seed, actions = 11, voltages(500)
     env = wrapped(name)
@@ -161,6 +169,7 @@ def test_a_wrapped_run_is_the_batch_run(name):
         np.testing.assert_allclose(infos_of(part, infos), estimate[0], rtol=1e-12, atol=1e-12, err_msg=part)
 
 
+@compiled_names
 def test_a_trajectory_does_not_depend_on_its_company(name):
     model = thruster_model()
     inputs, measurements = simulated(model, 30, count=19)
@@ -173,6 +182,7 @@ def test_a_trajectory_does_not_depend_on_its_company(name):
         assert equal(alone, [part[b : b + 1] for part in together])
 
 
+@pytest.mark.usefixtures("as_python")
 def test_the_same_key_gives_the_same_numbers_and_only_ensembles_use_it(name):
     model = thruster_model()
     inputs, measurements = simulated(model, 30)

@@ -140,6 +140,7 @@ def test_a_radius_beyond_everything_is_none(name):
         assert of_far.log_likelihood == pytest.approx(of_plain.log_likelihood, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOCAL)
 def test_few_members_follow_a_long_ring_only_with_a_radius(name):
     """Of 8 states and 5 members: one with a page and one by parts have the same numbers compiled."""

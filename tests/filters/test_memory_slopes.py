@@ -150,7 +150,7 @@ def assert_gradient_on(scenario, name, steps, mixed=None):
     np.testing.assert_allclose(found.gradients, expected, rtol=0, atol=1e-6 * abs(expected).max())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])
 def test_on_a_scenario_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_scenario("outliers"), name, 100)
 

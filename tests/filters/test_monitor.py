@@ -218,6 +218,7 @@ def vehicle_log(spoil):
     return estimate_with(make_filter("ekf", model), log)
 
 
+@pytest.mark.slow
 def test_the_faulty_channel_is_the_one_without_which_alarms_end():
     def spoil(z):
         z[400:, 5] += 0.02  # r [rad/s], of deviation 0.003

@@ -210,6 +210,7 @@ def test_regularised_particles_have_the_kernels_covariance_in_the_next_step():
     np.testing.assert_allclose(filter_.particle_covariances(after)[:, 1, 1], cov, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_tenth_of_the_particles_is_as_good_and_compiled_code_gives_what_python_does():
     """On the example of the source: with particles for one state instead of four."""
     data, model = mixed_linear.problem.data(range(60)), mixed_linear.model()

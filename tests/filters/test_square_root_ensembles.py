@@ -194,6 +194,7 @@ def half_gain_recursion(model, inputs, measurements):
     return np.stack(means, axis=1), np.stack(covs, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["etkf", "denkf"])
 def test_it_converges_to_its_limit_like_one_over_root_n(name):
     model = linear_model(1)

@@ -18,7 +18,9 @@ def test_every_room_has_attacks():
     assert {name.partition(".")[0] for name in attacks()} == set(ROOMS)
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "files.journals" else name for name in QUICK]
+)
 def test_an_attack_of_a_moment_is_withstood(name):
     assert attacks()[name](np.random.default_rng(1), 0.2)
 

@@ -111,6 +111,7 @@ def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs
         assert len(one) == len(run.times) and settled_rmse(one, run) < 0.5 * settled_rmse(other, run)
 
 
+@pytest.mark.slow
 def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
     assert (
         after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0])).tolist()

@@ -85,6 +85,7 @@ def test_a_lag_is_exact_where_its_input_is_a_straight_line():
         np.testing.assert_allclose(lag_weights(small, step), (0.0, 1.0 - small / step), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_lag_that_goes_to_zero_leaves_the_likelihood_of_the_model_without():
     base, plant = thruster_model(**PLANT), make_plant(**PLANT)
     inputs = np.repeat(np.random.default_rng(0).uniform(-9, 9, (4, 20, 1)), 10, axis=1)

@@ -58,6 +58,7 @@ def test_sac_learns_too(tmp_path):
     assert learn(setup_of("depth", "ekf", "sac"), tmp_path / "policy").steps == 256
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["raw", "ekf", "true"])
 def test_pd_in_number_is_pd_on_a_single_env(observe):
     setup = setup_of("depth", observe)

@@ -223,6 +223,7 @@ def test_of_many_states_sentences_tell_the_worst():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [(1, True), (8, True), (3, False)])
 def test_figures_are_drawn_for_any_plant(comparisons, case, tmp_path):
     problem, comparison = comparisons[case]

@@ -98,6 +98,7 @@ def test_manoeuvres_are_those_of_the_plant_with_and_without_a_torque():
     assert short("auv:papers").data([0]).inputs.shape[-1] == 3
 
 
+@pytest.mark.slow
 def test_a_file_says_whose_scenario_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my.toml").write_text(

@@ -19,6 +19,7 @@ from tuning.ways.registry import WAYS
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
 
+@pytest.mark.slow
 def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
     study = tuning.tune(SHORT, "ekf", way="likelihood", trials=10, progress=False)
     data = SHORT.data(SHORT.training_seeds(0, TRAINING_SEEDS))

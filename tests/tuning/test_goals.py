@@ -187,6 +187,7 @@ def of_two_sensors(**assumed):
     return ModelProblem(truth, truth.replace(measurement_noise_cov=[1.0, 4.0]), steps=200, **assumed)
 
 
+@pytest.mark.slow
 def test_correlated_sensors_are_found():
     plan = Plan("ekf", (of_two_sensors(),), full_q=True, full_r=True).checked()
     found = tune_by_gradient("ekf", plan.scenarios, plan.training_data(), [1.0], options=plan.options)

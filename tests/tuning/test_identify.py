@@ -63,6 +63,7 @@ def test_constants_and_noise_are_found_together_within_their_standard_errors(fou
     assert "determine every free parameter" in found.sentences()[0]
 
 
+@pytest.mark.slow
 def test_an_end_at_zero_is_not_to_be_widened(found):
     first, second = found.objective.coordinates.free[:2]
     coordinates = SimpleNamespace(free=(replace(first, low=0.0, log=False, default=None), second))

@@ -139,6 +139,7 @@ def test_gradients_along_constants_and_the_numbers_of_the_grid():
     np.testing.assert_allclose(jittered(at).gradient, slopes, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_jittering_clock_does_not_move_what_is_identified():
     """On a grid 0.4 of a step's motion passes for noise of the sensors."""
     logs, options = [recorded(stamps_of(250, seed), seed) for seed in (3, 4)], {"model": plant(), "dt": DT}

@@ -73,6 +73,7 @@ def test_logs_that_begin_at_speed_give_the_noise_and_constants_of_the_truth():
     assert checked["identified"].fit["speed"] > 95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensors", "noise"),
     [(("speed",), {"Q11": 1.0, "Q22": 4e-4, "R": 4.0}), (("thrust",), {"Q11": 1.0, "Q22": 4e-4, "R": 0.25})],

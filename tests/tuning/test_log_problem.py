@@ -122,6 +122,7 @@ def test_a_problem_of_logs_is_one_whose_digest_is_of_its_content():
     assert len({one.digest, *(other.digest for other in others)}) == 3
 
 
+@pytest.mark.slow
 def test_the_lead_in_counts_in_no_likelihood():
     problem = LogProblem(logs_of(600), MODEL, blocks=6)
     data = problem.data(problem.parts.training)

@@ -125,6 +125,7 @@ def test_where_the_model_is_wrong_the_log_score_earns_a_covariance_and_costs_err
     assert nees_ratio(found.log_score) < 3.0 < 8.0 < nees_ratio(found.score)
 
 
+@pytest.mark.slow
 def test_a_study_of_the_log_score_needs_no_band_and_is_validated():
     plan = Plan("kf", (PROBLEM,), objectives=("log-score",)).checked()
     assert not plan.is_constrained and Plan("kf", (PROBLEM,)).is_constrained

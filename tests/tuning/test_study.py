@@ -134,6 +134,7 @@ def test_a_torn_first_line_is_cut_off_and_another_file_is_left_alone(tmp_path, b
     assert path.read_text() == "hello"
 
 
+@pytest.mark.slow
 def test_a_killed_process_loses_its_running_trial_only(tmp_path):
     path = tmp_path / "j"
     program = (
