@@ -13,6 +13,8 @@ from thruster_env.numerics.streams import episode_keys
 from thruster_env.plants import simulate
 
 KEY = (123456789, 4294967295)  # of a filter's random numbers
+# One of each kind of page and kernel: what one of the others has in common with it is compiled alike.
+OF_EACH_KIND = ("kf-steady", "ekf-robust", "ukf", "vb", "enkf", "ensrf", "pf", "gsf", "fuzzy", "inversion")
 DT = 0.05  # of the pendulum
 
 

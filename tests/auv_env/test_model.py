@@ -158,10 +158,9 @@ def test_what_makes_no_model_is_told_in_a_line(arguments, message):
     assert str(error.value).startswith(message) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize(
-    "states", [pytest.param(one, marks=pytest.mark.slow) if one == "navigation" else one for one in MODELS]
-)
+@pytest.mark.parametrize("states", MODELS)
 def test_every_filter_runs(states):
     """Interpreted, one step each, on other states one of each kind; fuzzy rules for speed and rates of turn."""
     model = auv_model(states=states, sensors=SENSORS[states])

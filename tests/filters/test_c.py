@@ -20,6 +20,7 @@ from filters.logs.estimate import estimate_with
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
+from tests.slow import slow_but
 from thruster_cli.templates.filter import Template
 from thruster_env.numerics.algebra.c_source import literal, statements_of
 from thruster_env.numerics.algebra.graphs import Graph, arctan2, where
@@ -167,6 +168,11 @@ CLANG = pytest.param(
 )
 
 
+def of_gcc(which):
+    """One model is quick; the other ones have sizes and angles of their own."""
+    return pytest.param(which, "gcc", marks=() if which == "pendulum" else pytest.mark.slow)
+
+
 def made(name, model):
     if name in ENSEMBLES:
         return make_filter(name.split()[0], model, ensemble_size=13, **ENSEMBLES[name])
@@ -175,7 +181,7 @@ def made(name, model):
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
-@pytest.mark.parametrize(("which", "compiler"), [*((which, "gcc") for which in MODELS), CLANG])
+@pytest.mark.parametrize(("which", "compiler"), [*map(of_gcc, MODELS), CLANG])
 def test_steps_are_those_of_run(which, compiler, name, tmp_path):
     model = MODELS[which]()
     inputs, z = simulated(model, 200 if which == "thruster" else 60, level=1.0, missing=0.2)
@@ -244,7 +250,7 @@ def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
+@pytest.mark.parametrize("name", slow_but([*OWN, *ENSEMBLES], ("ekf", "kf square-root", "etkf")))
 def test_single_precision(name, tmp_path):
     for which in ("thruster", "pendulum") if name in ("ekf", "ukf", "etkf") else ("pendulum",):
         model = MODELS[which]()

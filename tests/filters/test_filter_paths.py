@@ -6,8 +6,9 @@ import pytest
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.engine.session import Session
 from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrapped
-from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
+from tests.models import KEY, MODELS, OF_EACH_KIND, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
+from tests.slow import SLOW, slow_but
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import make_plant
@@ -36,14 +37,7 @@ def in_session(filter_, key, inputs, measurements):
     return [np.array(part) for part in zip(*rows, strict=True)]
 
 
-# One of each kind of page and kernel: what one of the others has in common with it is compiled alike.
-OF_EACH_KIND = ("kf-steady", "ekf-robust", "ukf", "vb", "enkf", "ensrf", "pf", "gsf", "fuzzy", "inversion")
-
-
-SLOW = pytest.mark.slow
-compiled_names = pytest.mark.parametrize(
-    "name", [name if name in OF_EACH_KIND else pytest.param(name, marks=SLOW) for name in FILTERS]
-)
+compiled_names = pytest.mark.parametrize("name", slow_but(FILTERS, OF_EACH_KIND))
 
 
 @pytest.fixture(params=list(FILTERS))

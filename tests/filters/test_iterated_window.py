@@ -215,6 +215,7 @@ def test_all_paths_agree_and_members_of_now_are_recorded():
     assert recorded.members.shape == (1, 13, 2, SIZE) and recorded.weights is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
 def test_large_models_are_called():
     model = random_affine(38, 8, 1)

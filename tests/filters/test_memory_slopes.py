@@ -17,6 +17,7 @@ from tests.filters.test_pages_called import turn_if
 from tests.filters.test_sensitivity import slopes_of
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import simulated
+from tests.slow import slow_but
 from thruster_cli.templates.filter import Template
 from thruster_env.numerics.algebra.graphs import Graph
 from thruster_env.numerics.algebra.programs import Place, values_of
@@ -150,7 +151,7 @@ def assert_gradient_on(scenario, name, steps, mixed=None):
     np.testing.assert_allclose(found.gradients, expected, rtol=0, atol=1e-6 * abs(expected).max())
 
 
-@pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])
+@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
 def test_on_a_scenario_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_scenario("outliers"), name, 100)
 
@@ -168,7 +169,7 @@ def test_on_a_vehicle_the_compiled_gradient_is_that_of_differences(name):
     assert_gradient_on(find_vehicle("auv:motion"), name, 100)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
 def test_gradients_tune_such_a_filter(name):
     scenario = find_scenario("outliers")
     data = scenario.data(training_seeds(0, 2))

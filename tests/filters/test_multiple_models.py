@@ -87,6 +87,7 @@ def naive(filter_, inputs, measurements):
     return [np.array(one) for one in zip(*found, strict=True)]
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize(("name", "kinds"), [("ekf", "functions"), ("ekf-robust", "numbers"), ("ukf", "numbers")])
 def test_equals_the_recursion_of_the_textbook(name, kinds):
     whole = thruster_model()

@@ -10,6 +10,7 @@ from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, 
 from filters.engine.session import Session
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import convergence, normals, relative_errors
+from tests.slow import slow_but
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import (
     FILTER_KERNEL,
@@ -23,6 +24,7 @@ from thruster_env.numerics.streams import (
 from thruster_env.plants import simulate
 
 both_kinds = pytest.mark.parametrize("kind", [ParticleFilter, AuxiliaryParticleFilter])
+quick_kind = pytest.mark.parametrize("kind", slow_but([ParticleFilter, AuxiliaryParticleFilter], [ParticleFilter]))
 
 
 def root(cov):
@@ -155,7 +157,7 @@ def test_it_converges_to_the_kalman_filter_like_one_over_root_n(kind):
     assert abs(likelihoods.mean() + likelihoods.var() / 2) < 4 * likelihoods.std(ddof=1) / math.sqrt(60)
 
 
-@both_kinds
+@quick_kind
 def test_the_likelihood_is_right_on_average_however_few_particles(kind):
     model, runs = line_model(), 4000
     inputs = np.random.default_rng(3).normal(size=(1, 6, 1))
@@ -221,7 +223,7 @@ def test_a_second_measurement_of_the_same_step_is_taken_as_well(kind):
     assert (np.abs(means[0] - means[1]) < 0.1 * np.sqrt(np.diag(belief.cov))).all()
 
 
-@both_kinds
+@quick_kind
 def test_batch_and_session_agree_bit_for_bit_over_500_steps(kind):
     model = thruster_model()
     filter_ = kind(model=model, ensemble_size=1000)

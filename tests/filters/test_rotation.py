@@ -53,6 +53,7 @@ def test_the_rotations_are_uniform():
     np.testing.assert_allclose(variances, (1 - 1 / N) ** 2 / (N - 1), rtol=0.1)
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["etkf", "ensrf", "denkf"])
 def test_a_filter_with_rotations_has_the_moments_of_one_without_after_an_update(name):
     plain, turned = (make_filter(name, thruster_model(), ensemble_size=6, rotations=r) for r in (0, 1))

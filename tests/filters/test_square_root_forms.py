@@ -10,6 +10,7 @@ from filters import ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, a
 from tests.filters.test_c import built, estimated
 from tests.filters.test_differentiated import swing_if
 from tests.models import KEY, pendulum, simulated, wide_model
+from tests.slow import slow_but
 
 FORMS = [
     partial(KalmanFilter, form="square-root"),
@@ -45,7 +46,7 @@ def test_the_estimates_are_those_of_the_covariance_form(kind, make):
     np.testing.assert_allclose(*smoothed, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", FORMS[1:-1])
+@pytest.mark.parametrize("kind", slow_but(FORMS[1:-1], FORMS[1:2]))
 def test_compiled_batch_session_and_python_agree(kind, request):
     model = wide_model() if kind.func is KalmanFilter else pendulum()
     filter_ = kind(model=model)

@@ -38,6 +38,7 @@ def naive(model, inputs, z, correct, fading=1.0):
     return [np.array(one) for one in zip(*found, strict=True)]
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NO_MORE)
 def test_equals_the_textbook(name):
     model = random_affine()

@@ -153,6 +153,7 @@ def test_the_page_shows_what_its_script_draws_and_has_the_tables_it_makes(page):
     assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in script.FIGURES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", FILTER_EXAMPLES, ids=range(len(FILTER_EXAMPLES)))
 def test_an_example_of_a_filter_runs(code, capsys, tmp_path, monkeypatch):
     """As a module of its own: what compiles is kept under the name of its module."""

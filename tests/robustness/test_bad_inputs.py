@@ -5,6 +5,8 @@ import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.registry import tunable_numbers
+from tests.models import OF_EACH_KIND
+from tests.slow import slow_but
 
 RUNS, STEPS = 1000, 100
 EXTREME = [0.0, 5e-324, 1e-300, 1e8, -1e8, 1e30, -1e30, 1e154, -1e154, 1e300, -1e300, 1e308]
@@ -27,7 +29,7 @@ def data():
     return keys, inputs, measurements
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", slow_but(FILTERS, OF_EACH_KIND))
 def test_every_estimate_is_finite_and_every_restart_counted(name, data):
     numbers = {"ensemble_size": 12} if "ensemble_size" in tunable_numbers(name) else {}
     estimates = run(make_filter(name, thruster_model(), **numbers), *data)

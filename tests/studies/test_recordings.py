@@ -125,6 +125,7 @@ def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(r
     assert more.nis < one.nis
 
 
+@pytest.mark.slow
 def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     class Learnt:
         interrupted, log_likelihood, agreement, optima = False, -1.0, 1, (1,)

@@ -13,6 +13,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
+from tests.slow import slow_but
 from thruster_cli.main import main
 from thruster_cli.output import console
 from thruster_env.parameters import PRESETS, TUNNEL, derive_constants
@@ -161,7 +162,7 @@ def test_inspect_draws(thruster, as_json, tmp_path):
     assert as_json("inspect", "--voltage", 0)["picture"] is None  # at rest thrust does not move with the voltage
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", slow_but(PRESETS, ["tunnel", "t200"]))
 @pytest.mark.parametrize(("width", "voltages"), [(80, (-12, 0)), (115, (13,))])
 def test_inspect_fits_the_terminal(thruster, preset, width, voltages, monkeypatch):
     monkeypatch.setattr(console, "width", width)

@@ -95,6 +95,7 @@ def test_equations_break_where_they_part_and_sentences_fill_the_width():
     assert fitted(text, 23) == "\n".join(lines)
 
 
+@pytest.mark.slow
 def test_it_tells_which_filters_fit_a_problem_and_what_a_belief_takes(thruster):
     code, out, _ = thruster("filters", "--problem", "thruster_env.studies.lorenz96:problem", "--json", "-")
     found = {one["name"]: one for one in json.loads(out)["filters"]}

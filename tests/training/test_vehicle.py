@@ -54,6 +54,7 @@ def test_a_policy_learns_and_is_scored(task, observe, tmp_path):
     assert configuration_from_json(setup.as_json(), "setup.json").as_json() == setup.as_json()
 
 
+@pytest.mark.slow
 def test_sac_learns_too(tmp_path):
     assert learn(setup_of("depth", "ekf", "sac"), tmp_path / "policy").steps == 256
 

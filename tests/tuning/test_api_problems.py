@@ -9,6 +9,7 @@ import thruster_env  # noqa: F401 - registers the env
 import tuning
 from filters import EstimateState
 from tests.pendulum_problem import problem as pendulum
+from tests.slow import slow_but
 from tests.small_problems import pair
 from thruster_env.plants.affine import affine_model
 from thruster_env.plants.logs.log import Log
@@ -150,7 +151,7 @@ def test_a_table_is_read_as_a_file_is(logs, tmp_path):
     assert found.name == "mine" and found.digest == read_log(tmp_path / "run.csv", cart()).digest
 
 
-@pytest.mark.parametrize("name", ["nominal", "published_tunnel", "auv:motion"])
+@pytest.mark.parametrize("name", slow_but(["nominal", "published_tunnel", "auv:motion"], ["nominal"]))
 def test_an_env_of_a_scenario_makes_its_data(name):
     problem = find_problem(name)
     env, data = problem.make_env(), problem.data([3])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.linear_problem import LinearProblem
+from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.search.enqueued import MAXIMUM_LIKELIHOOD_AFTER
@@ -22,7 +23,7 @@ def value_of(objective, choice, problem, data):
     return OBJECTIVES[objective].value(found, np.nan)
 
 
-@pytest.mark.parametrize("objective", ["score", "mse", "log-score"])
+@pytest.mark.parametrize("objective", slow_but(["score", "mse", "log-score"], ["mse"]))
 def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective):
     data = MISMATCH.data(range(40))
     found = tune_by_gradient("ekf", MISMATCH, data, objective=objective)

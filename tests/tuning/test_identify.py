@@ -87,6 +87,7 @@ def test_standard_errors_are_the_scatter_of_estimates(found, data):
         assert 0.45 < scatter / found.standard_errors[name] < 2.0, name  # chi with 7 degrees of freedom
 
 
+@pytest.mark.slow
 def test_the_same_numbers_come_out_of_one_seed(data, found):
     again = identify(data, pendulum, FREE, starts=3)
     assert again.values == found.values and again.standard_errors == found.standard_errors

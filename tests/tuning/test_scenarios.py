@@ -97,6 +97,7 @@ def test_voltages_hold_their_level_and_fill_the_range():
     assert abs((levels[:, :, 0] ** 2).mean() - 48.0) < 5 * 48.0 * np.sqrt(0.8 / 800)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["nominal", "published_noise", "speed_magnitude", "reversal", "bias", "mixed"])
 def test_the_stored_scale_is_the_bound(name):
     scenario = find_scenario(name)

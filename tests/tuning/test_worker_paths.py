@@ -51,6 +51,7 @@ def test_workers_run_no_file_beside_the_data(folder):
     assert (folder / "t.json").exists()
 
 
+@pytest.mark.slow
 def test_the_command_as_a_module_runs_no_file_beside_the_data_either(folder):
     (folder / "thruster_cli.py").unlink()  # which is what Python itself would run
     done = started(folder, sys.executable, "-m", "thruster_cli", "evaluate", "--filter", "ekf", "--seeds", "2",

@@ -161,7 +161,7 @@ def html_page(
         for section in sections
     )
     script = f"\n<script>{SCRIPT}</script>" if "data-read=" in body or 'class="code"' in body else ""
-    kind = ' class="beside"' if two_columns else ""
+    kind = ' class="two-columns"' if two_columns else ""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -60,7 +60,7 @@ summary {{ cursor: pointer; font-weight: 600; }}
 .pair > * {{ min-width: 0; }}
 .pair.deep {{ display: block; }}
 .whose {{ font-weight: 600; color: var(--mark); margin: .75rem 0 0; }}
-body.beside {{ max-width: 84rem; }}
+body.two-columns {{ max-width: 84rem; }}
 @media screen and (max-width: 40rem) {{
   body {{ padding: 1rem .75rem 3rem; }}
   h1 {{ font-size: 1.35rem; }}
@@ -80,7 +80,7 @@ body.beside {{ max-width: 84rem; }}
 }}
 @media print {{
   @page {{ size: A4; margin: 14mm 12mm; }}
-  body, body.beside {{ max-width: none; padding: 0; font-size: 9.5pt; }}
+  body, body.two-columns {{ max-width: none; padding: 0; font-size: 9.5pt; }}
   nav, .code button, .read .value {{ display: none !important; }}
   h2 {{ margin-top: 1.2rem; break-after: avoid; }}
   h3, .caption {{ break-after: avoid; }}
