@@ -50,7 +50,7 @@ bench: $(BENCH) ## install what benchmarks need (once) and time it against other
 	@$(BIN)/python -m benchmarks $(ARGS)
 
 docs: $(DOCS) ## install what the site needs (once) and build it into build/docs; ARGS=linkcheck tries external links
-	@$(BIN)/python -m sphinx -b $(or $(ARGS),html) -W --keep-going -q docs build/docs
+	@$(BIN)/python -m sphinx -b $(or $(ARGS),html) -W --keep-going -q $(SPHINXOPTS) docs build/docs
 	@echo "build/docs/index.html"
 
 fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
