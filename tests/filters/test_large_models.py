@@ -21,6 +21,7 @@ from tests.models import (
     wide_model,
 )
 from tests.numerics.test_angles import turned, turning, turntable
+from tests.slow import slow_but
 from thruster_env.numerics import matrices, sources
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import episode_keys
@@ -111,9 +112,7 @@ def everything(model_name):
 QUICK = ("angles",)  # a filter's arrays, and the angles among them
 
 
-@pytest.mark.parametrize(
-    "model", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in MODELS]
-)
+@pytest.mark.parametrize("model", slow_but(MODELS, QUICK))
 def test_loops_over_arrays_are_what_is_written_out_for_tuples(model):
     with interpreted():
         tuples = everything(model)

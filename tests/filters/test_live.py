@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from filters import make_filter, thruster_model
+from tests.slow import slow_but
 from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.diffusion import noise_for_dt
 
@@ -108,7 +109,9 @@ def test_van_loan_is_the_integral(dt):
         np.testing.assert_allclose(oscillator().noise(dt), noise_for_dt(S, 1.0, dt), rtol=2e-2, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "ekf-robust", pytest.param("pf", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", slow_but(["ekf", "ukf", "enkf", "ekf-robust", "pf"], ["ekf", "ukf", "enkf", "ekf-robust"])
+)
 def test_late_samples_give_what_the_right_order_gives(name):
     plant = oscillator()
     filter_ = make_filter(name, plant.at(0.05))

@@ -9,6 +9,7 @@ import pytest
 from tests.fuzz import commands, files
 from tests.fuzz.__main__ import ROOMS, attacks
 from tests.models import TUNED
+from tests.slow import slow_but
 
 SLOW = ("processes.", "checkpoints.")  # which start processes; tests of their own show what they attack
 QUICK = [name for name in attacks() if not name.startswith(SLOW)]
@@ -18,9 +19,7 @@ def test_every_room_has_attacks():
     assert {name.partition(".")[0] for name in attacks()} == set(ROOMS)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "files.journals" else name for name in QUICK]
-)
+@pytest.mark.parametrize("name", slow_but(QUICK, set(QUICK) - {"files.journals"}))  # which waits for locks
 def test_an_attack_of_a_moment_is_withstood(name):
     assert attacks()[name](np.random.default_rng(1), 0.2)
 

@@ -186,9 +186,10 @@ def run_random_episodes(seed, count, steps=20):
     return refused, done, terminated
 
 
+@pytest.mark.slow
 def test_random_configurations_are_refused_or_finite():
-    refused, done, terminated = run_random_episodes(seed=1, count=100)
-    assert refused > 1 and done >= 100 and terminated > 3
+    refused, done, terminated = run_random_episodes(seed=1, count=300)
+    assert refused > 3 and done >= 300 and terminated > 10
 
 
 numbers = st.one_of(st.floats(), st.floats(-1e3, 1e3), st.sampled_from([0.0, 1e-300, 1e300, -1.0]))
