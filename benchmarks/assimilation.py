@@ -24,8 +24,8 @@ from filters.filter import Filter
 from thruster_env.numerics.threads import cores
 from thruster_env.studies.lorenz96 import STEPS, problem
 from tuning.problems import in_parts
+from tuning.search import filter_parameters
 from tuning.search import plan as plans
-from tuning.search import space
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
 
@@ -73,7 +73,7 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int], 
     """Seconds of a study of so many trials on so many seeds, without pruning; the N of its runs; one filter."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
-    limits = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
+    limits = mock.patch.object(filter_parameters, "KALMAN_SIZES", filter_parameters.Sizes(30, 5, LARGEST))
     sizes: list[int] = []
     filters: list[Filter] = []
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from filters import affine_model, make_filter
 from filters.filter import Filter
-from filters.registry import FILTERS, tunable_numbers
+from filters.registry import FILTERS, filter_type
 from thruster_env.plants.state_space import StateSpaceModel
 
 SIZES = ((2, 1), (12, 4), (40, 40))
@@ -62,7 +62,7 @@ def use_once(filter_: Filter) -> None:
 
 def filter_of(name: str, n: int, m: int) -> Filter:
     """A filter on a model of n states and m measurements."""
-    numbers = {"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}
+    numbers = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
     return make_filter(name, model_of(name, n, m), **numbers)
 
 

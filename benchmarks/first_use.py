@@ -14,7 +14,7 @@ from auv_env.model import MODELS, auv_model
 from benchmarks.compilation import measured, timed_use
 from filters import make_filter
 from filters.filter import Filter
-from filters.registry import FILTERS, tunable_numbers
+from filters.registry import FILTERS, filter_type
 
 FEW_RULES = {"fuzzy": {"premises": [0, 5]}}  # u and r; twelve states would make 4096
 WITH_POSITION = ("navigation", "current")  # of which there is no steady state unless a position is measured
@@ -22,7 +22,7 @@ WITH_POSITION = ("navigation", "current")  # of which there is no steady state u
 
 def filter_of(name: str, states: str) -> Filter:
     """A filter on a model of the vehicle."""
-    own = {"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}
+    own = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
     if MODELS[states].count > 8:
         own |= FEW_RULES.get(name, {})
     sensors = "usbl" if name == "kf-steady" and states in WITH_POSITION else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, NamedTuple
 
 from filters.adaptive.robust import RobustExtendedKalmanFilter
 from filters.adaptive.sage_husa import SageHusaFilter
@@ -15,7 +16,7 @@ from filters.ensembles.rank_histogram import RankHistogramFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
-from filters.estimators.find import foreign_filter, is_foreign, own_filter, parameters_of
+from filters.estimators.find import as_filter, estimator_named, is_filter_class, is_foreign, label_of
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
@@ -77,41 +78,93 @@ FILTERS: dict[str, type[Filter]] = {
 }
 
 
-def filter_class(name: str) -> type[Filter]:
-    """The class of a filter by name, or by "module:class"; `ForeignFilter` for estimators.
+class FilterType(NamedTuple):
+    """A filter's name resolved: what makes the filter, and the parameters that it has beside its model."""
+
+    name: Any  # as `filter_type` got it
+    filter_class: type[Filter]  # the filter's class; `ForeignFilter` of an estimator
+    found: Any = None  # the user's object that the name stands for; None for a filter of `FILTERS`
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether it is a user's estimator or filter."""
+        return self.found is not None
+
+    @property
+    def is_estimator(self) -> bool:
+        """Whether it is a user's estimator, not a class of filters."""
+        return self.filter_class is ForeignFilter
+
+    @property
+    def label(self) -> str:
+        """Its name in tables."""
+        return label_of(self.name)
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether it has a covariance, and so Q and R."""
+        return self.filter_class.has_covariance
+
+    @property
+    def has_ensemble(self) -> bool:
+        """Whether it has an ensemble whose size can be chosen."""
+        return "ensemble_size" in self.numbers
+
+    @property
+    def declared(self) -> tuple:
+        """The tunable parameters that an estimator declares, `Parameter`s; none by default."""
+        found = getattr(self.found, "parameters", ()) if self.is_estimator else ()
+        return tuple(found) if isinstance(found, list | tuple) else ()  # of a network in torch it is a method
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of its parameters beside its model, or of those that an estimator declares as tunable."""
+        if self.is_estimator:
+            return tuple(one.name for one in self.declared)
+        return tuple(field.name for field in dataclasses.fields(self.filter_class) if field.name != "model")
+
+    def make(self, model: StateSpaceModel, **numbers) -> Filter:
+        """The filter for a model; see `make_filter`."""
+        if self.is_foreign:
+            return as_filter(self.found, self.label, model, numbers)
+        for number in numbers:
+            one_of(f"a number of filter {self.name!r}", number, self.numbers)
+        if isinstance(model, AnyStepModel) and not self.filter_class.any_step:
+            raise ValueError(
+                f"a filter on a log's own stamps must know steps of any length, but {self.name!r} does not"
+            )
+        return self.filter_class(model=model, **numbers)
+
+
+def filter_type(name) -> FilterType:
+    """What a filter's name means.
+
+    Args:
+        name: of a filter in `FILTERS`; "module:object" or a trained estimator's file; or an estimator, or what
+            makes one from a model, itself.
 
     Raises:
         ValueError: for an unknown name.
     """
-    if is_foreign(name):
-        return own_filter(name) or ForeignFilter
-    return FILTERS[one_of("filter", name, tuple(FILTERS), LISTED)]
+    if not is_foreign(name):
+        return FilterType(name, FILTERS[one_of("filter", name, tuple(FILTERS), LISTED)])
+    found = estimator_named(name)
+    return FilterType(name, found if is_filter_class(found) else ForeignFilter, found)
 
 
-def tunable_numbers(name: str) -> tuple[str, ...]:
-    """Names of a filter's parameters beside its model, or of those that an estimator declares as tunable."""
-    if is_foreign(name) and own_filter(name) is None:
-        return tuple(one.name for one in parameters_of(name))
-    return tuple(field.name for field in dataclasses.fields(filter_class(name)) if field.name != "model")
-
-
-def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
+def make_filter(name, model: StateSpaceModel, **numbers) -> Filter:
     """Make a filter by name, for a model, with its own parameters.
 
     Args:
-        name: of a filter in `FILTERS`, such as "ekf"; or an estimator or a filter of your own, as
-            `filters.estimators.find.foreign_filter` takes it, such as "module:class".
-        model: the model that the filter assumes, with Q, R and the prior.
+        name: of a filter in `FILTERS`, such as "ekf"; or a user's estimator or filter: an object, a function, or
+            class, of a model (and of `numbers`) that makes one, "module:object" for any of these, or the file of a
+            trained estimator.
+        model: the model that the filter assumes, with Q, R and the prior; an estimator takes the names and angles
+            of states, inputs and measurements from it.
         **numbers: parameters of the filter beside its model, such as `ensemble_size`; defaults where not given.
 
     Raises:
-        ValueError: for an unknown name or parameter, or a value that the filter does not accept.
+        ValueError: for an unknown name or parameter, a value that the filter does not accept, or an object that is
+            no estimator.
     """
-    if is_foreign(name):
-        return foreign_filter(name, model, **numbers)
-    known = tunable_numbers(name)
-    for number in numbers:
-        one_of(f"a number of filter {name!r}", number, known)
-    if isinstance(model, AnyStepModel) and not filter_class(name).any_step:
-        raise ValueError(f"a filter on a log's own stamps must know steps of any length, but {name!r} does not")
-    return filter_class(name)(model=model, **numbers)
+    return filter_type(name).make(model, **numbers)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from filters.registry import FILTERS, LISTED, tunable_numbers
+from filters.registry import FILTERS, LISTED, filter_type
 from filters.tuned_model import check_model_data
 from thruster_env.numerics.checks import finite, one_of, positive, short_repr
 
@@ -112,7 +112,7 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
             f"a tuned file must have a filter with name, numbers and model, but got {short_repr(entry)}"
         )
     name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS), LISTED)
-    numbers = tunable_numbers(name)
+    numbers = filter_type(name).numbers
     for key, value in _mapping("numbers", entry["numbers"]).items():
         one_of(f"a number of filter {name!r}", key, numbers)
         _check_finite(key, value)

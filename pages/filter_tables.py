@@ -11,7 +11,7 @@ import numpy as np
 
 from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_filter, thruster_model
 from filters.filter import Filter
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from pages.filter_noise import LOUD, outliers
 from pages.filter_runs import PUBLISHED_NOISE, Runs, errors_of, held_runs
 from pages.filter_sampled import SIGNLESS, signless_runs
@@ -115,7 +115,7 @@ def calls(name: str) -> str:
     functions = {"f": ("transition", "transition_jacobian"), "h": ("observe", "observe_jacobian")}
     fields = [(letter, field) for letter, both in functions.items() for field in both]
     counting = {field: counted(letter, getattr(model, field)) for letter, field in fields}
-    sized = "ensemble_size" in tunable_numbers(name)
+    sized = filter_type(name).has_ensemble
     filter_ = make_filter(
         name, model.replace(**counting, substeps=1), **({"ensemble_size": members} if sized else {})
     )

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.estimators.find import foreign_filter
 from filters.filter import Filter
+from filters.registry import make_filter
 from pages.page import digits, table
 from pages.ranking_tables import SEEDS, leaderboard, main, marked, ratio_cell, table_of
 from pages.tuning_mismatch import UNKNOWNS, tuned_augmented
@@ -105,7 +105,7 @@ def network_papers() -> str:
         data = data_of(problem, problem.held_out_seeds(0, SEEDS))
         oracle_of = contender("ekf").filter(problem)
         filters = {"ekf, oracle": oracle_of} | {
-            kind: foreign_filter(_trained(kind, problem, PAPERS | own.get(kind, {})), problem.model())
+            kind: make_filter(_trained(kind, problem, PAPERS | own.get(kind, {})), problem.model())
             for kind in TRAININGS
         }
         found = [evaluate(one, data, problem.scale) for one in filters.values()]

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from filters.registry import FILTERS
+from filters.registry import FILTERS, filter_type
 from pages.page import DOCS, digits, table, with_tables
 from thruster_env.numerics.files import write_whole
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
@@ -25,7 +25,7 @@ from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.error_tables import unless_blank
-from tuning.search.space import KALMAN_SIZES, ensemble_sizes_of, has_ensemble
+from tuning.search.filter_parameters import KALMAN_SIZES, ensemble_sizes_of
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenarios import SCENARIOS
 
@@ -125,7 +125,7 @@ def by_default(name: str) -> Contender:
     """A filter with its default parameters, but an ensemble of 100, and Schmidt's with the flow considered."""
     if name == "schmidt":
         return contender(name, unknown=FLOW, considered=(-1,))._replace(label="schmidt, U_0 considered")
-    sized = has_ensemble(name) and ensemble_sizes_of(name) == KALMAN_SIZES
+    sized = filter_type(name).has_ensemble and ensemble_sizes_of(filter_type(name)) == KALMAN_SIZES
     return contender(name, ensemble_size=100 if sized else None)
 
 

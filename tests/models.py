@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from filters.tuned_file import sealed
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import episode_keys
@@ -172,7 +172,7 @@ def held_voltages(count, levels, hold=25, seed=20, limit=12.0):
 
 def small(name, model, size=10):
     """A filter by name; ensembles small, and of a size that fills no vector register."""
-    numbers = {"ensemble_size": size} if "ensemble_size" in tunable_numbers(name) else {}
+    numbers = {"ensemble_size": size} if filter_type(name).has_ensemble else {}
     return make_filter(name, model, **numbers)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from filters.estimators.find import is_trained
-from filters.registry import FILTERS
+from filters.registry import FILTERS, filter_type
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
@@ -23,7 +23,6 @@ from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.search.space import has_ensemble
 from tuning.thruster.logs import of_preset
 
 
@@ -117,7 +116,7 @@ def _default(files: list[Path]) -> Problem:
 def _size(text: str) -> tuple[str | None, int]:
     name, equals, number = text.rpartition("=")
     if equals:
-        if not has_ensemble(name):
+        if not filter_type(name).has_ensemble:
             raise ValueError(f"--ensemble-size must be for a filter with an ensemble, but got {text!r}")
         return name, at_least("--ensemble-size", number, 2)
     return None, at_least("--ensemble-size", number, 2)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.options import (
     FILTER,
@@ -121,7 +121,7 @@ def command(
 
 def _given(name: str, problem: Problem) -> Choice:
     """The filter with the given Q and R of the problem's model; ValueError if there are none."""
-    if not filter_class(name).has_covariance:
+    if not filter_type(name).has_covariance:
         raise ValueError(f"--given must be used with a filter that has a Q and R, but got {name}")
     found = given(name, problem)
     if found is None:

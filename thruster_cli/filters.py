@@ -15,13 +15,13 @@ from rich.text import Text
 
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.filter import Filter
-from filters.registry import FILTERS, filter_class, tunable_numbers
+from filters.registry import FILTERS, filter_type
 from thruster_cli.fitting import fit_table, fits_of
 from thruster_cli.options import INPUT, JsonOption, spelt
 from thruster_cli.output import console, emit, table
 from thruster_cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
-from tuning.search.space import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES, has_ensemble
+from tuning.search.filter_parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES
 
 MADE = EnsembleKalmanFilter.ensemble_size  # by default
 ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
@@ -66,7 +66,7 @@ def command(
     Example: thruster filters --problem my_module:problem
     """
     if name is not None:
-        filter_class(name)
+        filter_type(name)
     if problem is not None:
         found = find_problem(problem)
         fits = fits_of(found, tuple(FILTERS) if name is None else (name,))
@@ -79,11 +79,12 @@ def command(
 
 def entry(name: str) -> Entry:
     """The description in a filter's class."""
-    kind = filter_class(name)
-    text, meaning = cleandoc(kind.__doc__ or ""), _meanings(kind)
-    defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-    numbers = tuple(Number(number, defaults[number], meaning[number]) for number in tunable_numbers(name))
-    return Entry(name, first_sentence(text), kind.has_covariance, has_ensemble(name), numbers, text)
+    kind = filter_type(name)
+    own = kind.filter_class
+    text, meaning = cleandoc(own.__doc__ or ""), _meanings(own)
+    defaults = {field.name: field.default for field in dataclasses.fields(own)}
+    numbers = tuple(Number(number, defaults[number], meaning[number]) for number in kind.numbers)
+    return Entry(name, first_sentence(text), kind.has_covariance, kind.has_ensemble, numbers, text)
 
 
 def overview(entries: list[Entry]) -> list[RenderableType]:
@@ -110,7 +111,7 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
 
 def in_full(one: Entry, width: int) -> list[RenderableType]:
     """One filter: its documentation, fitted to a width, and a table of its parameters."""
-    kind = filter_class(one.name)
+    kind = filter_type(one.name).filter_class
     has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
     shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
     shown.append(fitted(one.documentation, width))

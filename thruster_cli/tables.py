@@ -11,7 +11,7 @@ from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
-from tuning.search.filter_types import FilterType
+from tuning.search.filter_types import TypeResult
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -50,7 +50,7 @@ def front_table(plan: Plan, front: Sequence) -> Table:
     )
 
 
-def kinds_table(kinds: Sequence[FilterType], plan: Plan) -> Table:
+def kinds_table(kinds: Sequence[TypeResult], plan: Plan) -> Table:
     """Filter types that a study tried, the best first."""
     rows = [
         [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), _best(kind)]
@@ -66,7 +66,7 @@ def kinds_table(kinds: Sequence[FilterType], plan: Plan) -> Table:
     return table(title, columns, rows, caption=caption, best=best)
 
 
-def _best(kind: FilterType) -> str:
+def _best(kind: TypeResult) -> str:
     return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 

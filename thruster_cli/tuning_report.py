@@ -28,12 +28,12 @@ from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
 from tuning.reporting.residual_words import residual_sentences
 from tuning.reporting.units import apart
+from tuning.search.filter_parameters import size_ladder
 from tuning.search.filter_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
 from tuning.search.ranges import at_ends, range_words
-from tuning.search.space import size_ladder
 from tuning.search.study import StudyResult
 from tuning.search.validation import as_data as as_data_of_choice
 

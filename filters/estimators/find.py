@@ -41,33 +41,9 @@ def label_of(given) -> str:
     return type(given).__name__
 
 
-def parameters_of(given) -> tuple:
-    """The tunable parameters that an estimator declares, `Parameter`s; none by default."""
-    found = getattr(estimator_named(given), "parameters", ())
-    return tuple(found) if isinstance(found, list | tuple) else ()  # of a network in torch it is a method
-
-
-def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
-    """An estimator in the place of a filter.
-
-    Args:
-        given: an estimator; a function, or class, of a model (and of `numbers`) that makes one, or a `Filter`; or
-            "module:object" for any of these; or the file of a trained estimator.
-        model: of states, inputs and measurements: what a function gets, and where names and angles come from.
-        **numbers: further arguments of the function.
-
-    Raises:
-        ValueError: if there is no such object, or it is not an estimator.
-    """
-    found, label = estimator_named(given), label_of(given)
-    if not is_estimator(found):
-        found = _made(found, label, model, numbers)
-    elif numbers:
-        raise ValueError(
-            f"numbers must come with a function that makes an estimator, but {label!r} is one already, and got "
-            f"{', '.join(numbers)}"
-        )
-    return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
+def is_filter_class(given) -> bool:
+    """Whether something is a user's class of filters."""
+    return isinstance(given, type) and issubclass(given, Filter)
 
 
 def estimator_named(given) -> Any:
@@ -79,12 +55,34 @@ def estimator_named(given) -> Any:
     return object_named(given, "estimator") if isinstance(given, str) else given
 
 
+def as_filter(found: Any, label: str, model: StateSpaceModel, numbers: dict) -> Filter:
+    """An estimator in the place of a filter.
+
+    Args:
+        found: an estimator; or a function, or class, of a model (and of `numbers`) that makes one, or a `Filter`.
+        label: its name in tables, if it does not name itself.
+        model: of states, inputs and measurements: what a function gets, and where names and angles come from.
+        numbers: further arguments of the function.
+
+    Raises:
+        ValueError: if it neither is an estimator nor makes one.
+    """
+    if not is_estimator(found):
+        found = _made(found, label, model, numbers)
+    elif numbers:
+        raise ValueError(
+            f"numbers must come with a function that makes an estimator, but {label!r} is one already, and got "
+            f"{', '.join(numbers)}"
+        )
+    return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
+
+
 def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
     what = f"estimator {label!r}"
     if not callable(make):
         raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {short_repr(make)}")
     try:
-        found = make(model=model, **numbers) if _is_filter_class(make) else make(model, **numbers)
+        found = make(model=model, **numbers) if is_filter_class(make) else make(model, **numbers)
     except Exception as error:
         wanted = ", ".join(["a model", *numbers])
         raise ValueError(f"{what} must be made of {wanted}, but raised {said(error)}") from error
@@ -94,13 +92,3 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
             f"measurements), but made {short_repr(found)}"
         )
     return found
-
-
-def own_filter(given) -> type[Filter] | None:
-    """The class of a user's filter, by itself or by "module:class"; None for estimators and what makes them."""
-    found = estimator_named(given)
-    return found if _is_filter_class(found) else None
-
-
-def _is_filter_class(make) -> bool:
-    return isinstance(make, type) and issubclass(make, Filter)

@@ -10,7 +10,7 @@ import numpy as np
 
 from filters.estimators.find import is_foreign
 from filters.filter import Filter
-from filters.registry import make_filter, tunable_numbers
+from filters.registry import filter_type
 from filters.wrappers.models import made, maker_of
 from filters.wrappers.tuned import tuned_filter
 from thruster_env.numerics.checks import short_repr
@@ -58,15 +58,15 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
             raise ValueError(f"{rule}, but got {short_repr(filter)} with some")
         return filter
     filter = "ekf" if filter is None else filter
-    known = () if is_foreign(filter) else tunable_numbers(filter)
+    kind = filter_type(filter)
     for name in numbers:
-        if name not in known and not is_foreign(filter):
-            rule = f"a number of filter {filter!r} must be one of {', '.join(known) or 'none'}"
+        if name not in kind.numbers and not kind.is_foreign:
+            rule = f"a number of filter {filter!r} must be one of {', '.join(kind.numbers) or 'none'}"
             raise ValueError(f"{rule} (arguments of the model go into model_arguments), but got {name!r}")
     arguments = {} if model_arguments is None else model_arguments
     if not isinstance(arguments, Mapping):
         raise ValueError(f"model_arguments must be a mapping, but got {short_repr(arguments)}")
-    return make_filter(filter, model_for(env, model, arguments), **numbers)
+    return kind.make(model_for(env, model, arguments), **numbers)
 
 
 def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> StateSpaceModel:

@@ -9,7 +9,7 @@ from auv_env.parameters import derive_constants
 from auv_env.plant import make_plant
 from auv_env.presets import SEGOROGENI
 from filters import FILTERS, make_filter
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from tests.auv_env.textbook import random_states
 from thruster_env.plants.affine import linearize
 
@@ -169,7 +169,7 @@ def test_every_filter_runs(states):
         np.array(model.observe(tuple(model.prior_mean.tolist()), model.constants)),
     )
     for name in FILTERS if states == "motion" else ("kf", "ekf", "ukf", "vb", "enkf", "ensrf", "pf"):
-        numbers = {"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}
+        numbers = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
         numbers |= {"premises": [0, 4, 5]} if name == "fuzzy" else {}
         filter_ = make_filter(name, model, **numbers)
         belief = filter_.predict(filter_.init(), u)

@@ -7,7 +7,7 @@ import pytest
 
 from filters import run
 from filters.estimators.estimator import Estimator
-from filters.estimators.find import foreign_filter
+from filters.registry import make_filter
 from tests.models import random_affine
 
 KEYS = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
@@ -72,7 +72,7 @@ def test_a_run_is_a_function_of_its_key_and_data(draw, data):
     inputs.setflags(write=False)
     draw()
     before = np.random.get_state()[1].copy(), random.getstate()
-    filter_ = foreign_filter(Walks(model.n, draw), model)
+    filter_ = make_filter(Walks(model.n, draw), model)
     whole = run(filter_, KEYS, inputs, measurements).means
     np.testing.assert_array_equal(np.random.get_state()[1], before[0])
     assert random.getstate() == before[1], "what others draw goes on as it would"
@@ -93,7 +93,7 @@ def test_a_run_is_a_function_of_its_key_and_data(draw, data):
 @pytest.mark.parametrize("draw", DRAWS)
 def test_all_runs_at_once_are_the_same_again(draw, data):
     model, inputs, measurements = data
-    filter_ = foreign_filter(AtOnce(model.n, draw), model)
+    filter_ = make_filter(AtOnce(model.n, draw), model)
     first, again = (run(filter_, KEYS, inputs, measurements).means for _ in range(2))
     np.testing.assert_array_equal(first, again)
     other = run(filter_, KEYS[::-1].copy(), inputs, measurements).means
@@ -102,7 +102,7 @@ def test_all_runs_at_once_are_the_same_again(draw, data):
 
 def test_sessions_in_turns_keep_their_own_generators(data):
     model, inputs, measurements = data
-    filter_ = foreign_filter(Walks(model.n, np.random.normal), model)
+    filter_ = make_filter(Walks(model.n, np.random.normal), model)
     whole = run(filter_, KEYS, inputs, measurements).means
     sessions = [filter_.session() for _ in KEYS]
     for session, key, z in zip(sessions, KEYS, measurements, strict=True):
@@ -116,7 +116,7 @@ def test_sessions_in_turns_keep_their_own_generators(data):
 def test_what_draws_from_a_generator_that_nobody_can_seed_is_refused(data):
     model, inputs, measurements = data
     hidden = np.random.default_rng(1)
-    filter_ = foreign_filter(Walks(model.n, lambda: hidden.normal()), model)
+    filter_ = make_filter(Walks(model.n, lambda: hidden.normal()), model)
     rule = (
         "the estimator 'Walks' must give the same for the same key and data, but when run 0 is repeated, its mean"
     )

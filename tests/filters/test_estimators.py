@@ -12,7 +12,6 @@ import pytest
 
 from filters import EstimateState, make_filter, run
 from filters.estimators.estimator import Estimator
-from filters.estimators.find import foreign_filter
 from filters.wrappers.vector import EstimateStates
 from tests.models import random_affine, simulated
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
@@ -146,7 +145,7 @@ def test_a_user_s_kalman_filter_gives_what_ours_gives_missing_channels_and_likel
 
 def test_an_estimator_stands_in_evaluation_and_comparison_beside_ours():
     data = NOMINAL.data(SEEDS)
-    found = evaluate(foreign_filter(AtOnce(), NOMINAL.model()), data, NOMINAL.scale)
+    found = evaluate(make_filter(AtOnce(), NOMINAL.model()), data, NOMINAL.scale)
     u = np.concatenate([np.zeros_like(data.inputs[:, :1]), data.inputs], axis=1)
     errors = np.concatenate([u, data.measurements], axis=-1) - data.states
     expected = np.sqrt((errors[:, data.late] ** 2).mean(axis=(0, 1)))

@@ -9,7 +9,7 @@ import pytest
 
 from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior, run
 from filters.augmented import augmented_model
-from filters.registry import FILTERS, tunable_numbers
+from filters.registry import FILTERS, filter_type
 from filters.smoothers.smooth import smooth
 from tests.models import (
     lonely_model,
@@ -84,7 +84,7 @@ def everything(model_name):
     keys, found = episode_keys([3, 4]), {}
     found["simulate"] = simulate(model, keys, inputs)
     for name, (kind, numbers) in CASES.items():
-        if "ensemble_size" in tunable_numbers(kind):
+        if filter_type(kind).has_ensemble:
             numbers = {**numbers, "ensemble_size": 10}
         try:
             made = make_filter(kind, model, **numbers)

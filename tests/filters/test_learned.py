@@ -11,7 +11,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from filters import EstimateState, make_filter, run, thruster_model
-from filters.estimators.find import foreign_filter, is_foreign, label_of
+from filters.estimators.find import is_foreign, label_of
 from filters.learned.equations import Equations
 from filters.learned.estimator import unit_scales
 from filters.learned.file import LEARNED, read, write_estimator
@@ -252,7 +252,7 @@ def test_a_file_has_numbers_alone_and_stands_for_the_estimator(tmp_path, data, a
     estimator = made("gru", width=7)
     write_estimator(path, estimator, {"problem": "plane"})
     assert is_foreign(path) and label_of(path) == "mine"
-    filter_ = foreign_filter(str(path), model)
+    filter_ = make_filter(str(path), model)
     assert filter_.name == "gru" and not filter_.has_covariance
     np.testing.assert_array_equal(run(filter_, KEYS, inputs, z).means, estimator.run(KEYS, inputs, z).mean)
     assert read(path).about["training"] == {"problem": "plane"} and read(path) is read(path)

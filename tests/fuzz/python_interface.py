@@ -19,7 +19,7 @@ import numpy as np
 
 from filters import FILTERS, EstimateState, EstimateStates, make_filter, run, thruster_model
 from filters.engine.belief import Belief, LostBelief
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from tests.robustness.test_copies import assert_alike
 from tests.thruster_env.test_robustness import random_arguments, run_random_episode
 from thruster_env.numerics.compiled import interpreted
@@ -98,7 +98,7 @@ def beliefs(rng: np.random.Generator, seconds: float) -> str:
     with interpreted(), np.errstate(all="ignore"):
         for k in _until(seconds):
             name = names[k % len(names)]
-            own = {"ensemble_size": 5} if "ensemble_size" in tunable_numbers(name) else {}
+            own = {"ensemble_size": 5} if filter_type(name).has_ensemble else {}
             kind = make_filter(name, thruster_model(), **own)
             belief = _some_belief(rng, kind.init((k % 2**32, 1)))
             u, z = ([_number(rng)] if rng.random() < 0.9 else WRONG[rng.integers(len(WRONG))] for _ in range(2))

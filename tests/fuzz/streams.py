@@ -19,7 +19,7 @@ import numpy as np
 from filters import StateSpaceModel
 from filters.engine.batch import run
 from filters.estimators.estimator import Estimator
-from filters.estimators.find import foreign_filter
+from filters.registry import make_filter
 from tests.fuzz.python_interface import _until
 from thruster_env.numerics.streams import SPAWN_KEYS, derived_generator, derived_seed
 from tuning.problems.digest import digest_of
@@ -163,7 +163,7 @@ def estimators(rng: np.random.Generator, seconds: float) -> str:
         keys = rng.integers(0, 2**32, size=(3, 2)).astype(np.float64)
         u, z = rng.normal(size=(3, steps, 1)), rng.normal(size=(3, steps + 1, 1))
         z[rng.random(z.shape) < 0.2] = np.nan
-        filter_ = foreign_filter(_Spoiling(source), model)
+        filter_ = make_filter(_Spoiling(source), model)
         whole = run(filter_, keys, u, z).means
         order = rng.permutation(3)
         np.random.seed(int(rng.integers(2**32)))

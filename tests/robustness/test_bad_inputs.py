@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from tests.models import OF_EACH_KIND
 from tests.slow import slow_but
 
@@ -31,7 +31,7 @@ def data():
 
 @pytest.mark.parametrize("name", slow_but(FILTERS, OF_EACH_KIND))
 def test_every_estimate_is_finite_and_every_restart_counted(name, data):
-    numbers = {"ensemble_size": 12} if "ensemble_size" in tunable_numbers(name) else {}
+    numbers = {"ensemble_size": 12} if filter_type(name).has_ensemble else {}
     estimates = run(make_filter(name, thruster_model(), **numbers), *data)
     for part in estimates:
         assert np.isfinite(part).all()

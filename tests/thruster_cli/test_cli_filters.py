@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from filters.registry import FILTERS, filter_class, tunable_numbers
+from filters.registry import FILTERS, filter_type
 from thruster_cli.filters import entry, first_sentence, fitted
 from thruster_cli.main import main
 from thruster_cli.output import console
@@ -34,7 +34,7 @@ def test_the_list_names_every_filter_and_number_and_fits_the_terminal(thruster, 
     first_words = [line.split()[0] for line in out.splitlines() if line.split()]
     for name in FILTERS:
         assert name in first_words
-        assert set(tunable_numbers(name)) <= set(first_words)
+        assert set(filter_type(name).numbers) <= set(first_words)
     assert out.split().count("ensemble_size") == 3  # of members, particles, and few: shared lines are told once
 
 
@@ -55,11 +55,11 @@ def test_one_filter_is_shown_in_full(thruster, monkeypatch, name, width):
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_what_is_said_of_a_filter_comes_from_its_class(name):
-    kind, told = filter_class(name), entry(name)
+    kind, told = filter_type(name).filter_class, entry(name)
     assert told.covariance is kind.has_covariance
-    assert told.ensemble is ("ensemble_size" in tunable_numbers(name))
+    assert told.ensemble is ("ensemble_size" in filter_type(name).numbers)
     assert 10 < len(told.about) < 120 and told.about.endswith(".")
-    assert tuple(number.name for number in told.numbers) == tunable_numbers(name)
+    assert tuple(number.name for number in told.numbers) == filter_type(name).numbers
     for number in told.numbers:
         assert number.default == getattr(kind, number.name) and len(number.meaning) > 5
 

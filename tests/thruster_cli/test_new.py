@@ -13,7 +13,7 @@ import pytest
 import tuning
 from filters import EstimateState, make_filter, run
 from filters.likelihood import likelihood
-from filters.registry import filter_class
+from filters.registry import filter_type
 from tests.filters.test_differentiated import swing_if
 from tests.models import pendulum, simulated, swing
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
@@ -80,7 +80,7 @@ def naive_correntropy(model, bandwidth, iterations, inputs, measurements):
 
 def test_a_filter_is_that_of_its_paper_on_every_path(new):
     kind = importlib.import_module(new("filter", "a_new_filter")).ANewFilter
-    assert filter_class("a_new_filter:ANewFilter") is kind
+    assert filter_type("a_new_filter:ANewFilter").filter_class is kind
     model = thruster_model(measurement_noise_cov=0.2)
     inputs, z = simulated(model, 30)
     z[0, 9] += 8.0  # an outlier
@@ -130,7 +130,7 @@ def test_a_filter_runs_on_a_model_that_cannot_be_traced(new):
 
 def test_studies_search_the_range_of_a_filters_parameter(new):
     new("filter", "a_new_range")
-    (found,) = filter_parameters("a_new_range:ANewRange", None, True)
+    (found,) = filter_parameters(filter_type("a_new_range:ANewRange"), True)
     assert (found.name, found.low, found.high, found.default, found.log) == ("bandwidth", 1.0, 20.0, 3.0, True)
     choice = rule_of_thumb("a_new_range:ANewRange", find_problem("outliers"))
     assert choice.numbers == {"bandwidth": 3.0} and choice.filter(find_problem("outliers")).bandwidth == 3.0

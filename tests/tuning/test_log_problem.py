@@ -26,8 +26,9 @@ from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.reporting.tables import errors_table, numbers_table
+from tuning.search.filter_parameters import size_ladder
 from tuning.search.plan import Plan
-from tuning.search.space import size_ladder, untuned_choice
+from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.workers import _packed, _unpacked
 

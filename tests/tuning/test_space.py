@@ -3,15 +3,9 @@ import pytest
 
 from filters.registry import FILTERS
 from thruster_env.studies import lorenz63
+from tuning.search.filter_parameters import size_ladder
 from tuning.search.plan import Plan
-from tuning.search.space import (
-    choice_of,
-    distributions,
-    parameters_of,
-    size_ladder,
-    trial_parameters,
-    untuned_choice,
-)
+from tuning.search.space import choice_of, distributions, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study
 from tuning.thruster.find import find_scenario
 

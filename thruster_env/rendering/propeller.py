@@ -8,6 +8,7 @@ camera whose shutter stays open from one frame to the next.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pygame
@@ -56,6 +57,7 @@ class BlurredPicture:
         return self._sums[-1] * np.float32(rounds) + (1 - part) * self._sums[k] + part * self._sums[k + 1]
 
 
+@cache  # all renderers and their copies share the tables
 def end_view(radius: float) -> BlurredPicture:
     """The propeller of a radius [px] seen from port, in a square around it; angles count clockwise from up."""
     r, half_width = _blade()
@@ -80,6 +82,7 @@ def end_view(radius: float) -> BlurredPicture:
     return BlurredPicture(draw, (side, side))
 
 
+@cache
 def side_view(radius: float) -> BlurredPicture:
     """The same propeller seen from the side, its axis level and water driven to the right, width 1.2 radii."""
     r, half_width = _blade()

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from thruster_env.numerics.checks import at_least, one_of, positive, short_repr
 from thruster_env.training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
 from thruster_env.training.observations import find_observation_set
@@ -33,7 +33,7 @@ def check_configuration(setup: TrainingConfiguration) -> None:
         one_of("controller", setup.controller, plant.correctable)
         plant.check_observes(setup.controller, setup.observe)
     positive("share", setup.share)
-    own = () if observed.filter is None else (*tunable_numbers(observed.filter), *plant.model_arguments)
+    own = () if observed.filter is None else (*filter_type(observed.filter).numbers, *plant.model_arguments)
     _check_known("env_arguments", setup.env_arguments, plant.env_arguments)
     _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)
     if setup.assumed_plant is not None:

@@ -11,7 +11,7 @@ from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from thruster_env.plants.observe import ObserveState, ObserveStateVector
 from thruster_env.training.controllers import CorrectController
 from thruster_env.training.observations import find_observation_set
@@ -94,7 +94,7 @@ def make_single(setup: TrainingConfiguration, render_mode: str | None = None) ->
 def _filter_arguments(setup: TrainingConfiguration, filter_name: str) -> dict:
     """Arguments of the wrapper; where the filter assumes another plant than the env's, a model of that one."""
     arguments = dict(setup.filter_arguments)
-    own = {name: arguments.pop(name) for name in tunable_numbers(filter_name) if name in arguments}
+    own = {name: arguments.pop(name) for name in filter_type(filter_name).numbers if name in arguments}
     if setup.assumed_plant is None:
         return {"model_arguments": arguments, **own}
     return {"model": plant_of(setup.task).model(**{**setup.assumed_plant, **arguments}), **own}

@@ -9,7 +9,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from tuning.evaluation.baselines import noise_estimated
 from tuning.likelihood.goal import OF_STATES
 from tuning.problems.data import Data
@@ -61,7 +61,7 @@ def follow(
     """
     if ANSWER in study.user_attrs:
         return False
-    options = plan.options if filter_class(plan.filter).has_covariance else {}
+    options = plan.options if filter_type(plan.filter).has_covariance else {}
     with stop_on_interrupt() as interrupted:
         given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
         passes = sum(len(one.seeds) for one in data)

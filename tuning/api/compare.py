@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from filters.estimators.find import is_foreign, label_of
+from filters.estimators.find import label_of
 from filters.filter import Filter
-from filters.registry import filter_class
+from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.numerics.checks import at_least, short_repr
 from tuning.api.comparison import FilterComparison
@@ -29,7 +29,7 @@ from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.augmented import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.search.space import Choice, has_ensemble
+from tuning.search.space import Choice
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 
@@ -139,7 +139,7 @@ def contenders_of(
         seed: of the study whose training runs scale the scaled default.
     """
     for name, number in sizes.items():
-        if name is not None and not has_ensemble(name):
+        if name is not None and not filter_type(name).has_ensemble:
             raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {number}")
         at_least("ensemble_size", number, 2)
 
@@ -160,9 +160,10 @@ def contenders_of(
             chosen, suit = partial(_from_file, Path(one), size), partial(suited_to, Path(one))
             out.append(Contender(_new(Path(one).stem, out), chosen, knows=OF_FILE, suit=suit))
         else:
-            size = size_of(one) if not is_foreign(one) and has_ensemble(one) else None
+            kind = filter_type(one)
+            size = size_of(one) if kind.has_ensemble and not kind.is_foreign else None
             out.append(contender(one, knows, seed=seed, ensemble_size=size))
-            if unknown and filter_class(one).has_covariance:
+            if unknown and kind.has_covariance:
                 out.append(contender(one, knows, unknown, seed, ensemble_size=size))
     return out
 

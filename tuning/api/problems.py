@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.estimators.find import is_foreign, is_trained
-from filters.registry import FILTERS, filter_class
+from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.modules import is_code
@@ -87,7 +87,7 @@ def is_filter(given: Any) -> bool:
     if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
         return False
     if isinstance(given, str) or is_foreign(given):
-        filter_class(given)  # a clear error for an unknown name
+        filter_type(given)  # a clear error for an unknown name
         return True
     raise ValueError(
         f"a filter must be a name, a tuned file, a Study or an estimator, but got {short_repr(given)}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from filters.filter import Filter
-from filters.registry import tunable_numbers
+from filters.registry import filter_type
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.problem import Problem
@@ -42,6 +42,6 @@ def user_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
     numbers = untuned_choice(name, problem).numbers
     if isinstance(given, Filter):
         numbers = {
-            key: getattr(given, key) for key in tunable_numbers(name) if key in numbers or hasattr(given, key)
+            key: getattr(given, key) for key in filter_type(name).numbers if key in numbers or hasattr(given, key)
         }
     return Choice(name, {**{one.name: one.start for one in problem.parameters or ()}, **noise}, numbers)

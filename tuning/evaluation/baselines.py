@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.assumed import as_argument, rows_argument
@@ -56,7 +56,7 @@ def given(name: str, scenario: Problem) -> Choice | None:
 
     A model with the plant's own Q and R is the oracle, not a given one.
     """
-    return given_choice(name, scenario) if filter_class(name).has_covariance else None
+    return given_choice(name, scenario) if filter_type(name).has_covariance else None
 
 
 def rule_label(scenario: Problem) -> str:
@@ -66,7 +66,7 @@ def rule_label(scenario: Problem) -> str:
 
 def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | None:
     """The filter with the sample covariances of its model's residuals on the truth; None if there are none."""
-    if not filter_class(name).has_covariance:
+    if not filter_type(name).has_covariance:
         return None
     found = noise_estimation(scenario, seed)
     if found.process_cov is None or found.measurement_cov is None:

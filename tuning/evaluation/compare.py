@@ -14,10 +14,9 @@ import numpy as np
 from filters.augmented import Unknown, augmented_model
 from filters.consistency.intervals import Interval, rmse_ratios, slightly
 from filters.engine.batch import run
-from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
-from filters.registry import filter_class, make_filter
+from filters.registry import filter_type, make_filter
 from thruster_env.numerics.checks import one_of
 from tuning.evaluation.baselines import given, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import (
@@ -34,8 +33,9 @@ from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
+from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.interruption import stop_on_interrupt
-from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
+from tuning.search.space import Choice
 
 VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
 WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
@@ -150,7 +150,7 @@ def contender(
         ValueError: for an unknown name or knowledge. (Parameters and constants are checked when the filter is
             made.)
     """
-    filter_class(name)
+    kind = filter_type(name)
     one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
@@ -159,12 +159,10 @@ def contender(
         return choice._replace(numbers={**choice.numbers, **numbers})
 
     unknown = unknown or {}
-    size = [str(numbers.get("ensemble_size", ensemble_sizes_of(name).untuned))] if has_ensemble(name) else []
+    size = [str(numbers.get("ensemble_size", ensemble_sizes_of(kind).untuned))] if kind.has_ensemble else []
     others = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
-    return Contender(
-        " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown, knows
-    )
+    return Contender(" ".join([kind.label, *size, *others, *added]), chosen, unknown, knows)
 
 
 def _said(value) -> str:
@@ -196,7 +194,9 @@ def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
 
 def sized(choice: Choice, ensemble_size: int | None) -> Choice:
     """A choice with another ensemble size, if one is given and the filter has an ensemble."""
-    return choice if ensemble_size is None or not has_ensemble(choice.name) else choice.with_size(ensemble_size)
+    if ensemble_size is None or not filter_type(choice.name).has_ensemble:
+        return choice
+    return choice.with_size(ensemble_size)
 
 
 def compare(

@@ -17,9 +17,10 @@ from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, s
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
+from tuning.search.filter_parameters import size_ladder
 from tuning.search.objectives import MOST_PRICE, nis_violation
 from tuning.search.plan import SIZE_SEEDS, Plan
-from tuning.search.space import Choice, size_ladder
+from tuning.search.space import Choice
 
 FEW = 8  # of the fresh seeds, on which all sizes of a large model are compared first
 SURE = 0.0005  # quantile of the resamples by which a size is left out after these seeds

@@ -21,8 +21,9 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.summary import as_interval, numbers, summarised, summary
 from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
+from tuning.search.filter_parameters import size_ladder
 from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
-from tuning.search.space import Choice, size_ladder
+from tuning.search.space import Choice
 
 ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations of a `Comparison`
 

@@ -11,7 +11,7 @@ from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
 from filters.estimators.find import is_foreign
 from filters.pages.page_filter import PageFilter
-from filters.registry import filter_class, make_filter
+from filters.registry import filter_type, make_filter
 from thruster_env.numerics.checks import one_of
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.likelihood.noise import TunedCovariance
@@ -30,12 +30,12 @@ STEP = 1e-4  # in coordinates, of the differences of a model's numbers
 
 def has_gradient(name: str) -> bool:
     """Whether a filter, or a user's by "module:class", has exact gradients."""
-    return name in DIFFERENTIABLE or (is_foreign(name) and has_derivatives(filter_class(name)))
+    return name in DIFFERENTIABLE or (is_foreign(name) and has_derivatives(filter_type(name).filter_class))
 
 
 def keeps_more(name: str) -> bool:
     """Whether a filter with a page keeps more than mean and covariance, such as an estimate of R."""
-    kind = filter_class(name)
+    kind = filter_type(name).filter_class
     return issubclass(kind, PageFilter) and kind.page.start is not None
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from optuna.distributions import BaseDistribution
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from tuning.likelihood.family import known_information
 from tuning.problems.data import Data, where_true
@@ -126,7 +126,7 @@ def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, 
 
     Parameters of a problem's own are none where the choice has a Q and R that they do not give.
     """
-    if not filter_class(choice.name).has_covariance:
+    if not filter_type(choice.name).has_covariance:
         return ()
     places, own = places_in(choice), parameters_of(choice)
     without = [name for name in choice.model if set(NOISE) & set(choice.model)]

@@ -7,7 +7,7 @@ from math import isfinite, sqrt
 
 from optuna.trial import TrialState
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.versions import versions
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem
@@ -73,7 +73,7 @@ def _word(subject: Subject) -> str:
 
 def model_section(choice: Choice, scenario: Problem) -> Section:
     """The model that the tuned filter assumes, and its Q and R in words and numbers."""
-    model, kind = scenario.model(**choice.model), filter_class(choice.name)
+    model, kind = scenario.model(**choice.model), filter_type(choice.name).filter_class
     f = "f" if model.substeps == 1 else f"f (of {model.substeps} equal parts a step)"
     sample = f", one step each {scenario.dt:g} s" if scenario.dt else ""
     said = [

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from filters.registry import filter_type
 from thruster_env.numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
@@ -22,7 +23,6 @@ from tuning.reporting.subject import Subject, find_subject, is_file
 from tuning.reporting.tables import errors_table, known_table, numbers_table
 from tuning.search.objectives import nis_ratio
 from tuning.search.ranges import at_ends
-from tuning.search.space import has_ensemble
 from tuning.search.trials import measure
 
 
@@ -91,7 +91,7 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     file = str(source) if file is None and is_file(source) else file or None
     data = plan.training_data()
     sizes: Sequence[SizeRow] = []
-    if has_ensemble(choice.name):
+    if filter_type(choice.name).has_ensemble:
         kept_rows = stored_sizes(subject.sizes, choice, plan)
         sizes = ensemble_sizes(choice, plan, data, subject.consistent) if kept_rows is None else kept_rows
     if sizes and not subject.chosen:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from filters.consistency.verdicts import sentences
-from filters.registry import filter_class
+from filters.registry import filter_type
 from thruster_env.numerics.sources import is_array
 from tuning.evaluation.baselines import TUNED, baselines
 from tuning.evaluation.evaluate import check_consistency
@@ -33,7 +33,7 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
     pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
     where = f"{scenario.name}, held-out {word} {comparison.seeds.start}"
-    has_covariance, scored = filter_class(choice.name).has_covariance, comparison.tuned.scored or None
+    has_covariance, scored = filter_type(choice.name).has_covariance, comparison.tuned.scored or None
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
     alt = of_estimates(pair, data, 0, dt)

@@ -1,14 +1,42 @@
-"""The parameters of filters besides their model that a study may choose, with ranges."""
+"""The parameters of filters besides their model that a study may choose: ranges and untuned values."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-from filters.estimators.find import is_foreign, own_filter, parameters_of
 from filters.filter import Filter
-from filters.registry import tunable_numbers
+from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
+from filters.particles.weighted import WeightedFilter
+from filters.registry import FilterType, filter_type
 from tuning.problems.parameter import Parameter
+
+SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
+
+
+class Sizes(NamedTuple):
+    """Ensemble sizes of a filter type."""
+
+    untuned: int
+    low: int  # of the search
+    high: int
+
+
+# The members of a Kalman ensemble represent a mean and a covariance, those of a particle filter a distribution.
+KALMAN_SIZES, PARTICLE_SIZES, GAUSSIANS = Sizes(30, 5, 200), Sizes(1000, 200, 5000), Sizes(100, 20, 1000)
+
+
+def ensemble_sizes_of(kind: FilterType) -> Sizes:
+    """Ensemble sizes of a filter that has an ensemble."""
+    if issubclass(kind.filter_class, RaoBlackwellisedParticleFilter):
+        return GAUSSIANS
+    return PARTICLE_SIZES if issubclass(kind.filter_class, WeightedFilter) else KALMAN_SIZES
+
+
+def size_ladder(name: str) -> tuple[int, ...]:
+    """Ensemble sizes of a filter at which a report shows its error, smallest first."""
+    _, low, high = ensemble_sizes_of(filter_type(name))
+    return tuple(size for size in SIZE_LADDER if low <= size <= high)
 
 
 @dataclass(frozen=True)
@@ -62,20 +90,31 @@ FILTER_PARAMETERS = {
 WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0), _own("window", 0, 3, integer=True))}
 
 
-def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: bool) -> list[Parameter]:
-    """Parameters of a filter that a study may choose: N from `sizes`, if it has an ensemble, and the others.
+def filter_parameters(kind: FilterType, process_noise: bool) -> list[Parameter]:
+    """Parameters of a filter that a study may choose: N, if it has an ensemble, and the others.
 
     An estimator declares its own parameters. Some parameters are chosen only without process noise.
     """
-    own = own_filter(name) if is_foreign(name) else None
-    if own is not None:
+    if kind.is_estimator:
+        return [replace(one, place=FilterParameter(one.name)) for one in kind.declared]
+    if kind.is_foreign:
+        own = kind.filter_class
         return [_own_of_user(own, number, *ends) for number, ends in getattr(own, "ranges", {}).items()]
-    if is_foreign(name):
-        return [replace(one, place=FilterParameter(one.name)) for one in parameters_of(name)]
-    size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterParameter("ensemble_size"))]
-    known = tunable_numbers(name)
+    known, found = kind.numbers, []
+    if kind.has_ensemble:
+        _, low, high = ensemble_sizes_of(kind)
+        found = [Parameter("N", low, high, integer=True, place=FilterParameter("ensemble_size"))]
     numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
-    return size + [one for number, one in numbers.items() if number in known]
+    return found + [one for number, one in numbers.items() if number in known]
+
+
+def default_numbers(kind: FilterType, process_noise: bool) -> dict[str, Any]:
+    """The values of these parameters in the untuned filter."""
+    own = filter_parameters(kind, process_noise)
+    if kind.is_foreign:
+        return {one.name: one.start for one in own}
+    size = {"ensemble_size": ensemble_sizes_of(kind).untuned} if kind.has_ensemble else {}
+    return size | {one.name: getattr(kind.filter_class, one.name) for one in own if one.name != "N"}
 
 
 def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Parameter:

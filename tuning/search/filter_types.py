@@ -12,7 +12,7 @@ from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.space import FILTER_TYPE
 
 
-class FilterType(NamedTuple):
+class TypeResult(NamedTuple):
     """The results of a filter type in a study."""
 
     name: str
@@ -24,7 +24,7 @@ class FilterType(NamedTuple):
     microseconds: float | None  # us/step of that trial or, if none is complete, of the cheapest one
 
 
-def filter_types_tried(trials: Sequence[FrozenTrial]) -> list[FilterType]:
+def filter_types_tried(trials: Sequence[FrozenTrial]) -> list[TypeResult]:
     """The filter types that finished trials chose, the best first; empty for a study of one type."""
     by_type: dict[str, list[FrozenTrial]] = {}
     for trial in trials:
@@ -45,10 +45,10 @@ def trials_of_type(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial
     return [trial for trial in trials if trial.params.get(FILTER_TYPE, name) == name]
 
 
-def _row(name: str, trials: list[FrozenTrial]) -> FilterType:
+def _row(name: str, trials: list[FrozenTrial]) -> TypeResult:
     best, over = best_trial(trials), sum(map(is_over_budget, trials))
     costs = [trial.user_attrs[COST] for trial in ([best] if best else trials) if COST in trial.user_attrs]
-    return FilterType(
+    return TypeResult(
         name,
         len(trials),
         sum(trial.state == TrialState.PRUNED for trial in trials) - over,

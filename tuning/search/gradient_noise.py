@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import optuna
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from tuning.likelihood.family import has_gradient, keeps_more
 from tuning.likelihood.goal import Goal
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
@@ -30,7 +30,7 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
     is so flat that a sampler finds the optimum late, and with many correlations never; with a wrong model the
     trial is one among many. None for parameters that change functions of the model, which have no such gradient.
     """
-    if not all(filter_class(name).has_covariance for name in plan.filter_types):
+    if not all(filter_type(name).has_covariance for name in plan.filter_types):
         return None
     key = MAXIMUM_LIKELIHOOD if objective == LIKELIHOOD else f"{BY_GRADIENT} {objective}"
     known = study.user_attrs.get(key)

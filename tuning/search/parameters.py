@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.registry import filter_class
+from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
 from thruster_env.numerics.checks import covariance
@@ -172,7 +172,7 @@ def places_in(choice) -> dict[str, Place]:
     Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
     """
     found: dict[str, Place] = {}
-    if not filter_class(choice.name).has_covariance:
+    if not filter_type(choice.name).has_covariance:
         return found
     q, r = choice.model.get(Q), choice.model.get(R)
     found |= {name: Argument(name) for name in choice.model if name not in (Q, R, PRIOR.name)}

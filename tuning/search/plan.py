@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import optuna
 from optuna.distributions import BaseDistribution
 
-from filters.estimators.find import estimator_named
-from filters.registry import filter_class
+from filters.registry import filter_type
 from thruster_env.numerics.checks import positive, short_repr
 from thruster_env.numerics.modules import is_code
 from tuning.problems.check import checked_problem, data_of
@@ -58,7 +57,7 @@ class Plan(NamedTuple):
     @property
     def identity(self) -> dict:
         """What must be the same for a study to be continued, including the code of a user's own estimator."""
-        own = {name: digest_of(estimator_named(name)) for name in self.filter_types if is_code(name)}
+        own = {name: digest_of(filter_type(name).found) for name in self.filter_types if is_code(name)}
         return {
             **({"estimators": own} if own else {}),
             **({"worst": True} if self.worst else {}),
@@ -95,7 +94,7 @@ class Plan(NamedTuple):
 
     @property
     def _has_covariance(self) -> bool:
-        return all(filter_class(name).has_covariance for name in self.filter_types)
+        return all(filter_type(name).has_covariance for name in self.filter_types)
 
     @property
     def asks_for_cost(self) -> bool:

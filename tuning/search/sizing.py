@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import optuna
 
+from filters.registry import filter_type
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.evaluation.stored import sizes_as_data, stored_sizes
 from tuning.problems.data import Data
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, has_ensemble
+from tuning.search.space import Choice
 
 SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
 
@@ -19,7 +20,7 @@ def sizes_of(
     study: optuna.Study, choice: Choice, plan: Plan, data: Sequence[Data], consistent: bool
 ) -> list[SizeRow]:
     """The table of ensemble sizes of a choice, stored with the study; empty if there is none."""
-    if not has_ensemble(choice.name) or len(plan.objectives) > 1:
+    if not filter_type(choice.name).has_ensemble or len(plan.objectives) > 1:
         return []
     kept = stored_sizes(study.user_attrs.get(SIZES), choice, plan)
     if kept is None:
@@ -33,6 +34,6 @@ def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[Size
     if sizes:
         return choice.with_size(sufficient_size(sizes, consistent))
     recorded = all(scenario.leads_in for scenario in plan.scenarios)
-    if has_ensemble(choice.name) and len(plan.objectives) == 1 and recorded:
+    if filter_type(choice.name).has_ensemble and len(plan.objectives) == 1 and recorded:
         return choice.with_size(close_size(choice, plan, data))
     return choice

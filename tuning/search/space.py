@@ -10,14 +10,11 @@ from typing import Any, NamedTuple
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
-from filters.estimators.find import is_foreign
 from filters.filter import Filter
-from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
-from filters.particles.weighted import WeightedFilter
-from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
+from filters.registry import FILTERS, filter_type, make_filter
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import FilterParameter, filter_parameters
+from tuning.search.filter_parameters import FilterParameter, default_numbers, filter_parameters
 from tuning.search.parameters import (
     has_process_noise,
     model_parameters,
@@ -28,19 +25,6 @@ AUTO = "auto"  # in place of a filter: a study chooses among the following, all 
 # The first one is the first trial.
 AUTO_FILTER_TYPES = ("ekf", *(name for name, kind in FILTERS.items() if kind.has_covariance and name != "ekf"))
 FILTER_TYPE = "filter"  # the trial parameter that is the filter type
-SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
-
-
-class Sizes(NamedTuple):
-    """Ensemble sizes of a filter type."""
-
-    untuned: int
-    low: int  # of the search
-    high: int
-
-
-# The members of a Kalman ensemble represent a mean and a covariance, those of a particle filter a distribution.
-KALMAN_SIZES, PARTICLE_SIZES, GAUSSIANS = Sizes(30, 5, 200), Sizes(1000, 200, 5000), Sizes(100, 20, 1000)
 
 
 class Choice(NamedTuple):
@@ -61,50 +45,21 @@ class Choice(NamedTuple):
 
 def untuned_choice(name: str, problem: Problem) -> Choice:
     """The untuned filter: R from the data sheet, Q from the ranges of the states, N = 30 (particles: 1000)."""
-    return Choice(name, dict(problem.untuned), _default_numbers(name, problem))
+    return _choice(name, problem, problem.untuned)
 
 
 def given_choice(name: str, problem: Problem) -> Choice | None:
     """The filter with the model's given values and the untuned ensemble size; None if there are none."""
-    return None if problem.given is None else Choice(name, dict(problem.given), _default_numbers(name, problem))
+    return None if problem.given is None else _choice(name, problem, problem.given)
 
 
 def oracle_choice(name: str, problem: Problem) -> Choice | None:
     """The filter with the plant's own Q and R and the untuned ensemble size; None if they are unknown."""
-    return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
+    return None if problem.true is None else _choice(name, problem, problem.true)
 
 
-def has_ensemble(name: str) -> bool:
-    """Whether a filter has an ensemble whose size can be chosen."""
-    return "ensemble_size" in tunable_numbers(name)
-
-
-def ensemble_sizes_of(name: str) -> Sizes:
-    """Ensemble sizes of a filter that has an ensemble."""
-    kind = filter_class(name)
-    if issubclass(kind, RaoBlackwellisedParticleFilter):
-        return GAUSSIANS
-    return PARTICLE_SIZES if issubclass(kind, WeightedFilter) else KALMAN_SIZES
-
-
-def size_ladder(name: str) -> tuple[int, ...]:
-    """Ensemble sizes of a filter at which a report shows its error, smallest first."""
-    _, low, high = ensemble_sizes_of(name)
-    return tuple(size for size in SIZE_LADDER if low <= size <= high)
-
-
-def _default_numbers(name: str, problem: Problem) -> dict:
-    own = _of_filter(name, has_process_noise(problem))
-    if is_foreign(name):  # also the default of a user's filter
-        return {one.name: one.start for one in own}
-    numbers: dict[str, Any] = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
-    others = [one.name for one in own if one.name != "N"]
-    return numbers | {number: getattr(filter_class(name), number) for number in others}
-
-
-def _of_filter(name: str, process_noise: bool = False) -> list[Parameter]:
-    sizes = ensemble_sizes_of(name)[1:] if has_ensemble(name) else None
-    return filter_parameters(name, sizes, process_noise)
+def _choice(name: str, problem: Problem, model: Mapping[str, Any]) -> Choice:
+    return Choice(name, dict(model), default_numbers(filter_type(name), has_process_noise(problem)))
 
 
 def parameters(name: str, problem: Problem, **options: Any) -> list[Parameter]:
@@ -119,8 +74,9 @@ def parameters(name: str, problem: Problem, **options: Any) -> list[Parameter]:
         problem: the ranges follow from its untuned values.
         **options: of `model_parameters`, what of the model is chosen.
     """
-    found = model_parameters(problem, **options) if filter_class(name).has_covariance else []
-    return found + _of_filter(name, has_process_noise(problem))
+    kind = filter_type(name)
+    found = model_parameters(problem, **options) if kind.has_covariance else []
+    return found + filter_parameters(kind, has_process_noise(problem))
 
 
 def distributions(name: str, problem: Problem, **options) -> dict[str, BaseDistribution]:
@@ -152,9 +108,9 @@ def joint_distributions(filter_types: Sequence[str], problem: Problem, **options
     }
 
 
-def _is_of(filter_type: str | None, key: str) -> bool:
+def _is_of(name: str | None, key: str) -> bool:
     """Whether a parameter of `joint_distributions` is chosen for a filter type."""
-    return " " not in key or key.startswith(f"{filter_type} ")
+    return " " not in key or key.startswith(f"{name} ")
 
 
 def suggest(
@@ -166,12 +122,12 @@ def suggest(
 ) -> Choice:
     """Let a trial choose its filter type, and the parameters of a `joint_distributions` space for that type."""
     chosen: dict[str, float | int | str] = {}
-    filter_type = None
+    chosen_type = None
     for key, distribution in space.items():
         if isinstance(distribution, CategoricalDistribution):
-            filter_type = str(trial.suggest_categorical(key, distribution.choices))
-            chosen[key] = filter_type
-        elif _is_of(filter_type, key):
+            chosen_type = str(trial.suggest_categorical(key, distribution.choices))
+            chosen[key] = chosen_type
+        elif _is_of(chosen_type, key):
             if isinstance(distribution, IntDistribution):
                 chosen[key] = trial.suggest_int(key, distribution.low, distribution.high, log=distribution.log)
             elif isinstance(distribution, FloatDistribution):
@@ -225,7 +181,8 @@ def everything_of(problem: Problem) -> dict[str, Any]:
 
 def has_search_space(name: str) -> bool:
     """Whether a filter has any parameter to choose."""
-    return filter_class(name).has_covariance or bool(_of_filter(name))
+    kind = filter_type(name)
+    return kind.has_covariance or bool(filter_parameters(kind, process_noise=False))
 
 
 @lru_cache(maxsize=512)
@@ -243,7 +200,9 @@ def parameters_of(choice: Choice) -> dict[str, float | int]:
 
     Correlations and P0 are among them where the choice has a full Q or R and a factor on P_0.
     """
-    places = places_in(choice) | {one.name: one.place for one in _of_filter(choice.name)}
+    places = places_in(choice) | {
+        one.name: one.place for one in filter_parameters(filter_type(choice.name), process_noise=False)
+    }
     found = {name: place.get(choice) for name, place in places.items()}
     return {name: value for name, value in found.items() if value is not None}
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.intervals import Interval
-from filters.registry import filter_class
+from filters.registry import filter_type
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
 from tuning.evaluation.baselines import GIVEN, ORACLE, baselines, same_filter
 from tuning.problems.data import Data
@@ -158,7 +158,7 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     """
     problem = plan.scenarios[0]
     found = {name: one for name, one in baselines(kind, problem, plan.seed).items() if name != ORACLE}
-    if plan.hold_r and filter_class(kind).has_covariance:
+    if plan.hold_r and filter_type(kind).has_covariance:
         held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
         found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
     if plan.where:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.likelihood import Likelihood
-from filters.registry import filter_class
+from filters.registry import filter_type
 from thruster_env.numerics.streams import WAY_OF_TUNING, derived_generator
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
@@ -134,7 +134,7 @@ class Task:
     @cached_property
     def searched(self) -> list[Parameter]:
         """What a search without gradients tunes: the same and the filter's own numbers, but no ensemble size."""
-        if not filter_class(self.filter).has_covariance:
+        if not filter_type(self.filter).has_covariance:
             return [one for one in parameters(self.filter, self.problems[0]) if not one.integer]
         found = parameters(self.filter, self.problems[0], **self.options)
         return [within_first_range(one) for one in found if not one.integer]

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Callable
 from typing import NamedTuple
 
-from filters.registry import filter_class, tunable_numbers
+from filters.registry import filter_type
 from thruster_env.numerics.extras import to_install
 from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
@@ -42,9 +42,9 @@ class Way(NamedTuple):
             raise ValueError(f"filter must be one that has something to tune, but got {task.filter!r}")
         if GRADIENT in self.needs:
             check_gradient(task.filter, f"a filter for way {name!r}")
-        if COVARIANCE in self.needs and not filter_class(task.filter).has_covariance:
+        if COVARIANCE in self.needs and not filter_type(task.filter).has_covariance:
             raise ValueError(f"way {name!r} needs a filter with a covariance, but got {task.filter!r}")
-        if INFLATION in self.needs and INFLATION not in tunable_numbers(task.filter):
+        if INFLATION in self.needs and INFLATION not in filter_type(task.filter).numbers:
             raise ValueError(f"way {name!r} tunes the inflation of an ensemble, but {task.filter!r} has none")
         if TRUTH in self.needs and not task.has_truth:
             pairs = zip(task.problems, task.data, strict=True)
