@@ -32,7 +32,7 @@ def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from filters.learned.threads import one_thread
+    from thruster_env.numerics.torch_threads import one_thread
     from thruster_env.training.environments import make_environments
 
     numbers = dict(setup.hyperparameters)

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
-from filters.learned.threads import one_thread
 from thruster_env.numerics.checks import at_least, one_of
+from thruster_env.numerics.torch_threads import one_thread
 from thruster_env.plants.state_space import StateSpaceModel
 
 MOST = 10_000  # members, or hidden states

@@ -46,7 +46,12 @@ TUNING_OF_PLANTS = {
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
 PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
-OF_TENSORS = "filters/tensors/", "filters/learned/", "tuning/learning/"  # networks in models and estimators
+OF_TENSORS = (  # networks in models and estimators
+    "filters/tensors/",
+    "filters/learned/",
+    "tuning/learning/",
+    "thruster_env/numerics/torch_threads.py",
+)
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.distributions import Distribution
 
-from filters.learned.threads import one_thread
+from thruster_env.numerics.torch_threads import one_thread
 from thruster_env.numerics.wait_policy import PASSIVE, waiting
 from thruster_env.training.rollouts import epoch_minibatches
 from thruster_env.training.tanh import numpys_tanh

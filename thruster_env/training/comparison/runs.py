@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.learned.threads import one_thread
 from thruster_env.numerics.files import write_whole
 from thruster_env.numerics.modules import safe_paths
 from thruster_env.numerics.threads import cores
+from thruster_env.numerics.torch_threads import one_thread
 from thruster_env.training.classical import classical_policy
 from thruster_env.training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from thruster_env.training.environments import make_environments
