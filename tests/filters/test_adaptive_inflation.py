@@ -205,6 +205,7 @@ def test_compiled_code_and_python_are_one():
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_compiled_code_and_python_are_one_with_a_factor_for_each_state():
     filter_ = make_filter("etkf", plane_model(), ensemble_size=9, adaptive_inflation=0.2, inflation_by_state=1)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)

@@ -127,6 +127,7 @@ def covariances_in_theory(model, lags):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_when_it_has_settled_its_errors_fall_with_the_lag_as_in_theory():
     model, lags, steps, settled = moving_target(), 12, 400, 100
     theory = covariances_in_theory(model, lags)

@@ -167,6 +167,7 @@ def test_the_gru_begins_with_the_mean_of_the_states_and_follows_its_equations(da
     np.testing.assert_allclose(untrained.run(KEYS, inputs, z).mean, np.broadcast_to([4.0, 5.0], (3, STEPS + 1, 2)))
 
 
+@pytest.mark.slow
 def test_untrained_the_ensemble_is_the_enkf(data):
     inputs, z = data
     model = plane_model()

@@ -13,6 +13,7 @@ from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
 from tests.models import pendulum, simulated
+from tests.slow import slow_but
 from thruster_env.numerics.compiled import interpreted
 
 MODELS = [moving(0.01), moving(4.0)]
@@ -198,7 +199,7 @@ def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covar
     assert found[1][0] - found[0][0] == pytest.approx(second - first, rel=1e-8)
 
 
-@pytest.mark.parametrize("given", [None, {"a": (0.0, 1.0)}])
+@pytest.mark.parametrize("given", slow_but([None, {"a": (0.0, 1.0)}], [None]))
 def test_later_measurements_help_modes_of_unequal_sizes(given):
     whole = point("pva", 0.1)
     filter_ = make_filter("imm", whole, modes=[point("pv", 1e-3), whole], mode_filter="kf", stay=0.9, absent=given)

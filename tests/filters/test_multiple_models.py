@@ -150,6 +150,7 @@ def switching(models, stay, steps, rng):
     return modes, states, inputs, seen
 
 
+@pytest.mark.slow
 def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
     whole = thruster_model()
     models = [whole, half_lost(whole)]

@@ -35,7 +35,7 @@ def published():
     [
         pytest.param(GaussianSumFilter, id="gsf"),
         pytest.param(partial(ParticleFilter, ensemble_size=1000), id="pf"),
-        pytest.param(partial(AuxiliaryParticleFilter, ensemble_size=1000), id="apf"),
+        pytest.param(partial(AuxiliaryParticleFilter, ensemble_size=1000), id="apf", marks=pytest.mark.slow),
     ],
 )
 def test_it_halves_the_extended_filter_s_error_of_the_flow(published, kind):

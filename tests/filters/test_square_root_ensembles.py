@@ -219,6 +219,7 @@ def test_with_small_noise_a_hundred_members_sit_on_the_bound(name):
     assert found.divergences == 0
 
 
+@pytest.mark.slow
 def test_with_the_published_noise_ensembles_beat_the_extended_filter_and_iterations_beat_both():
     scenario = find_scenario("published_noise")
     data, model = scenario.data(held_out_seeds(0, 64)), scenario.model(**scenario.true)

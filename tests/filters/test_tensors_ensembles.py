@@ -17,6 +17,7 @@ from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.filters.test_tensors import Drag, assert_same, one_thread  # noqa: F401 - a fixture
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
+from tests.slow import slow_but
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import episode_keys
 
@@ -86,7 +87,11 @@ def test_a_key_for_each_trajectory():
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize(
-    ("name", "make"), [(name, wide_pendulum) for name in ENSEMBLES] + [("etkf", wide_model), ("ensrf", wide_model)]
+    ("name", "make"),
+    slow_but(
+        [(name, wide_pendulum) for name in ENSEMBLES] + [("etkf", wide_model), ("ensrf", wide_model)],
+        [(name, wide_pendulum) for name in ("enkf", "etkf", "denkf")],
+    ),
 )
 def test_everything_that_is_a_tensor_has_derivatives(name, make):
     """By central differences, in units of each number, with the random numbers as they are."""

@@ -58,6 +58,7 @@ def test_functions_of_ours_are_wide_unless_marked(tmp_path, wrap, wide):
     assert (WIDE in text) is wide
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="there are no such vectors")
 def test_an_intel_processor_would_use_them(tmp_path):
     (tmp_path / "loop.py").write_text(LOOP)

@@ -131,6 +131,7 @@ def upright(axis):
     return max(np.nanmax(step) for step in steps if len(step) > 1 and np.isfinite(step).any())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
 def test_no_figure_has_a_line_from_one_end_to_the_other():
     log, one = recorded(math.pi), model(heading=math.pi)

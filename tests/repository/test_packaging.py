@@ -80,6 +80,7 @@ def packed(tmp_path_factory):
     return folder / "dist", files
 
 
+@pytest.mark.slow
 def test_a_source_distribution_holds_the_whole_repository(packed):
     dist, files = packed
     with tarfile.open(next(dist.glob("*.tar.gz"))) as archive:

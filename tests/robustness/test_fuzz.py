@@ -19,7 +19,7 @@ def test_every_room_has_attacks():
     assert {name.partition(".")[0] for name in attacks()} == set(ROOMS)
 
 
-@pytest.mark.parametrize("name", slow_but(QUICK, set(QUICK) - {"files.journals"}))  # which waits for locks
+@pytest.mark.parametrize("name", slow_but(QUICK, set(QUICK) - {"files.journals", "starts.starts_and_effects"}))
 def test_an_attack_of_a_moment_is_withstood(name):
     assert attacks()[name](np.random.default_rng(1), 0.2)
 

@@ -16,6 +16,7 @@ from tests.filters.test_filter_paths import assert_paths_agree
 from tests.models import KEY, line_model, scalar_model, simulated, small
 from tests.numerics.test_angles import data_of, makers, plain_run, rotated
 from tests.plants.test_logs import MODEL
+from tests.slow import slow_but
 from thruster_env.numerics.angles import difference
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.streams import filter_keys
@@ -87,7 +88,7 @@ def means_of(seed):
         return run(make_filter("enkf", model, ensemble_size=6), filter_keys([seed, 9]), inputs, measurements).means
 
 
-@pytest.mark.parametrize("way", ["fork", "spawn"])
+@pytest.mark.parametrize("way", slow_but(["fork", "spawn"], ["fork"]))
 def test_another_process_finds_the_same_numbers(way):
     if way not in multiprocessing.get_all_start_methods():
         pytest.skip(f"there is no {way} here")

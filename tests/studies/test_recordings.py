@@ -156,6 +156,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 
+@pytest.mark.slow
 def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):  # noqa: F811
     found = as_json("study", "recordings", "--data", folder)
     assert [row["run"] for row in found["ratios"]] == ["CLLookupStep", "Ramp", "mean"]

@@ -69,6 +69,7 @@ def test_kalman_filter_is_stationary_at_the_optimum(case):
     assert (error / expected < 0.005).all()
 
 
+@pytest.mark.slow
 def test_intervals_of_the_kalman_filter_cover_the_optimum(comparisons):
     covered = np.array([(c.kf.low <= c.optimum) & (c.optimum <= c.kf.high) for c in comparisons])
     assert covered.sum() >= 14  # of 16, two states in each row; one in twenty may miss

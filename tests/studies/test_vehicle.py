@@ -134,6 +134,7 @@ def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
     np.testing.assert_array_equal(run(own, keys, inputs, z).means, means)
 
 
+@pytest.mark.slow
 def test_filters_on_the_same_runs(as_python):
     ekf8, _, level, own = kalman()
     tasks = [Task("dynamic", "vehicle", [measured(), ekf8, level, own])]

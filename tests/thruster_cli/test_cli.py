@@ -153,6 +153,7 @@ def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["out"]  # the picture; nothing else
 
 
+@pytest.mark.slow
 def test_inspect_draws(thruster, as_json, tmp_path):
     done = thruster("inspect", "--voltage", 12, "--out", "new/tunnel.png")
     assert done.returncode == 0 and "new/tunnel.png" in done.stdout

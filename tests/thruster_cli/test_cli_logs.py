@@ -134,6 +134,7 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
     assert not (tmp_path / "est.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "pendulum_of_a_user.py").write_text(TWO_STATES)

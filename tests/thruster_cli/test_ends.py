@@ -11,6 +11,7 @@ import time
 import pytest
 
 import thruster_cli.app
+from tests.slow import slow_but
 from thruster_cli.main import main
 from thruster_env.numerics.characters import showable
 
@@ -57,11 +58,14 @@ def process(before, name, arguments="filters", **options):
 
 @pytest.mark.parametrize(
     ("module", "arguments"),
-    [
-        *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "numba")),
-        ("optuna.samplers", "tune --trials 1"),
-        ("thruster_cli.verify", "verify none.json"),
-    ],
+    slow_but(
+        [
+            *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "numba")),
+            ("optuna.samplers", "tune --trials 1"),
+            ("thruster_cli.verify", "verify none.json"),
+        ],
+        [("optuna.samplers", "tune --trials 1")],
+    ),
     ids=lambda name: name,
 )
 def test_ctrl_c_while_a_package_loads_is_one_line(module, arguments, tmp_path):
@@ -70,6 +74,7 @@ def test_ctrl_c_while_a_package_loads_is_one_line(module, arguments, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_code_is_compiled_is_one_line(tmp_path):
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cold")}
     done = process(AT_COMPILATION, "thruster", f"simulate --steps 3 --out {tmp_path}/run.csv", env=cold)

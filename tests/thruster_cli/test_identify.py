@@ -119,6 +119,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, 
     assert not list(tmp_path.glob("*.toml"))
 
 
+@pytest.mark.slow
 def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_path):  # noqa: F811
     (log,) = record(0, 1, 100)
     write_log("flat.csv", replace(log, inputs=np.full_like(log.inputs, 6.0)))

@@ -198,6 +198,7 @@ covariances = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, derandomize=True, database=None)
 @given(
     st.sampled_from(list(PRESETS)),

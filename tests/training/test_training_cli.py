@@ -81,6 +81,7 @@ def small_algorithm(name):
     return ALGORITHMS[name]._replace(hyperparameters={**ALGORITHMS[name].hyperparameters, **SMALL[name]})
 
 
+@pytest.mark.slow
 def test_a_filter_is_trained_beside_as_it_is_told(thruster, monkeypatch, tmp_path):
     monkeypatch.setattr(sys.modules["thruster_env.training.setup"], "find_algorithm", small_algorithm)
     study = ("tune", "--filter", "ekf", "--scenario", "nominal", "--trials", 4, "--out", "mine.json")

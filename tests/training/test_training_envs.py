@@ -12,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize, VecVideoRecorder
 
 import thruster_env  # noqa: F401 - registers the envs
+from tests.slow import slow_but
 from thruster_env.training.environments import make_environments, make_single
 from thruster_env.training.observations import OBSERVATION_SETS, STACKED
 from thruster_env.training.setup import in_scenario, make_configuration
@@ -124,7 +125,7 @@ def test_helpers_of_stable_baselines_take_the_envs():
     assert VecVideoRecorder  # needs a render mode, which single envs have
 
 
-@every_arm
+@pytest.mark.parametrize("observe", slow_but(OBSERVATION_SETS, ["raw", "ekf", "enkf"]))
 def test_native_envs_are_single_envs_over_several_episodes(observe):
     setup = setup_of(observe)
     ours, theirs = (make_environments(setup, SEEDS, native=which) for which in (True, False))

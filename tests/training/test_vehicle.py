@@ -93,6 +93,7 @@ def test_an_episode_that_ends_early_is_scored_to_its_end():
     assert parts["vertical"].steps.tolist() == steps.tolist() and isinstance(parts["vertical"], Part)
 
 
+@pytest.mark.slow
 def test_a_filter_goes_on_assuming_the_vehicle_of_training():
     setup = setup_of("path", "ekf")
     met = in_scenario(setup, find_problem("auv:current"))

@@ -62,6 +62,7 @@ def test_a_name_says_which_constants_are_states(text, plain, unknown):
     assert name_and_unknown(text) == (plain, unknown)
 
 
+@pytest.mark.slow
 def test_a_study_is_found_by_its_name_and_estimates_the_flow(study):
     """On `ambient` the filter does not know the flow: with it as a state the error is significantly lower."""
     assert find_given(NAME, (), "a study").digest == study.problem.digest

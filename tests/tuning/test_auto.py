@@ -168,6 +168,7 @@ def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
     assert all(trial.params[key] == best.params[key] for trial in heirs for key in ("Q11", "Q22", "R"))
 
 
+@pytest.mark.slow
 def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
     plan = Plan("enkf", (MISMATCH,), budget=1.0)
     result = studied(plan, 15)

@@ -8,6 +8,7 @@ import auv_env  # noqa: F401 - registers the envs
 import thruster_env  # noqa: F401 - as well
 from auv_env.manoeuvres import MANOEUVRES
 from filters import EstimateState, make_filter, run
+from tests.slow import slow_but
 from tests.tuned_files import write_untuned
 from thruster_env.numerics.streams import episode_keys
 from tuning.auv.find import find_scenario
@@ -25,7 +26,9 @@ def short(name, **changes):
     return find_scenario(name).replace(steps=60, first_scored_step=10, **changes)
 
 
-@pytest.mark.parametrize("name", ["auv:dvl_dropout", "auv:estimated_current", "auv:papers"])
+@pytest.mark.parametrize(
+    "name", slow_but(["auv:dvl_dropout", "auv:estimated_current", "auv:papers"], ["auv:papers"])
+)
 def test_data_are_those_of_the_env_with_the_same_seed(name):
     scenario = short(name)
     data = scenario.data([5])
@@ -65,7 +68,8 @@ def test_scales_are_those_of_the_code():
         np.testing.assert_allclose(found, find_scenario(name).scale, rtol=0.08)
 
 
-@pytest.mark.parametrize("name", ["auv:motion", pytest.param("auv:navigation", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["auv:motion", "auv:navigation"])
 def test_an_extended_filter_is_consistent_and_on_its_scale(name):
     scenario = find_scenario(name)
     found = evaluate(make_filter("ekf", scenario.model(**scenario.true)), scenario.data(range(24)), scenario.scale)

@@ -189,6 +189,7 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
     assert len(row["rmse_over_first"]) == 2 and row["microseconds_a_step"] > 0
 
 
+@pytest.mark.slow
 def test_the_command_takes_sizes_augmentation_and_scenario_files(thruster, tmp_path):
     (tmp_path / "my.toml").write_text('base = "ambient"\nsteps = 100\nscale = [1.0, 0.05]\n')
     options = ("--filter", "ekf", "--filter", "enkf", "--filter", "low-pass", "--ensemble-size", "enkf=12")

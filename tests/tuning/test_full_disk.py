@@ -61,6 +61,7 @@ def test_a_study_on_a_full_disk_keeps_what_is_finished_and_others_go_on(tmp_path
     assert finished_trials(resumed) == 3 and len(resumed.get_trials(states=(TrialState.COMPLETE,))) == 3
 
 
+@pytest.mark.slow
 def test_a_worker_says_in_a_line_that_the_disk_is_full(tmp_path, data):
     path = tmp_path / "j"
     study = open_study("s", PLAN, open_storage(str(path)))

@@ -91,8 +91,6 @@ LIGHT = {  # each of the others is compiled for a second or two
     ("affine", "score"),
     ("correlation and prior", "likelihood"),
     ("R held", "log-score"),
-    ("one more state", "log-score"),
-    ("several problems", "likelihood"),
 }
 
 

@@ -142,6 +142,7 @@ def _with(problem, model):
     return choice._replace(model={"process_noise_cov": (Q,), "measurement_noise_cov": R}).filter(problem)
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     problem = LogProblem(logs_of(1500, 1500), GUESS)
     plan = Plan("kf", (problem,), objectives=("likelihood",))

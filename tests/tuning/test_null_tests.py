@@ -66,6 +66,7 @@ def test_a_null_is_tested_as_the_normal_distribution_says():
     assert not found.null_tests["stiffness"].is_zero and found.null_tests["stiffness"].said == "< 0.001"
 
 
+@pytest.mark.slow
 def test_the_probability_of_a_true_null_is_uniform():
     free = [one for one in FREE if one.name in ("damping", "offset")]
     found = []

@@ -147,6 +147,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 5
 
 
+@pytest.mark.slow
 def test_a_baseline_has_no_covariance_to_speak_of():
     tuned(Plan("low-pass", (MISMATCH,)), 3)
     report = write_report("s.json", STORAGE)

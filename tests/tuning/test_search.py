@@ -8,6 +8,7 @@ import pytest
 from optuna.distributions import FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
+from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
@@ -120,6 +121,7 @@ def test_every_objective_falls(objective):
     assert result.best_value < result.trials[0].values[0]
 
 
+@pytest.mark.slow
 def test_two_objectives_give_a_front_that_no_trial_beats():
     plan = Plan("enkf", (NOMINAL,), objectives=("score", "cost"))
     result = studied(plan, 12)
@@ -162,7 +164,9 @@ def test_a_plan_that_cannot_work_is_refused(change, rule):
         open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
 
 
-@pytest.mark.parametrize(("name", "kind"), [("nominal", "ekf"), ("published_tunnel", "kf")])
+@pytest.mark.parametrize(
+    ("name", "kind"), slow_but([("nominal", "ekf"), ("published_tunnel", "kf")], [("nominal", "ekf")])
+)
 def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cent_of_the_true_q_and_r(name, kind):
     scenario = find_scenario(name)
     plan, true = Plan(kind, (scenario,)), oracle_choice(kind, scenario)

@@ -92,6 +92,7 @@ def test_a_second_run_compiles_nothing_and_computes_no_bound_anew(reactor, tmp_p
     assert reactor(*compare) == {"compiled": 0, "bounds": 0}
 
 
+@pytest.mark.slow
 def test_a_number_that_the_model_imports_changes_the_bound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "reactor.py").write_text(REACTOR)

@@ -129,6 +129,7 @@ def test_a_proxy_must_have_a_host():
         open_storage("grpc://:13000")
 
 
+@pytest.mark.slow
 def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
     pytest.importorskip("grpc")
     with socket.socket() as free:

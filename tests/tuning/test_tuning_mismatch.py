@@ -1,6 +1,7 @@
 """What tuning can buy where the model is wrong: the script of the table in docs/tuning.md, in a small form."""
 
 import numpy as np
+import pytest
 
 from pages.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
 from tuning.thruster.find import find_scenario
@@ -22,6 +23,7 @@ def test_the_factor_on_the_lift_is_that_of_the_parameters():
     assert len(SLOPES) == 8 and model.measurement_noise_cov[0, 0] == 0.3
 
 
+@pytest.mark.slow
 def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
     names = "`ekf`, Q and R", "`ekf` + lift and K2", RIGHT
     lines = bought(trials=1, rows=names, seeds=20).splitlines()[2:]

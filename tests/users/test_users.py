@@ -43,7 +43,7 @@ PAGES = (
 )
 SEEDS = range(2000, 2008)
 FEW = 20  # runs that decide a statistic
-QUICK = (altitude, pendulum, range_bearing)  # an affine one, one of an env, and one with an angle
+QUICK = (altitude, pendulum, lorenz63)  # an affine one, one of an env with an angle, and one of rates
 
 
 def named(page):
@@ -105,9 +105,7 @@ def test_who_knows_the_plant_is_consistent_and_better_than_its_user(page):
     assert best.nis.value / best.expected_nis == pytest.approx(1.0, abs=0.06)
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if hasattr(page, "rates")], ids=lambda page: page.__name__
-)
+@of_filters([page for page in PAGES if hasattr(page, "rates")])
 def test_a_step_is_the_integral_of_the_rates(page):
     model = getattr(page.problem, "truth", None) or page.problem.model()
     data, c = page.problem.data(range(2)), model.constants

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from filters import affine_model
+from tests.slow import slow_but
 from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
 from thruster_env.plants.simulate import simulate
 from thruster_env.studies.ways.problems import ring
@@ -45,7 +46,7 @@ def nile():
     return RunsProblem(runs, level(), held_out=[2, 3], name="the Nile")
 
 
-@pytest.mark.parametrize("way", ["likelihood", "em", "squarem", "scoring"])
+@pytest.mark.parametrize("way", slow_but(["likelihood", "em", "squarem", "scoring"], ["likelihood", "em"]))
 def test_the_nile_has_the_variances_that_durbin_and_koopman_print(way):
     task = task_of(nile(), 1)
     find_way(way).run(way, task)
@@ -166,6 +167,7 @@ def motivating(q=0.2, r=0.4):
     )
 
 
+@pytest.mark.slow
 def test_als_has_the_scatter_of_the_toolboxs_example():
     free = [Parameter("q", 1e-6, 1e3, default=0.2), Parameter("r", 1e-6, 1e3, default=0.4)]
     truth = motivating(0.5, 0.1)
@@ -269,6 +271,7 @@ def test_als_finds_full_matrices_of_long_runs():
     assert task.runs == 3 * 8
 
 
+@pytest.mark.slow
 def test_fisher_scoring_ends_where_l_bfgs_ends():
     problem = linear(runs=4, steps=80)
     tasks = {way: task_of(problem, 4, options={"full_q": True}) for way in ("scoring", "likelihood")}

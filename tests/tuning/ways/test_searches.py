@@ -51,6 +51,7 @@ def test_slopes_by_matrices_of_diagonals_are_those_of_coordinates():
         goal.of(SCORE).by_noise(task.start)
 
 
+@pytest.mark.slow
 def test_a_way_by_gradients_ends_where_the_gradient_method_ends():
     problem = find_scenario("mismatch")
     data = problem.data(range(8))
@@ -151,6 +152,7 @@ def test_masked_measurements_find_the_ratio_of_q_and_r():
     assert model["process_noise_cov"][0] / model["measurement_noise_cov"] == pytest.approx(0.25, rel=0.3)
 
 
+@pytest.mark.slow
 def test_two_sample_times_find_the_q_and_r_of_a_level_where_one_leaves_a_curve_of_zeros():
     problem = linear(a=np.eye(1), c=np.eye(1), q=[[1.0]], r=[[4.0]], p0=np.eye(1), steps=400, runs=32)
     box, ratios = {"where": ("Q11 = 0.05..20", "R = 0.2..80")}, {"c-nis": [], "c-nis-two-rates": []}

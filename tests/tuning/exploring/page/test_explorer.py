@@ -69,6 +69,7 @@ def test_the_browser_is_led_to_the_page_by_a_file_that_others_cannot_read(tmp_pa
     assert "url=http://127.0.0.1:1/token&amp;x/" in page.read_text()
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_address_and_opens_no_token_on_a_command_line(monkeypatch, capsys, as_python):
     opened, served = [], []
     monkeypatch.setattr(command.webbrowser, "open", opened.append)

@@ -117,18 +117,18 @@ def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
     assert not tab.session.pictures.states[1].figure.visible
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0, "many", None, [1.0]], ids=str)
-def test_what_is_no_value_is_said_and_nothing_changes(tab, bench, value):
+def test_what_is_no_value_is_said_and_nothing_changes(tab, bench):
     tab.ask("hello")
     before = dict(tab.session.values)
-    told = tab.ask("view", values={bench.knobs[0].name: value})
-    assert told["error"] and told["answers"] == 2 and tab.session.values == before
-    assert "error" not in tab.ask("view", values={})
+    for value in (math.nan, math.inf, -1.0, "many", None, [1.0]):
+        told = tab.ask("view", values={bench.knobs[0].name: value})
+        assert told["error"] and told["answers"] == tab.number and tab.session.values == before
+        assert "error" not in tab.ask("view", values={})
 
 
-@pytest.mark.parametrize(
-    "question",
-    [
+def test_a_wrong_question_is_answered_and_the_tab_lives_on(tab):
+    tab.ask("hello")
+    for question in (
         {"do": "__class__"},
         {"do": "nothing"},
         {"do": "filter", "filter": "no"},
@@ -141,15 +141,12 @@ def test_what_is_no_value_is_said_and_nothing_changes(tab, bench, value):
         {"do": "plotted", "states": ["a"], "run": 0, "errors": False},
         {"do": "view", "values": {"os": 1}},
         {},
-    ],
-    ids=str,
-)
-def test_a_wrong_question_is_answered_and_the_tab_lives_on(tab, question):
-    tab.ask("hello")
-    tab.session.wire.asked = json.dumps({"number": 2, **question})
-    told = tab.told()
-    assert told["answers"] == 2 and ("error" in told or question["do"] == "drop")
-    assert "figures" in tab.ask("view", values={})
+    ):
+        tab.number += 1
+        tab.session.wire.asked = json.dumps({"number": tab.number, **question})
+        told = tab.told()
+        assert told["answers"] == tab.number and ("error" in told or question["do"] == "drop"), question
+        assert "figures" in tab.ask("view", values={})
 
 
 def test_text_that_is_no_question_is_answered(tab):
