@@ -13,6 +13,7 @@ import pytest
 from optuna.trial import TrialState
 
 from tuning.search.plan import Plan
+from tuning.search.processes import orders_of
 from tuning.search.storage import open_storage
 from tuning.search.study import finished_trials, open_study, run_trials
 from tuning.thruster.find import find_scenario
@@ -65,9 +66,8 @@ def test_a_study_on_a_full_disk_keeps_what_is_finished_and_others_go_on(tmp_path
 def test_a_worker_says_in_a_line_that_the_disk_is_full(tmp_path, data):
     path = tmp_path / "j"
     study = open_study("s", PLAN, open_storage(str(path)))
-    plan = PLAN._replace(scenarios=["mismatch"])._asdict()
-    orders = {"study": "s", "storage": str(path), "trials": 3, "workers": 1, "worker": 0, "place": 5, "plan": plan}
-    orders["digests"] = [scenario.digest for scenario in PLAN.scenarios]
+    orders = {"study": "s", "storage": str(path), "trials": 3, "workers": 1, "worker": 0, "place": 5}
+    orders |= orders_of(PLAN)
     with room_for(path.stat().st_size + 10):
         done = subprocess.run(
             [sys.executable, "-m", "tuning.search.workers"],

@@ -1,5 +1,6 @@
 """Recorded runs as a problem: blocks, what is held out, what counts, and truth where logs have it."""
 
+import json
 import pickle
 from pathlib import Path
 
@@ -28,9 +29,9 @@ from tuning.problems.log_problem import LogProblem
 from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.filter_parameters import size_ladder
 from tuning.search.plan import Plan
+from tuning.search.processes import orders_of, plan_of
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.workers import _packed, _unpacked
 
 Q, R = 0.04, 0.25
 MODEL = affine_model(
@@ -118,7 +119,8 @@ def test_a_problem_of_logs_is_one_whose_digest_is_of_its_content():
     one, same = (checked_problem(LogProblem(logs_of(300), GUESS)) for _ in range(2))
     assert one.scale is None and one.true is None and one.digest == same.digest
     assert pickle.loads(pickle.dumps(one)).digest == one.digest
-    assert _unpacked(_packed(one)).digest == one.digest  # as workers get it
+    orders = json.loads(json.dumps(orders_of(Plan("ekf", (one,)))))  # as workers get it
+    assert plan_of(orders).scenarios[0].digest == one.digest
     others = LogProblem(logs_of(300, offset=0.1), GUESS), LogProblem(logs_of(300), GUESS, blocks=8)
     assert len({one.digest, *(other.digest for other in others)}) == 3
 

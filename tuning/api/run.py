@@ -24,6 +24,7 @@ from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
+from tuning.search.compiling import compile_filters
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.quiet import quiet_optuna
@@ -129,6 +130,8 @@ def run_tuning(
         if already:
             console.print(f"study {name!r} continues after {already} finished trials")
         with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
+            if way is None and workers == 1 and not already and len(plan.filter_types) > 1:
+                compile_filters(plan, plan.filter_types[:trials], lambda name: show_kinds([f"compiling {name}"]))
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)

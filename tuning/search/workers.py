@@ -1,40 +1,29 @@
 """Several processes on one host that run trials of one study.
 
-Each runs `tuning.search.workers` in its own session, so that Ctrl-C reaches only the parent. It reads its task as
-a line of JSON from its standard input, and ends after its running trial when that is closed: by its parent, or
-because its parent has ended.
+Each runs `tuning.search.workers`. When it is asked to end (`tuning.search.processes`), it does so after its trial.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 import os
-import pickle
-import select
 import subprocess
 import sys
 import time
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import Any
 
 import optuna
 
-from thruster_env.numerics.modules import as_module, working_folder_last
 from thruster_env.numerics.threads import cores
-from tuning.problems.augmented import within
 from tuning.problems.data import Data
-from tuning.problems.find import find_same
-from tuning.problems.log_problem import LogProblem
-from tuning.problems.problem import Problem
-from tuning.search.interruption import stop_on_interrupt, without_interrupts
+from tuning.search.interruption import stop_on_interrupt
 from tuning.search.plan import Plan
+from tuning.search.processes import close_input, end, orders_of, parent_says_stop, plan_of, read_orders, start
 from tuning.search.storage import open_storage, retry_orphans, this_process
 from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
 
+MODULE = "tuning.search.workers"
 POLL_SECONDS = 0.2
 
 
@@ -62,66 +51,28 @@ def run_in_workers(
         storage: journal file or URL, as for `open_storage`.
         workers: number of processes.
     """
-    names = [scenario.name for scenario in plan.scenarios]
-    orders: dict[str, Any] = {
+    orders = {
         "study": study.study_name,
         "storage": storage,
         "trials": trials,
         "workers": workers,
+        **orders_of(plan),
     }
-    orders["plan"] = {**plan._asdict(), "scenarios": names}
-    orders["digests"] = [scenario.digest for scenario in plan.scenarios]
-    orders["logs"] = {one.name: _packed(one) for one in plan.scenarios if isinstance(within(one), LogProblem)}
     # Indices that no other host has, so that no two workers propose the same trials.
     first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
     try:
         with stop_on_interrupt() as interrupted:
             for worker in range(workers):
-                processes[worker] = _start({**orders, "worker": worker, "place": first + worker})
+                processes[worker] = start(MODULE, {**orders, "worker": worker, "place": first + worker})
             _watch(study, processes, on_trial, interrupted)
         return interrupted() or run_trials(study, plan, data, trials, on_trial)
     except KeyboardInterrupt:
         return True
     finally:
         for process in processes.values():
-            process.kill()
-            process.wait()
-            _close_input(process)
+            end(process)
         retry_orphans(study)
-
-
-def _packed(problem: Problem) -> str:
-    """A problem of logs as text, since it cannot be found by a name. Only the parent of a worker sends it."""
-    try:
-        return base64.b64encode(pickle.dumps(problem)).decode()
-    except Exception as error:  # functions within functions, say
-        raise ValueError(
-            f"several workers need logs whose model can be pickled, but that of {problem.name} cannot: {error}"
-        ) from None
-
-
-def _unpacked(text: str) -> Problem:
-    with working_folder_last():  # where the model's module may lie
-        return pickle.loads(base64.b64decode(text))
-
-
-def _start(orders: dict) -> subprocess.Popen:
-    with without_interrupts():
-        command = as_module("tuning.search.workers")
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdin is not None  # a pipe
-    with suppress(BrokenPipeError):  # it has died already, which its exit code shows
-        process.stdin.write(json.dumps(orders) + "\n")
-        process.stdin.flush()
-    return process
-
-
-def _close_input(process: subprocess.Popen) -> None:
-    """Close a worker's standard input, which asks it to end."""
-    if process.stdin is not None:
-        with suppress(BrokenPipeError):
-            process.stdin.close()
 
 
 def _watch(
@@ -132,7 +83,7 @@ def _watch(
         time.sleep(POLL_SECONDS)
         if interrupted():
             for process in living.values():
-                _close_input(process)
+                close_input(process)
         for worker, process in list(living.items()):
             if process.poll() is not None:
                 del living[worker]
@@ -163,24 +114,15 @@ def take_share(workers: int) -> None:
 
 def main() -> None:
     """Run the trials that standard input describes, until the study is finished or standard input is closed."""
-    orders = json.loads(sys.stdin.readline())
+    orders = read_orders()
     take_share(orders["workers"])
     quiet_optuna()
-    given = orders["plan"]
     try:
-        logs = {name: _unpacked(text) for name, text in orders.get("logs", {}).items()}
-        pairs = zip(given["scenarios"], orders["digests"], strict=True)
-        scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
-        several = {name: tuple(given[name]) for name in ("objectives", "where")}
-        plan = Plan(**{**given, **several, "scenarios": scenarios})
+        plan = plan_of(orders)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
-        run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
+        run_trials(study, plan, plan.training_data(), orders["trials"], stop=parent_says_stop)
     except (ValueError, OSError) as error:
         sys.exit(f"thruster: worker {orders['worker']}: {error}")
-
-
-def _parent_says_stop() -> bool:
-    return bool(select.select([sys.stdin], [], [], 0)[0])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,91 @@
+"""The machine code of a study's filter types, compiled on several cores before its first trial.
+
+Each type takes a second or more on its first use, on one core. If that turns out to be so, other processes compile
+the last of the types meanwhile, into the cache that all processes of a user share.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from filters.engine.batch import run
+from thruster_env.numerics.threads import cores
+from tuning.problems.data import Data
+from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.processes import end, orders_of, parent_says_stop, plan_of, read_orders, start
+from tuning.search.space import untuned_choice
+
+MODULE = "tuning.search.compiling"
+MOST_HELPERS = 3  # each takes some 300 MB
+COMPILED = 0.4  # seconds above which a filter was compiled and not read from the cache
+
+
+def compile_filters(
+    plan: Plan, names: Sequence[str], on_filter: Callable[[str], None] = lambda name: None
+) -> None:
+    """Compile what trials of some filter types run, or read it from the cache; what fails is left to the trials.
+
+    Args:
+        plan: of a study.
+        names: of its filter types.
+        on_filter: called with each name before that type is compiled.
+    """
+    data = [_a_step(plan, place) for place in range(len(plan.scenarios))]
+    helpers: list[subprocess.Popen] = []
+    try:
+        for place, name in enumerate(names):
+            on_filter(name)
+            started = time.perf_counter()
+            _compile(plan, name, data)
+            if not helpers and time.perf_counter() - started > COMPILED:
+                helpers = _helpers(plan, names[place + 1 :])
+    finally:
+        for process in helpers:
+            end(process)
+
+
+def _a_step(plan: Plan, place: int) -> Data:
+    """As many runs as a trial has, one step long and all the same, since drawing different ones may take long."""
+    problem = plan.scenarios[place]
+    seeds = problem.training_seeds(plan.seed, TRAINING_SEEDS)
+    one = problem.data(seeds[:1]).seen
+    parts = one.filter_keys, one.inputs[:, :1], one.measurements[:, :2]
+    keys, inputs, measurements = (np.repeat(part, len(seeds), axis=0) for part in parts)
+    return Data(tuple(seeds), inputs, measurements, keys)
+
+
+def _compile(plan: Plan, name: str, data: Sequence[Data]) -> None:
+    for problem, one in zip(plan.scenarios, data, strict=True):
+        with suppress(ValueError):
+            filter_ = untuned_choice(name, problem).filter(problem)
+            run(filter_, one.filter_keys, one.inputs, one.measurements)
+
+
+def _helpers(plan: Plan, names: Sequence[str]) -> list[subprocess.Popen]:
+    """Processes that compile filter types from the last one on, while this one goes on with the first."""
+    count = min(MOST_HELPERS, cores() - 1, len(names) // 2)
+    with suppress(ValueError):  # a model that cannot be sent
+        orders = orders_of(plan)
+        shares = [[*reversed(names)][place::count] for place in range(count)]
+        return [start(MODULE, {**orders, "names": share}, stderr=subprocess.DEVNULL) for share in shares]
+    return []
+
+
+def main() -> None:
+    """Compile the filter types that standard input names, until all are or it is closed; no error matters."""
+    orders = read_orders()
+    plan = plan_of(orders)
+    data = [_a_step(plan, place) for place in range(len(plan.scenarios))]
+    for name in orders["names"]:
+        if parent_says_stop():
+            break
+        _compile(plan, name, data)
+
+
+if __name__ == "__main__":
+    main()
