@@ -1,6 +1,7 @@
 """The gradient of the likelihood of a model whose matrices are arrays, with channels that are missing."""
 
 import numpy as np
+import pytest
 
 from auv_env.model import auv_model
 from filters.likelihood import likelihood
@@ -9,6 +10,7 @@ from thruster_env.numerics.compiled import interpreted
 PLACES = (0, 4, 6)  # of Q; with them one of R
 
 
+@pytest.mark.slow
 def test_the_gradient_on_eight_states_is_that_of_central_differences():
     model, rng = auv_model(states="motion"), np.random.default_rng(1)
     n, m, steps = model.n, model.m, 4

@@ -114,13 +114,17 @@ def test_where_the_model_s_error_is_steady_the_deviation_shrinks_and_the_factor_
     assert seen[0.1][1] < 0.75 * seen[0.0][1]
 
 
-def test_compiled_code_and_python_are_one_and_wrong_numbers_are_refused():
+@pytest.mark.slow
+def test_compiled_code_and_python_are_one():
     filter_ = make_filter("etkf", plane_model(), **OWN, inflation_by_state=1)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
     with interpreted():
         expected = run(filter_, None, inputs, z)
     for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_wrong_numbers_are_refused():
     with pytest.raises(ValueError, match="least_deviation must be at most adaptive_inflation, 0.3, but got 0.4"):
         make_filter("etkf", plane_model(), adaptive_inflation=0.3, least_deviation=0.4)
     with pytest.raises(ValueError, match="least_deviation must be zero or positive, but got -1"):

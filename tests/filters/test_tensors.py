@@ -19,6 +19,7 @@ from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, wide_model
+from tests.slow import slow_but
 from thruster_cli.templates.filter import Template
 from thruster_env.numerics.compiled import interpreted
 
@@ -56,7 +57,7 @@ def assert_same(found, expected, accuracy=1e-10):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize(("name", "which"), EACH_MODEL)
+@pytest.mark.parametrize(("name", "which"), slow_but(EACH_MODEL, {one for one in EACH_MODEL if one[1] != "large"}))
 def test_estimates_are_those_of_run(name, which):
     model = MODELS[which]()
     if name.startswith("kf") and MODELS[which] is wide_pendulum:

@@ -11,15 +11,16 @@ from tests.fuzz.__main__ import ROOMS, attacks
 from tests.models import TUNED
 from tests.slow import slow_but
 
-SLOW = ("processes.", "checkpoints.")  # which start processes; tests of their own show what they attack
-QUICK = [name for name in attacks() if not name.startswith(SLOW)]
+OF_PROCESSES = "processes.", "checkpoints."  # tests of their own show what these attack
+ATTACKS = [name for name in attacks() if not name.startswith(OF_PROCESSES)]
+SLOW = {"files.journals", "starts.starts_and_effects", "commands.command_lines"}  # wait, compile, start processes
 
 
 def test_every_room_has_attacks():
     assert {name.partition(".")[0] for name in attacks()} == set(ROOMS)
 
 
-@pytest.mark.parametrize("name", slow_but(QUICK, set(QUICK) - {"files.journals", "starts.starts_and_effects"}))
+@pytest.mark.parametrize("name", slow_but(ATTACKS, set(ATTACKS) - SLOW))
 def test_an_attack_of_a_moment_is_withstood(name):
     assert attacks()[name](np.random.default_rng(1), 0.2)
 

@@ -37,6 +37,7 @@ def test_targets_turn_and_are_seen_in_range_and_bearing():
     np.testing.assert_array_equal(drawn(5, seed=1)[4].states, drawn(5, seed=1)[4].states)
 
 
+@pytest.mark.slow
 @with_okf
 def test_our_filter_is_the_packages():
     from okf import OKF as OptimizedFilter

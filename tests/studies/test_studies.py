@@ -1,6 +1,4 @@
 import json
-import os
-import subprocess
 import sys
 
 import numpy as np
@@ -10,6 +8,7 @@ from scipy.linalg import solve_discrete_are
 from filters import KalmanFilter, run
 from tests.oracles import kalman_update
 from thruster_cli.main import main
+from thruster_env.numerics.text_tables import console
 from thruster_env.plants.simulate import simulate
 from thruster_env.studies import STUDIES
 from thruster_env.studies.comparison import compare, compare_all, discrete_model, optimum
@@ -78,6 +77,7 @@ def test_intervals_of_the_kalman_filter_cover_the_optimum(comparisons):
         assert (c.kf.low < c.kf.rmse).all() and (c.kf.rmse < c.kf.high).all()
 
 
+@pytest.mark.slow
 def test_ensemble_filter_ties_with_the_kalman_filter(comparisons):
     for c in comparisons:
         assert (np.abs(c.enkf_over_kf - 1) < 0.03).all()
@@ -218,21 +218,17 @@ def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("width", [100, pytest.param(160, marks=pytest.mark.slow)])
-def test_tables_fit_the_terminal(tmp_path, width):
+def test_tables_fit_the_terminal(monkeypatch, capsys, tmp_path, width):
     target = tmp_path / "table.json"
-    arguments = ["reproduce", "nurhadi2022", "--runs", "4", "--members", "5", "--json", str(target)]
-    done = subprocess.run(
-        [sys.executable, "-m", "thruster_cli.main", *arguments],
-        env={**os.environ, "COLUMNS": str(width)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    monkeypatch.setattr(console, "_width", width)
+    arguments = ["nurhadi2022", "--runs", "4", "--members", "5", "--json", str(target)]
+    assert command_line(monkeypatch, *arguments) == 0
+    out = capsys.readouterr().out
     assert json.loads(target.read_text())["studies"].keys() == {"nurhadi2022"}
-    assert max(map(len, done.stdout.splitlines())) <= width
-    assert "…" not in done.stdout
+    assert width - 40 < max(map(len, out.splitlines())) <= width
+    assert "…" not in out
     for words in ("0.8051", "1.8830", "a copy of the row q = 0.5", "Riccati", "un-updated", "known to us"):
-        assert words in " ".join(done.stdout.split())
+        assert words in " ".join(out.split())
 
 
 @pytest.mark.parametrize(

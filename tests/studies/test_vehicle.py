@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, affine_model, run
+from tests.slow import slow_but
 from tests.studies.test_studies import command_line
 from thruster_cli import output
 from thruster_env.studies import VEHICLE_STUDIES, ngatini2017, ngatini2019
@@ -202,7 +203,7 @@ def quick(monkeypatch, as_python):
     monkeypatch.setattr(estimators, "FuzzyKalmanFilter", lambda **given: fuzzy(premises=(0,), **given))
 
 
-@pytest.mark.parametrize("paper", VEHICLE_STUDIES)
+@pytest.mark.parametrize("paper", slow_but(VEHICLE_STUDIES, [*VEHICLE_STUDIES][1:]))
 def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, tmp_path, paper):
     monkeypatch.setattr(output.console, "width", 100)
     table, picture = tmp_path / "table.json", tmp_path / "paths.png"

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 OURS = ("numerics", "plants", "training", "studies")
 OLD = """
 import warnings
@@ -39,6 +41,7 @@ def test_old_names_are_the_same_modules_with_a_warning(tmp_path):
     assert run(OLD, tmp_path).stderr == ""
 
 
+@pytest.mark.slow
 def test_files_of_a_user_with_such_names_hide_nothing(tmp_path):
     for name in OURS:
         (tmp_path / f"{name}.py").write_text("mine = True\n")

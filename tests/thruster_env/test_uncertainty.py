@@ -72,7 +72,8 @@ def test_what_is_uncertain_does_not_move_noise_nor_reference():
 
 @pytest.mark.parametrize("flow", [None, [{"name": "sinusoid", "amplitude": 0.5}]], ids=["still", "flow"])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_an_episode_moves_by_its_own_parameters(preset, flow):
+def test_an_episode_moves_by_its_own_parameters(preset, flow, monkeypatch):
+    monkeypatch.setattr("thruster_env.plant.required_substeps", lambda *_: 12)  # half a second for all extremes
     env = gym.make("BowThruster-v0", preset=preset, uncertainty=SOME, flow=flow, ambient_velocity=0.1, **EXACT)
     seen = set()
     for seed in (4, None, None):

@@ -121,6 +121,7 @@ def test_a_digest_is_the_same_in_all_processes_run_or_imported(tmp_path):
     assert len(found) == 1
 
 
+@pytest.mark.slow
 def test_a_digest_is_another_if_any_part_of_the_code_is(tmp_path):
     changed = {"constant": "3.5", "static": "-x", "kept": "2.0", "gain": "1.6", "step": "0.2", "scaled": "5.0"}
     assert changed.keys() == PARTS.keys() - {"extra"}

@@ -112,6 +112,7 @@ def test_a_copy_of_a_study_does_not_write_what_waits_for_the_first(path):
     assert copied.trials == study.trials
 
 
+@pytest.mark.slow
 def test_a_study_in_a_database_can_be_copied(tmp_path):
     study = optuna.create_study(storage=open_storage(f"sqlite:///{tmp_path}/studies.db"))
     study.add_trial(optuna.trial.create_trial(value=1.0))

@@ -118,6 +118,7 @@ def test_runs_are_left_out_one_by_one_also_of_the_worst_problem(name):
         np.testing.assert_allclose(left_out, np.maximum(part.left_out[0], other.value), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_where_the_model_is_wrong_the_log_score_earns_a_covariance_and_costs_error():
     quiet_optuna()
     found = pair("mismatch", seed=1, trials=16)

@@ -164,7 +164,9 @@ def test_policies_act_on_what_the_env_shows():
     assert np.abs(inputs).max() <= 2.0 and inputs.std() > 1.0 and not np.array_equal(*inputs)
 
 
-@pytest.mark.parametrize("make", [MAKERS["two sensors"], pair], ids=["two sensors", "pair"])
+@pytest.mark.parametrize(
+    "make", [pytest.param(MAKERS["two sensors"], marks=pytest.mark.slow), pair], ids=["two sensors", "pair"]
+)
 def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
     monkeypatch.setattr(held_out, "scaled_default", lambda *_: Scaled(None, None, None, "not here"))
     problem = make(name="mine")

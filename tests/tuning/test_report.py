@@ -270,6 +270,7 @@ def test_a_mistake_is_one_clear_line(arguments, line, folder, monkeypatch, capsy
     assert {path.name for path in folder.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_wrote(monkeypatch, capsys):
     tuned(Plan("ekf", (MISMATCH,)), 2)
     monkeypatch.setattr(

@@ -59,6 +59,7 @@ def test_the_command_as_a_module_runs_no_file_beside_the_data_either(folder):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_our_main_programs_and_processes_that_are_spawned_do_not_look_there_first(folder):
     done = started(folder, *as_module("tuning.search.workers"))
     assert "JSONDecodeError" in done.stderr, "it is the worker, which was told nothing"
