@@ -13,7 +13,7 @@ from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS, dead_band_of
 from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 from thruster_env.linear.analysis import LinearModel
-from thruster_env.linear.steady_state import required_substeps, steady_state
+from thruster_env.linear.steady_state import required_substeps_of_all, steady_state
 from thruster_env.numerics.checks import (
     at_least,
     between,
@@ -139,7 +139,8 @@ def make_plant(
     swing = sum(signal.largest() for signal in flow)
     flows = {ambient_velocity - swing, ambient_velocity + swing}  # between which the integration has to do
     if substeps is None:
-        substeps = max(required_substeps(corner, dt, max_voltage, u_0) for corner in corners for u_0 in flows)
+        cases = tuple((corner, u_0) for corner in corners for u_0 in flows)
+        substeps = required_substeps_of_all(cases, dt, max_voltage)
     else:
         substeps = at_least("substeps", substeps, 1, 10_000)
     return Plant(

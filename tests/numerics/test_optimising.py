@@ -45,14 +45,18 @@ def emissions(monkeypatch):
     return found
 
 
-@pytest.fixture
-def outermost(tmp_path):
-    """A function that no cache has seen."""
+def unseen(tmp_path, value, **names):
+    """A compiled function outermost(x) that no cache has seen, which returns a value."""
     path = tmp_path / "outermost.py"
-    path.write_text("def outermost(values):\n    return checked_total(values) + total(values[1:])\n")
-    names = {"__name__": __name__, "checked_total": checked_total, "total": total}
+    path.write_text(f"def outermost(x):\n    return {value}\n")
+    names |= {"__name__": __name__}
     exec(compile(path.read_text(), str(path), "exec"), names)
     return compiled(names["outermost"])
+
+
+@pytest.fixture
+def outermost(tmp_path):
+    return unseen(tmp_path, "checked_total(x) + total(x[1:])", checked_total=checked_total, total=total)
 
 
 def test_machine_code_is_made_once_and_garbage_seldom_collected(outermost, emissions):
@@ -90,8 +94,8 @@ def ice(x):  # part of the name of what it calls, which is inlined all the same
     return twice(x) + 1.0
 
 
-def test_a_function_that_is_kept_apart_contains_what_it_calls():
-    outermost = compiled(lambda x: ice(x) + ice(x + 1.0))
+def test_a_function_that_is_kept_apart_contains_what_it_calls(tmp_path):
+    outermost = unseen(tmp_path, "ice(x) + ice(x + 1.0)", ice=ice)
     assert outermost(1.0) == 8.0
     calls = calls_in(outermost)
     assert any("3ice" in name for name in calls) and not any("5twice" in name for name in calls)

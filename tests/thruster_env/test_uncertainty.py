@@ -10,10 +10,23 @@ from scipy.integrate import solve_ivp
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.dynamics import Constants, rates, thrust_and_torque
-from thruster_env.effects.uncertainty import UNCERTAIN, LogNormal, Uniform, drawn_parameters, extreme_parameters
+from thruster_env.effects.uncertainty import (
+    UNCERTAIN,
+    LogNormal,
+    Uniform,
+    drawn_parameters,
+    extreme_parameters,
+    make_uncertainty,
+)
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import CONSTANT_ROWS
-from thruster_env.linear.steady_state import run_substeps, state_range, steady_state
+from thruster_env.linear.steady_state import (
+    required_substeps,
+    required_substeps_of_all,
+    run_substeps,
+    state_range,
+    steady_state,
+)
 from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.plant import make_plant
@@ -72,8 +85,7 @@ def test_what_is_uncertain_does_not_move_noise_nor_reference():
 
 @pytest.mark.parametrize("flow", [None, [{"name": "sinusoid", "amplitude": 0.5}]], ids=["still", "flow"])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_an_episode_moves_by_its_own_parameters(preset, flow, monkeypatch):
-    monkeypatch.setattr("thruster_env.plant.required_substeps", lambda *_: 12)  # half a second for all extremes
+def test_an_episode_moves_by_its_own_parameters(preset, flow):
     env = gym.make("BowThruster-v0", preset=preset, uncertainty=SOME, flow=flow, ambient_velocity=0.1, **EXACT)
     seen = set()
     for seed in (4, None, None):
@@ -91,6 +103,13 @@ def test_an_episode_moves_by_its_own_parameters(preset, flow, monkeypatch):
             assert info["thrust"] == pytest.approx(thrust, rel=1e-10, abs=1e-12)
             x = info["state"]
     assert len(seen) == 3 and PRESETS[preset] not in seen
+
+
+def test_substeps_suffice_for_every_extreme():
+    corners = extreme_parameters(PRESETS["open_bladed_corrected"], make_uncertainty(SOME))
+    cases = [(p, u_0) for p in corners for u_0 in (0.0, 0.5)]
+    each = [required_substeps(p, 0.02, 24.0, u_0) for p, u_0 in cases]
+    assert min(each) < max(each) == required_substeps_of_all(tuple(cases), 0.02, 24.0)
 
 
 def test_the_constants_in_memory_are_those_of_the_drawn_parameters():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,7 +101,6 @@ def run_substeps(x: tuple, u: tuple, p: ThrusterParameters, dt: float, substeps:
     return x
 
 
-@lru_cache(maxsize=64)
 def required_substeps(p: ThrusterParameters, dt: float, max_voltage: float, ambient_velocity: float = 0.0) -> int:
     """Fewest Runge-Kutta steps a sample time that hold the one-step accuracy over the whole voltage range.
 
@@ -110,17 +109,38 @@ def required_substeps(p: ThrusterParameters, dt: float, max_voltage: float, ambi
 
     Raises ValueError if 256 substeps do not suffice: dt is then far too long for the plant.
     """
-    ahead, astern = steady_state(p, max_voltage), steady_state(p, -max_voltage)
-    limit = ONE_STEP_ACCURACY * state_range(p, max_voltage)
+    return required_substeps_of_all(((p, ambient_velocity),), dt, max_voltage)
+
+
+@lru_cache(maxsize=64)
+def required_substeps_of_all(
+    cases: tuple[tuple[ThrusterParameters, float], ...], dt: float, max_voltage: float
+) -> int:
+    """`required_substeps` that suffice for several thrusters, each with a flow U_0 [m/s], computed at once."""
+    limits = np.stack([ONE_STEP_ACCURACY * state_range(p, max_voltage) for p, _ in cases], axis=1)
+    ends = [(steady_state(p, max_voltage), steady_state(p, -max_voltage)) for p, _ in cases]
+    fastest = np.array([max(ahead.omega_m, -astern.omega_m) for ahead, astern in ends])
+    fastest_flow = np.array([max(ahead.U_a, -astern.U_a) for ahead, astern in ends])
     grid = np.linspace(-1.0, 1.0, 5)
     omega, flow, voltage = (g.ravel() for g in np.meshgrid(grid, grid, grid, indexing="ij"))
-    fastest = max(ahead.omega_m, -astern.omega_m)
-    fastest_flow = max(ahead.U_a, -astern.U_a) + abs(ambient_velocity)
-    x, u = (omega * fastest, flow * fastest_flow), (voltage * max_voltage, ambient_velocity)
+    ambient = np.array([u_0 for _, u_0 in cases])[:, None]
+    p = _stacked([p for p, _ in cases])
+    x = omega * fastest[:, None], flow * (fastest_flow[:, None] + np.abs(ambient))
+    u, needed = (voltage * max_voltage, ambient), np.zeros(len(cases), dtype=int)
     with np.errstate(all="ignore"):
         exact = np.array(run_substeps(x, u, p, dt, 512))
         for count in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256):
-            error = np.abs(np.array(run_substeps(x, u, p, dt, count)) - exact).max(axis=1)
-            if (error <= limit).all():
-                return count
+            error = np.abs(np.array(run_substeps(x, u, p, dt, count)) - exact).max(axis=2)
+            needed[(needed == 0) & (error <= limits).all(axis=0)] = count
+            if needed.all():
+                return int(needed.max())
     raise ValueError(f"dt must be short enough for 256 Runge-Kutta steps to follow the plant, but got {dt!r}")
+
+
+def _stacked(several: list[ThrusterParameters]) -> ThrusterParameters:
+    """Parameters (C, 1) of several thrusters of one convention of angles; a number where all have the same."""
+    columns = {name: [getattr(p, name) for p in several] for name in ThrusterParameters._fields}
+    differing: dict[str, Any] = {
+        name: np.array(values)[:, None] for name, values in columns.items() if len(set(values)) > 1
+    }
+    return several[0]._replace(**differing)
