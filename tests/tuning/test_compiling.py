@@ -80,6 +80,9 @@ def test_it_runs_as_many_runs_as_a_trial_one_step_long(monkeypatch):
     runs = [(np.zeros((12, 1)), rng.normal(size=(13, 1))) for _ in range(5)]
     recorded = RunsProblem(runs, LinearProblem(n=1, m=1).model(), held_out=[3, 4])
     monkeypatch.setattr(compiling, "run", lambda filter_, *data: seen.append([*map(np.shape, data)]))
+    compile_filters(PLAN, NAMES)
+    assert not seen  # where nothing is compiled
+    monkeypatch.setattr(compiling, "is_interpreting", lambda: False)
     compile_filters(Plan("kf", (TUNNEL, recorded)), ["kf"])
     inputs = TUNNEL.data([0]).inputs.shape[-1]
     assert seen == [[(count, 2), (count, 1, p), (count, 2, 1)] for count, p in ((TRAINING_SEEDS, inputs), (3, 1))]

@@ -14,6 +14,7 @@ from contextlib import suppress
 import numpy as np
 
 from filters.engine.batch import run
+from thruster_env.numerics.compiled import is_interpreting
 from thruster_env.numerics.threads import cores
 from tuning.problems.data import Data
 from tuning.search.plan import TRAINING_SEEDS, Plan
@@ -35,6 +36,8 @@ def compile_filters(
         names: of its filter types.
         on_filter: called with each name before that type is compiled.
     """
+    if is_interpreting():
+        return
     data = [_a_step(plan, place) for place in range(len(plan.scenarios))]
     helpers: list[subprocess.Popen] = []
     try:
