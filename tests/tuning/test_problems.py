@@ -21,7 +21,6 @@ from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import BinarySequence, MultiSine
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.problem import scored_states
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters, parameters_of, untuned_choice
 
@@ -46,7 +45,6 @@ def test_a_problem_says_what_a_study_has_to_know(make):
     assert data.inputs.shape == (3, 60, model.inputs) and data.measurements.shape == (3, 61, model.m)
     assert data.states.shape == (3, 61, n) and data.filter_keys.shape == (3, 2) and not data.states.flags.writeable
     assert problem.quantities == model.quantities and problem.bound(data.slice(0, 1)).shape == (n,)
-    assert set(scored_states(problem)) <= {state.symbol for state in model.states}
     for given in (problem.untuned, problem.true or {}, {"prior_cov_factor": 4.0}):
         assert problem.model(**given).quantities == model.quantities
     np.testing.assert_allclose(problem.model(prior_cov_factor=4.0).prior_cov, 4.0 * model.prior_cov)

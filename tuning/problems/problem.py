@@ -174,11 +174,3 @@ def score_label(problems: Sequence[Problem]) -> str:
     """What axes call the score of some problems: over the bound where that is the scale of them all."""
     bounds = all(problem.scale_about in (BOUND, PATH_BOUND) for problem in problems)
     return f"score: mean RMSE over {'bound' if bounds else 'scale'} [-]"
-
-
-def scored_states(problem: Problem) -> tuple[str, ...]:
-    """Symbols of the states that count in the score; none without truth."""
-    if problem.scale is None:
-        return ()
-    states = problem.quantities.states[: len(problem.scale)]
-    return tuple(state.symbol for state, scale in zip(states, problem.scale, strict=True) if np.isfinite(scale))

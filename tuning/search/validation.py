@@ -66,11 +66,6 @@ class Validation(NamedTuple):
         """The best trial over the best baseline: ratio of errors, or difference of negative log-likelihoods."""
         return self.named(self.candidate).over
 
-    @property
-    def paid(self) -> bool:
-        """Whether a mean NIS within its band cost so much that the best proper score was taken instead."""
-        return self.price is not None and self.price > MOST_PRICE
-
 
 def is_validated(plan: Plan) -> bool:
     """Whether the runs of a plan's objective can be compared with those of baselines, filter by filter."""
