@@ -23,15 +23,18 @@ PLAN = Plan("auto", (TUNNEL,), budget=1.0)
 @pytest.fixture
 def beside(monkeypatch):
     """Three cores on which each filter seems to take a while, and the helpers that would be started, and ended."""
-    started, ended = [], []
+    found = SimpleNamespace(started=[], options=[], ended=[])
+
+    def started(module, orders, **options):
+        found.started.append(json.dumps(orders))
+        found.options.append(options)
+
     monkeypatch.setattr(compiling, "COMPILED", -1.0)
     monkeypatch.setattr(compiling, "cores", lambda: 3)
-    monkeypatch.setattr(
-        compiling, "start", lambda module, orders, **_: started.append(json.dumps(orders)) or orders
-    )
-    monkeypatch.setattr(compiling, "end", ended.append)
+    monkeypatch.setattr(compiling, "start", started)
+    monkeypatch.setattr(compiling, "end", found.ended.append)
     monkeypatch.setattr(compiling, "_compile", lambda *_: None)
-    return SimpleNamespace(started=started, ended=ended)
+    return found
 
 
 def test_helpers_begin_with_the_last_types_and_are_ended(beside):
@@ -42,6 +45,9 @@ def test_helpers_begin_with_the_last_types_and_are_ended(beside):
     assert [one["names"] for one in orders] == [["enkf", "ukf"], ["ckf", "kf"]]
     assert plan_of(orders[0]).identity == PLAN.identity
     assert len(beside.ended) == 2
+    assert all(
+        set(one.values()) == {subprocess.DEVNULL} and len(one) == 2 for one in beside.options
+    )  # --json - may be beside
 
 
 def test_helpers_are_ended_when_somebody_interrupts(beside):

@@ -23,6 +23,7 @@ from tuning.search.space import untuned_choice
 
 MODULE = "tuning.search.compiling"
 MOST_HELPERS = 3  # each takes some 300 MB
+SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}  # the parent prints what there is to print
 COMPILED = 0.4  # seconds above which a filter was compiled and not read from the cache
 
 
@@ -38,28 +39,30 @@ def compile_filters(
     """
     if is_interpreting():
         return
-    data = [_a_step(plan, place) for place in range(len(plan.scenarios))]
-    helpers: list[subprocess.Popen] = []
+    data = _steps(plan)
+    helpers: list[subprocess.Popen] | None = None
     try:
         for place, name in enumerate(names):
             on_filter(name)
             started = time.perf_counter()
             _compile(plan, name, data)
-            if not helpers and time.perf_counter() - started > COMPILED:
+            if helpers is None and time.perf_counter() - started > COMPILED:
                 helpers = _helpers(plan, names[place + 1 :])
     finally:
-        for process in helpers:
+        for process in helpers or ():
             end(process)
 
 
-def _a_step(plan: Plan, place: int) -> Data:
-    """As many runs as a trial has, one step long and all the same, since drawing different ones may take long."""
-    problem = plan.scenarios[place]
-    seeds = problem.training_seeds(plan.seed, TRAINING_SEEDS)
-    one = problem.data(seeds[:1]).seen
-    parts = one.filter_keys, one.inputs[:, :1], one.measurements[:, :2]
-    keys, inputs, measurements = (np.repeat(part, len(seeds), axis=0) for part in parts)
-    return Data(tuple(seeds), inputs, measurements, keys)
+def _steps(plan: Plan) -> list[Data]:
+    """As many runs of each problem as a trial has, of one step and all the same: different ones may take long."""
+    found = []
+    for problem in plan.scenarios:
+        seeds = problem.training_seeds(plan.seed, TRAINING_SEEDS)
+        one = problem.data(seeds[:1]).seen
+        parts = one.filter_keys, one.inputs[:, :1], one.measurements[:, :2]
+        keys, inputs, measurements = (np.repeat(part, len(seeds), axis=0) for part in parts)
+        found.append(Data(tuple(seeds), inputs, measurements, keys))
+    return found
 
 
 def _compile(plan: Plan, name: str, data: Sequence[Data]) -> None:
@@ -75,7 +78,7 @@ def _helpers(plan: Plan, names: Sequence[str]) -> list[subprocess.Popen]:
     with suppress(ValueError):  # a model that cannot be sent
         orders = orders_of(plan)
         shares = [[*reversed(names)][place::count] for place in range(count)]
-        return [start(MODULE, {**orders, "names": share}, stderr=subprocess.DEVNULL) for share in shares]
+        return [start(MODULE, {**orders, "names": share}, **SILENT) for share in shares]
     return []
 
 
@@ -83,7 +86,7 @@ def main() -> None:
     """Compile the filter types that standard input names, until all are or it is closed; no error matters."""
     orders = read_orders()
     plan = plan_of(orders)
-    data = [_a_step(plan, place) for place in range(len(plan.scenarios))]
+    data = _steps(plan)
     for name in orders["names"]:
         if parent_says_stop():
             break
