@@ -15,8 +15,7 @@ from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian import extended
 from filters.gaussian.mixture import blender, part_update
-from filters.pages.kernels import nothing_to_summarise, page_kernels
-from filters.particles.weighted import anything_measured
+from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.numerics.checks import at_least
 from thruster_env.numerics.compiled import inlined
 from thruster_env.plants.shape import Functions, Shape

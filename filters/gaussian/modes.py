@@ -12,8 +12,7 @@ from filters.engine.layout import memory_places, own_place, row_access
 from filters.engine.restart import restart_if_lost
 from filters.gaussian.absent import Absent, Parts, completer
 from filters.gaussian.mixture import blender
-from filters.pages.kernels import nothing_to_summarise
-from filters.particles.weighted import anything_measured
+from filters.pages.kernels import anything_measured, nothing_to_summarise
 from thruster_env.numerics.compiled import inlined
 from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Shape

@@ -10,8 +10,7 @@ from filters.engine.layout import memory_places, own_place
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.limits import limits
 from filters.horizon.window import kept_places, scratch_places, window_works
-from filters.pages.kernels import nothing_to_summarise, page_kernels
-from filters.particles.weighted import anything_measured
+from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.numerics.compiled import inlined, not_inlined
 from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Functions, Shape

@@ -93,3 +93,12 @@ def prior_start(shape: Shape) -> Callable:
 @inlined
 def nothing_to_summarise(memory, size):
     """Mean and covariance are the belief itself."""
+
+
+@inlined
+def anything_measured(z):
+    """Whether a channel of z is present."""
+    for i in range(z.shape[0]):
+        if z[i] == z[i]:
+            return True
+    return False

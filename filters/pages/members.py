@@ -78,7 +78,7 @@ class Works(NamedTuple):
 
     work: Callable
     rows: int  # of the table that it uses
-    draws: bool  # whether it uses draws
+    draws: int  # rows of draws that it uses
 
 
 @lru_cache(maxsize=64)
@@ -133,13 +133,18 @@ def of_members(stage: Stage, first: int) -> Works:
     """
     program = as_programs(stage, 0, MOST).values
     work = callable_of(program, LANES, OF_MEMBERS, first)
-    return Works(work, cut(program, first).rows, any(place.array == "draws" for place, _ in program.reads))
+    return Works(
+        work,
+        cut(program, first).rows,
+        max((place.at + 1 for place, _ in program.reads if place.array == "draws"), default=0),
+    )
 
 
 def _as_calls(stage: Stage, model: Equations, readers: dict, first: int) -> Works:
     work = as_calls(stage, 0, model.called, readers, OF_MEMBERS).values
-    given = [one.operation for one in in_order(list(stage.values.values())) if not one.of]
-    return Works(work, first, any(isinstance(place, Place) and place.array == "draws" for place in given))
+    given = [one for one in in_order(list(stage.values.values())) if isinstance(one.operation, Place)]
+    draws = (one.operation.at + prod(one.shape) for one in given if one.operation.array == "draws")
+    return Works(work, first, max(draws, default=0))
 
 
 def analysis_of(page: Page, functions: Functions, shape: Shape) -> Callable:

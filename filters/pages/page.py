@@ -33,6 +33,9 @@ class Page(NamedTuple):
     start: Callable | None = None
     own: tuple[tuple[str, tuple[int, ...]], ...] = ()  # parameters and their shapes
     fixed: tuple[tuple[str, Any], ...] = ()  # values that stand in programs, such as how often a loop runs
+    renew: Callable | None = None  # of particles that were resampled
+    foresee: Callable | None = None  # of particles that are resampled in the update, before that
+    of_each: tuple[str, ...] = ()  # what is kept of each particle
 
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
         """What pages find in `model.own`: `read(place, shape)` of each parameter, and fixed values."""

@@ -27,11 +27,13 @@ class FilterWithPage(Filter):
         unrolled: fields that are whole numbers and say how often something is repeated; each value has a program
             of its own. Other fields are numbers that programs read.
         ranges: of fields that studies may tune, the smallest and the largest value.
+        resampled: whether it has particles that are resampled, which is done here alone.
     """
 
     page: ClassVar[Page]
     unrolled: ClassVar[tuple[str, ...]] = ()
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    resampled: ClassVar[bool] = False
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -83,9 +85,10 @@ class PageFilter(FilterWithPage):
 
 
 def with_page(filter_: Filter, what: str) -> FilterWithPage:
-    """A filter that has a page; of another one, and of a model with bounds, raise ValueError."""
-    if not isinstance(filter_, FilterWithPage):
-        raise ValueError(f"{what} must have a page, as 'ekf' and 'enkf' have, but got {filter_.name!r}")
+    """A filter whose page has no resampling; of another one, and of a model with bounds, raise ValueError."""
+    if not isinstance(filter_, FilterWithPage) or filter_.resampled:
+        rule = f"{what} must have a page without resampling, as 'ekf' and 'enkf' have"
+        raise ValueError(f"{rule}, but got {filter_.name!r}")
     if filter_.model.bounds:
         raise ValueError(f"{what} must have a model without bounds, but got {filter_.model.bounds}")
     return filter_

@@ -52,7 +52,9 @@ def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool) -> tup
     return memory, Equations(functions, memory, constants_move=False, trace=trace)
 
 
-def stored(results: tuple, targets: Sequence[Matrix | int], kept: Mapping[str, Matrix] | None = None) -> Stage:
+def stored(
+    results: tuple, targets: Sequence[Matrix | Place | int], kept: Mapping[str, Matrix] | None = None
+) -> Stage:
     """The stage that leaves results of a page where some matrices lie, or at places.
 
     Args:

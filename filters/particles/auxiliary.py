@@ -2,125 +2,45 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import ClassVar
 
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places
-from filters.particles.motion import add_noise, clear_noise, ensemble_motion
-from filters.particles.regularisation import kernel_spreader
-from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
-from filters.particles.weights import (
-    normalise,
-    read_weights,
-    systematic_resampler,
-    weighted_covariances,
-    weighted_means,
-    weighted_squares,
-)
-from thruster_env.numerics import matrices
-from thruster_env.numerics.angles import kept
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, uniform_block
-from thruster_env.numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
-from thruster_env.plants.layout import constants_reader, number_places
-from thruster_env.plants.shape import Functions, Shape
+from filters.ensembles.ensemble import advance
+from filters.pages.page_filter import Page
+from filters.particles import weighted
+from filters.particles.weighted import WeightedFilter, expect, fit, spread
+from thruster_env.numerics.algebra.blocks import zeros
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.members import on_branch
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.samples import weighted_square, weights
 
 
-@lru_cache(maxsize=64)
-def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> Kernels:
-    """Kernels of the auxiliary particle filter for a model's functions and shape.
+def start(model, w):
+    """A particle of the prior, without noise."""
+    return weighted.start(model, w), {"noise": zeros(model.Q, len(w))}
 
-    If it is regularised, the parents that it draws are spread, by the first of its own parameters.
 
-    The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
-    """
-    n, m, observe = shape.n, shape.m, functions.observe
-    places, source = memory_places(n, m), number_places(n, m)
-    logarithms, noise, weights = n, n + 1, 2 * n + 1
-    scratch, q_root_place = weights + 1, source.q_root
-    step_place, key_0, key_1, likelihood_place = places.step, places.key_0, places.key_1, places.log_likelihood
-    motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
-    draw_prior, move = motion.start, motion.predict
-    set_equal, expect, normal, distance, level, weigh, summarise = parts
-    constants, state = constants_reader(shape), column_reader(n)
-    predicted, store_effect, effects = (
-        column_reader(m, scratch),
-        column_writer(m, scratch),
-        weighted_squares(scratch, m, weights),
-    )
-    far = scratch + 2 * m
-    foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
-    add_scaled, add = kept(scaled_sum(m), "x, a, y", shape.measurement_angles), matrices.symmetric_sum(m)
-    read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
-    means, covariances, spread = (
-        weighted_means(0, n, weights),
-        weighted_covariances(0, n, weights),
-        kernel_spreader(shape, places.extras + 1),
-    )
+def settle(model, x, w):
+    """The end of a step, of which the noise is kept."""
+    noise = model.Q_root @ w
+    return on_branch(x + noise, model.state_angles), {"noise": noise}
 
-    @inlined
-    def start(memory, numbers, size):
-        draw_prior(memory, numbers, size)
-        set_equal(memory, size)
-        clear_noise(memory[1], noise, n)
 
-    @inlined
-    def predict(memory, u, numbers, size):
-        _, table, draws = memory
-        move(memory, u, numbers, size)
-        clear_noise(table, noise, n)
-        add_noise(table, noise, n, draws, numbers, q_root_place)  # of the very draws that moved the particles
+def foresee(model, x, log_w, z):
+    """A particle without its noise, log N(z; h(mu), R + V), and innovation and S of all with noise."""
+    seen, mu = present(z), x - model.kept["noise"]
+    y, v, S = expect(model, x, log_w, z)
+    without = only(seen, model.h(mu))
+    V = weighted_square(wrap(y - without, model.measurement_angles), weights(log_w))
+    rest = only(seen, wrap(z - without, model.measurement_angles))
+    return mu, log_density(rest, V + uncorrelated(seen, model.R), seen), v, S
 
-    @inlined
-    def update(memory, z, numbers, size):
-        row, table, _ = memory
-        expect(memory, z, numbers, size)
-        row[likelihood_place] = 0.0
-        if anything_measured(z):
-            c = constants(numbers)
-            # The particles without their noise, what would be measured of them, and what the noise adds to that.
-            for i in range(n):
-                for j in range(table.shape[1]):
-                    table[i, j] -= table[noise + i, j]
-            for j in range(table.shape[1]):
-                y = observe(state(table, j), c)
-                store_foreseen(table, j, y)
-                store_effect(table, j, add_scaled(predicted(table, j), -1.0, y))
-            read_weights(table, logarithms, weights, size)
-            foresight = normal(z, add(effects(table, size), read_r(numbers)))
-            for j in range(table.shape[1]):
-                table[far, j] = distance(foreseen(table, j), foresight)
-            for j in range(table.shape[1]):
-                table[logarithms, j] -= table[far, j]
-            first_stage, _ = normalise(table, logarithms, weights, size)
-            lost = math.nan if first_stage != first_stage else 0.0  # nothing to choose by
-            for j in range(table.shape[1]):
-                table[logarithms, j] = table[far, j] + lost
-            place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
-            if regularised:
-                cov = covariances(table, size, means(table, size))
-                choose(table, size, place)
-                spread(memory, cov, numbers, size)
-            else:
-                choose(table, size, place)
-            # The chosen ones with the noise of the place that they went to.
-            for i in range(n):
-                for j in range(table.shape[1]):
-                    table[i, j] += table[noise + i, j]
-            sensor = normal(z, read_r(numbers))
-            for j in range(table.shape[1]):
-                table[logarithms, j] -= distance(observe(state(table, j), c), sensor)
-            row[likelihood_place] = first_stage + weigh(memory, size) - math.log(size) + level(sensor)
-            clear_noise(table, noise, n)
-        else:
-            summarise(memory, size)
 
-    rows = scratch + max(2 * m + 1, n + 3)
-    root = n * n if regularised else 0
-    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1 + n, scratch=root)
+def update(model, x, log_w, z, e):
+    """The measurement z: particles that were chosen, with the noise of the places to which they went."""
+    x = x + model.kept["noise"]
+    return x, log_w + fit(model, only(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,8 +74,6 @@ class AuxiliaryParticleFilter(WeightedFilter):
     """
 
     name: ClassVar[str] = "apf"
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        model = self.kernel_model
-        return auxiliary_kernels(model.functions, model.shape, self.regularisation > 0.0)
+    page: ClassVar[Page] = Page(
+        advance, settle, update, None, start, renew=spread, foresee=foresee, of_each=("noise",)
+    )

@@ -2,156 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from filters.baselines.baselines import places_of
 from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place, row_access
-from filters.particles.motion import add_noise, clear_noise, drawer, ensemble_motion
-from filters.particles.proposal import proposal_works
-from filters.particles.regularisation import constants_spreader, cov_spreader, kernel_spreader
-from filters.particles.weighted import ResampledFilter, anything_measured, particle_parts
-from filters.particles.weights import read_weights, systematic_resampler
+from filters.ensembles.ensemble import advance, settle
+from filters.pages.page_filter import Page
+from filters.particles.kernels import particle_kernels
+from filters.particles.proposal import OPTIMAL
+from filters.particles.weighted import ResampledFilter, expect, fit, spread, start
+from thruster_env.numerics.algebra import members
+from thruster_env.numerics.algebra.points import outer, root
+from thruster_env.numerics.algebra.scalars import entries_product
 from thruster_env.numerics.checks import one_of
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PROPOSAL, uniform_block
-from thruster_env.numerics.tuples import column_reader, matrix_reader
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
 
-class Kind(NamedTuple):
-    """What a particle filter does that needs code of its own."""
-
-    regularised: bool = False
-    gaussian: bool = False  # it draws particles of a Gaussian, where others resample
-    optimal: bool = False  # its proposal
-    smoothed: tuple[int, ...] = ()  # states that the kernel spreads alone
+def update(model, x, log_w, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    y, v, S = expect(model, x, log_w, z)
+    return x, log_w + fit(model, y, z), v, S
 
 
-@lru_cache(maxsize=64)
-def particle_kernels(functions: Functions, shape: Shape, kind: Kind) -> Kernels:
-    """Kernels of a particle filter for a model's functions and shape.
+def draw(model, x, mean, P, e):
+    """Particles of a Gaussian, in the place of others."""
+    return mean + root(P) @ e
 
-    The table's rows: n of particles, one of log weights, n of noise if the proposal is optimal, one of weights,
-    scratch. Behind the ESS the row then has the Q of that noise: a later update may meet another one.
-    """
-    n, m, observe = shape.n, shape.m, functions.observe
-    kept = n + 1 + kind.optimal * n
-    places, noise, weights = memory_places(n, m), n + 1, kept
-    scratch, logarithms, regularised = weights + 1, n, kind.regularised
-    size_place, step_place, key_0, key_1 = places.extras, places.step, places.key_0, places.key_1
-    likelihood_place, threshold_place = places.log_likelihood, own_place(shape) + 1
-    motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
-    draw_prior, move = motion.start, motion.predict
-    set_equal, expect, normal, distance, level, weigh, summarise = parts
-    resample = systematic_resampler(n, weights, scratch)
-    read_r, predicted = matrix_reader(m, m, number_places(n, m).r), column_reader(m, scratch)
-    (read_mean, read_cov), root = row_access(shape)[0], size_place + 1 + kind.optimal * n * n
-    spread = constants_spreader(shape, kind.smoothed, root) if kind.smoothed else kernel_spreader(shape, root)
-    spread_by = cov_spreader(shape, root)
 
-    @inlined
-    def start(memory, numbers, size):
-        draw_prior(memory, numbers, size)
-        set_equal(memory, size)
-
-    @inlined
-    def choose(memory, numbers, size):
-        row, table, _ = memory
-        read_weights(table, logarithms, weights, size)
-        place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
-        resample(table, size, place)
-        if regularised:
-            spread(memory, read_cov(row), numbers, size)  # no particle moved since that was their covariance
-
-    @inlined
-    def draw_gaussian(memory, numbers, size):
-        row, table, _ = memory
-        mean = read_mean(row)
-        for i in range(n):
-            for j in range(table.shape[1]):
-                table[i, j] = mean[i]
-        spread_by(memory, read_cov(row), 1.0)
-
-    renew = draw_gaussian if kind.gaussian else choose
-
-    @inlined
-    def predict(memory, u, numbers, size):
-        row, table, _ = memory
-        if row[size_place] < numbers[threshold_place] * size:
-            renew(memory, numbers, size)
-            set_equal(memory, size)
-        move(memory, u, numbers, size)
-
-    @inlined
-    def update(memory, z, numbers, size):
-        row, table, _ = memory
-        expect(memory, z, numbers, size)
-        row[likelihood_place] = 0.0
-        if anything_measured(z):
-            sensor = normal(z, read_r(numbers))
-            for j in range(table.shape[1]):
-                table[logarithms, j] -= distance(predicted(table, j), sensor)
-            row[likelihood_place] = weigh(memory, size) + level(sensor)
-        else:
-            summarise(memory, size)
-
-    of_root = n * n if regularised or kind.gaussian else 0
-    rows = scratch + max(m, n + 2)
-    if not kind.optimal:
-        return Kernels(n, m, rows, n, start, predict, update, summarise, 1, kept - n, of_root)
-
-    noise_cov, log_weight, source = size_place + 1, scratch + m, number_places(n, m)
-    works, rows_of_works, length = proposal_works(functions, shape, noise, log_weight, noise_cov)
-    condition, draw, q_place, q_root_place = works["update"], drawer(n, m), source.q, source.q_root
-
-    @inlined
-    def forget_noise(memory):
-        row, table, _ = memory
-        for i in range(n * n):
-            row[noise_cov + i] = 0.0
-        clear_noise(table, noise, n)
-
-    @inlined
-    def start_without_noise(memory, numbers, size):
-        start(memory, numbers, size)
-        forget_noise(memory)
-
-    @inlined
-    def predict_with_noise(memory, u, numbers, size):
-        row, table, draws = memory
-        predict(memory, u, numbers, size)
-        forget_noise(memory)
-        add_noise(table, noise, n, draws, numbers, q_root_place)  # of the very draws that moved the particles
-        for i in range(n * n):
-            row[noise_cov + i] = numbers[q_place + i]
-
-    @inlined
-    def propose(memory, z, numbers, size):
-        row, table, draws = memory
-        expect(memory, z, numbers, size)
-        row[likelihood_place] = 0.0
-        if anything_measured(z):
-            draw(draws, m * table.shape[1], row, FILTER_PROPOSAL)
-            condition(row, z, numbers, table, draws, size)
-            for j in range(table.shape[1]):
-                table[logarithms, j] += table[log_weight, j]
-            row[likelihood_place] = weigh(memory, size)
-            forget_noise(memory)
-        else:
-            summarise(memory, size)
-
-    return Kernels(
-        *(n, m, max(rows, rows_of_works), max(n, m), start_without_noise, predict_with_noise, propose, summarise),
-        extras=1 + n * n,
-        extra_kept_rows=kept - n,
-        scratch=of_root + length,
-    )
+def smooth(model, x, mean, P, e):
+    """The states that are `smoothed` drawn together by a, and spread so that their covariance stays."""
+    own = model.own
+    L = root(entries_product(P, outer(own.smoothed, own.smoothed)))
+    return x - entries_product(own.smoothed, x - members.mean(x)) * own.drawn + L @ e * own.width
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,6 +98,7 @@ class ParticleFilter(ResampledFilter):
     """
 
     name: ClassVar[str] = "pf"
+    page: ClassVar[Page] = Page(advance, settle, update, start=start, renew=spread)
     proposal: str = "prior"
     resampling: str = "systematic"
     smoothed: Any = ()
@@ -226,8 +112,32 @@ class ParticleFilter(ResampledFilter):
         if self.regularisation and self.resampling == "gaussian":
             raise ValueError("a filter that draws from a Gaussian must have no regularisation, but got one")
 
+    @property
+    def spread_states(self) -> int:
+        """How many states the kernel spreads."""
+        return len(self.smoothed) or self.model.n
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """What the page and resampling read; of smoothed states b, and 1 - a."""
+        given = super().parameters
+        if not self.smoothed:
+            return given
+        width = min(given["width"], 1.0)
+        flags = [float(i in self.smoothed) for i in range(self.model.n)]
+        return {**given, "width": width, "drawn": 1.0 - (1.0 - width**2) ** 0.5, "smoothed": flags}
+
+    @property
+    def written_page(self) -> Page:
+        """The page of the choices."""
+        page = super().written_page
+        if self.proposal == "optimal":
+            page = OPTIMAL._replace(renew=page.renew, own=page.own)
+        if self.resampling == "gaussian":
+            return page._replace(renew=draw)
+        return page._replace(renew=smooth) if self.smoothed and self.regularisation else page
+
     def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        model, gaussian = self.kernel_model, self.resampling == "gaussian"
-        kind = Kind(self.regularisation > 0.0, gaussian, self.proposal == "optimal", self.smoothed)
-        return particle_kernels(model.functions, model.shape, kind)
+        """Kernels of the page for the model's functions; see `Filter.kernels`."""
+        model, resample = self.kernel_model, self.resampling == "systematic"
+        return particle_kernels(self.written_page, model.functions, model.shape, resample)

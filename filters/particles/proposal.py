@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
-
-from filters.pages.equations import Equations
-from filters.pages.programs import stored
-from filters.pages.stages import Stage
-from filters.particles.each import EachMemory, Works, works_of_each
+from filters.ensembles.ensemble import advance
+from filters.pages.page import Page
+from filters.particles import auxiliary
+from filters.particles.weighted import expect
+from thruster_env.numerics.algebra.blocks import zeros
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, only, present, sym, uncorrelated, wrap
-from thruster_env.plants.shape import Functions, Shape
+
+
+def start(model, w):
+    """A particle of the prior, without noise."""
+    x, kept = auxiliary.start(model, w)
+    return x, {"noise_cov": sym(zeros(model.Q, len(w), len(w))), **kept}
+
+
+def settle(model, x, w):
+    """The end of a step, of which the noise and its Q are kept: a later update may meet another Q."""
+    x, kept = auxiliary.settle(model, x, w)
+    return x, {"noise_cov": model.Q, **kept}
 
 
 def propose(model, x, d, Q, z, e):
@@ -29,16 +39,17 @@ def propose(model, x, d, Q, z, e):
     return x, d, log_density(v, S, seen) + log_density(rest, R, seen) - log_density(v - H @ d, R, seen)
 
 
-def stages_of(noise: int, level: int, memory: EachMemory, model: Equations) -> dict[str, Stage]:
-    """The update, of noise in rows from `noise` on; the logarithms go into the row `level`."""
-    n = memory.shape.n
-    d, Q = memory.of_each(noise, n), memory.of_all(n, n, symmetric=True)
-    x, new, logarithm = propose(model, memory.x, d, Q, memory.z, memory.e)
-    return {"update": Stage({**stored((x, new), (memory.x, d)).values, memory.place(level): logarithm}, {})}
+def update(model, x, log_w, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    _, v, S = expect(model, x, log_w, z)
+    x, d, level = propose(model, x, model.kept["noise"], model.kept["noise_cov"], z, e)
+    return (
+        x,
+        log_w + level,
+        v,
+        S,
+        {"noise": zeros(model.Q, len(x)), "noise_cov": sym(zeros(model.Q, len(x), len(x)))},
+    )
 
 
-@lru_cache(maxsize=64)
-def proposal_works(functions: Functions, shape: Shape, noise: int, level: int, cov: int) -> Works:
-    """The update for a model's functions and shape, whose row has the Q of the noise from `cov` on."""
-    stages, common = partial(stages_of, noise, level), (cov, shape.n * shape.n)
-    return works_of_each(functions, shape, level + 1, shape.m, stages, common)
+OPTIMAL = Page(advance, settle, update, start=start, of_each=("noise",))

@@ -2,149 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 
 from filters.baselines.baselines import places_of
-from filters.engine.belief import Belief, Kernels
-from filters.engine.layout import memory_places, own_place, row_access
-from filters.pages.kernels import nothing_to_summarise
-from filters.particles.conditional import rows_of, works_of
-from filters.particles.motion import drawer
-from filters.particles.regularisation import kernel_width
-from filters.particles.weighted import ResampledFilter, aligned_moments, anything_measured, particle_parts
-from filters.particles.weights import (
-    normalise,
-    read_weights,
-    systematic_resampler,
-    weighted_covariances,
-    weighted_means,
-)
-from thruster_env.numerics import matrices
-from thruster_env.numerics.angles import row_aligner
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import (
-    FILTER_MEASUREMENT,
-    FILTER_PRIOR,
-    FILTER_PROCESS,
-    FILTER_PROPOSAL,
-    GROUP,
-    fill_normals,
-    uniform_block,
-)
-from thruster_env.numerics.tuples import matrix_reader, zeros_of
-from thruster_env.plants.layout import number_places, padded
-from thruster_env.plants.shape import Functions, Shape, innovation_of
+from filters.engine.belief import Belief
+from filters.gaussian import extended
+from filters.pages.page_filter import Page
+from filters.particles.weighted import ResampledFilter
+from thruster_env.numerics.algebra.blocks import hstack, pick, zeros
+from thruster_env.numerics.algebra.members import on_branch
+from thruster_env.numerics.algebra.operations import sym, wrap
+from thruster_env.numerics.algebra.points import outer, root, square
+from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
+from thruster_env.numerics.algebra.scalars import entries_product
+from thruster_env.numerics.streams import FILTER_PROPOSAL, GROUP, fill_normals
+from thruster_env.plants.layout import padded
 
 
-def mixture_moments(first: int, covs: int, count: int, weights: int, angles: tuple[bool, ...]):
-    """`means(table, size)` and `covariances(table, size, mean)` of a mixture of Gaussians, one a column.
+def sample(x, P, e, sampled):
+    """Draw the sampled states of N(x, P); mean and covariance of all, if these are known.
 
-    Means and covariances lie in the rows from `first` and `covs` on: sum of w P, and the spread of the means.
+    With the sampled states first, P = [A 0; B C] [A 0; B C]', and [x_s; x_l] = mean + [A; B] e leaves C C'.
     """
-    means, between = weighted_means(first, count, weights), weighted_covariances(first, count, weights)
-    within, read = weighted_means(covs, count * count, weights), matrix_reader(count, count)
-    add = matrices.symmetric_sum(count)
-
-    @inlined
-    def covariances(table, size, mean):
-        return add(between(table, size, mean), read(within(table, size)))
-
-    if not any(angles):
-        return means, covariances
-    return aligned_moments(means, covariances, row_aligner(first, angles, weights))
+    n, count = len(x), len(sampled)
+    order = (*sampled, *(i for i in range(n) if i not in sampled))
+    back, places = tuple(map(order.index, range(n))), tuple(range(n))
+    L = root(pick(P, order, order))
+    AB, C = pick(L, back, places[:count]), pick(L, back, places[count:])
+    if count == n:
+        return x + AB @ e, {"P": P * 0.0}
+    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}
 
 
-@lru_cache(maxsize=64)
-def rao_blackwell_kernels(functions: Functions, shape: Shape, sampled: tuple[int, ...]) -> Kernels:
-    """Kernels for a model's functions and shape, and the sampled states; the table's rows: `rows_of`."""
-    n, m, count = shape.n, shape.m, len(sampled)
-    places, logarithms, first_cov = memory_places(n, m), n, n + 1
-    weights, seen, end = rows_of(shape)
-    works, rows, scratch = works_of(functions, shape, sampled)
-    begin, advance, settle, condition = (works[name] for name in ("start", "advance", "settle", "update"))
-    substeps_place, factor_place = number_places(n, m).substeps, own_place(shape)
-    threshold_place, size_place, cov_place = factor_place + 1, places.extras, places.cov
-    step_place, key_0, key_1 = places.step, places.key_0, places.key_1
-    likelihood_place, level = places.log_likelihood, end - 1
-    draw, resample = drawer(n, m), systematic_resampler(weights, weights, seen)
-    set_equal, width = particle_parts(functions.observe, shape, weights).set_equal, kernel_width(count)
-    means, covariances = mixture_moments(0, first_cov, n, weights, shape.state_angles)
-    means_of_seen, covariances_of_seen = mixture_moments(seen, seen + m, m, weights, shape.measurement_angles)
-    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    difference, nothing = innovation_of(shape), zeros_of(m)
-    align = row_aligner(0, shape.state_angles) if any(shape.state_angles) else nothing_to_summarise
+def start(model, w):
+    """A particle of the prior."""
+    return sample(model.prior_mean, square(model.prior_root), w, model.own.sampled)
 
-    @inlined
-    def start(memory, numbers, size):
-        row, table, draws = memory
-        draw(draws, count * table.shape[1], row, FILTER_PRIOR)
-        begin(row, numbers, numbers, table, draws, size)
-        align(table, size)
-        set_equal(memory, size)
 
-    @inlined
-    def spread(memory, numbers, size):
-        """Give the sampled states of each particle the kernel's covariance, of which the next step draws."""
-        row, table, _ = memory
-        factor = (numbers[factor_place] * width(size)) ** 2
-        for i in sampled:
-            for k in sampled:
-                for j in range(table.shape[1]):
-                    table[first_cov + i * n + k, j] += factor * row[cov_place + i * n + k]
+def advance(model, x, u):
+    """One of the model's substeps."""
+    x, P = extended.advance(model, x, model.kept["P"], u)
+    return x, {"P": P}
 
-    @inlined
-    def predict(memory, u, numbers, size):
-        row, table, draws = memory
-        if row[size_place] < numbers[threshold_place] * size:
-            read_weights(table, logarithms, weights, size)
-            place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
-            resample(table, size, place)
-            spread(memory, numbers, size)
-            set_equal(memory, size)
-        for _ in range(int(numbers[substeps_place])):
-            advance(row, u, numbers, table, draws, size)
-        row[step_place] += 1.0
-        draw(draws, count * table.shape[1], row, FILTER_PROCESS)
-        settle(row, u, numbers, table, draws, size)
-        align(table, size)
 
-    @inlined
-    def summarise(memory, size):
-        row, table, _ = memory
-        mean = means(table, size)
-        store_mean(row, mean)
-        store_cov(row, covariances(table, size, mean))
+def settle(model, x, w):
+    """The end of a step."""
+    x, P = extended.settle(model, x, model.kept["P"])
+    x, kept = sample(x, P, w, model.own.sampled)
+    return on_branch(x, model.state_angles), kept
 
-    @inlined
-    def summarise_anew(memory, size):
-        read_weights(memory[1], logarithms, weights, size)
-        summarise(memory, size)
 
-    @inlined
-    def update(memory, z, numbers, size):
-        row, table, draws = memory
-        read_weights(table, logarithms, weights, size)
-        condition(row, z, numbers, table, draws, size)
-        v = means_of_seen(table, size)
-        store_innovation(row, difference(v, nothing()))
-        store_s(row, covariances_of_seen(table, size, v))
-        row[likelihood_place] = 0.0
-        if anything_measured(z):
-            for j in range(table.shape[1]):
-                table[logarithms, j] += table[level, j]
-            row[likelihood_place], row[size_place] = normalise(table, logarithms, weights, size)
-        summarise(memory, size)
+def spread(model, x, mean, P, e):
+    """Copies of a particle, whose sampled states get a kernel's covariance, of which the next step draws."""
+    flags = model.own.flags
+    return x, {"P": model.kept["P"] + sym(entries_product(P, outer(flags, flags))) * model.own.kernel}
 
-    return Kernels(
-        *(n, m, max(rows, seen + weights + 2), max(count, 1), start, predict, update, summarise_anew),
-        extras=1,
-        extra_kept_rows=weights - n,
-        scratch=scratch,
-    )
+
+def update(model, x, log_w, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    x, P, v, S, level = extended.update(model, x, model.kept["P"], z)
+    w = weights(log_w)
+    v = on_branch(v, model.measurement_angles, w)
+    mean, cov = weighted_mean(v, w), weighted_covariance(v, w) + weighted_mean(S, w)
+    return x, log_w + level, wrap(mean, model.measurement_angles), cov, {"P": P}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,6 +110,8 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
     """
 
     name: ClassVar[str] = "rbpf"
+    page: ClassVar[Page] = Page(advance, settle, update, start=start, renew=spread, of_each=("P",))
+    unrolled: ClassVar[tuple[str, ...]] = ("sampled",)
     ensemble_size: int = 100
     sampled: Any = (0,)
 
@@ -197,10 +123,16 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
             raise ValueError("sampled must be a list of indices, at least one, but got none")
         object.__setattr__(self, "sampled", places)
 
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        model = self.kernel_model
-        return rao_blackwell_kernels(model.functions, model.shape, self.sampled)
+    @property
+    def spread_states(self) -> int:
+        """How many states the kernel spreads."""
+        return len(self.sampled)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """What the page and resampling read: of the kernel its share of the covariance of sampled states."""
+        given = super().parameters
+        return {**given, "kernel": given["width"] ** 2, "flags": [i in self.sampled for i in range(self.model.n)]}
 
     def sample(self, belief: Belief) -> np.ndarray:
         """A state (n, N) drawn from each particle's N(x_j, P_j), and the row of log weights."""

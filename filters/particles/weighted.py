@@ -1,143 +1,60 @@
-"""What particle filters share: weights and moments of a sample, what it expects, and its size."""
+"""What particle filters share: what a weighted sample expects to be measured, its kernel, and its size."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-from filters.engine.belief import Belief
-from filters.engine.layout import memory_places, row_access
+from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
-from filters.filter import Filter
-from filters.particles.motion import silencer
-from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
-from thruster_env.numerics import matrices
-from thruster_env.numerics.angles import row_aligner
+from filters.pages.page_filter import FilterWithPage, Page
+from filters.particles.kernels import particle_kernels
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.members import on_branch
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import root
+from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
 from thruster_env.numerics.checks import at_least, finite, positive
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
-from thruster_env.plants.layout import constants_reader, number_places
-from thruster_env.plants.shape import Shape, innovation_of
 
 
-class ParticleParts(NamedTuple):
-    """Functions common to all particle filters.
+def start(model, w):
+    """A particle of the prior."""
+    return model.prior_mean + model.prior_root @ w
 
-    Rows of the table: n of particles, one of log weights, those of a kind, one of weights, scratch.
+
+def expect(model, x, log_w, z):
+    """What a particle expects to be measured, zero in channels that are NaN in z; innovation and S of all."""
+    seen, w = present(z), weights(log_w)
+    y = on_branch(only(seen, model.h(x)), model.measurement_angles, w)
+    v = only(seen, wrap(z - weighted_mean(y, w), model.measurement_angles))
+    return y, v, weighted_covariance(y, w) + uncorrelated(seen, model.R)
+
+
+def fit(model, y, z):
+    """The logarithm of p(z | x) of a particle that expects y."""
+    seen = present(z)
+    rest = only(seen, wrap(z - y, model.measurement_angles))
+    return log_density(rest, uncorrelated(seen, model.R), seen)
+
+
+def spread(model, x, mean, P, e):
+    """Particles that are copies of one, spread by a kernel with a part of the covariance of all."""
+    return x + root(P) @ e * model.own.width
+
+
+def kernel_width(count: int, size: int) -> float:
+    """The width h = (4/(d + 2))^(1/(d + 4)) N^(-1/(d + 4)) of a kernel for N particles in d dimensions.
+
+    It makes the mean integrated square error of the density least where that is Gaussian.
+
+    Source: Silverman (1986), Density Estimation for Statistics and Data Analysis, section 4.3.2.
     """
-
-    set_equal: Callable  # set_equal(memory, size): the same weight for all
-    expect: Callable  # expect(memory, z, numbers, size): sets innovation and S, and the first scratch rows h(x_j)
-    normal: Callable  # normal(z, cov): the density N(z; y, cov), of the channels that are there, as a value ...
-    distance: Callable  # ... distance(y, normal): whose logarithm at y is level(normal) - distance
-    level: Callable
-    weigh: Callable  # weigh(memory, size): normalises weights, sets mean, cov, ESS; the log of the weights' sum
-    summarise: Callable  # summarise(memory, size): sets mean and cov
-
-
-@lru_cache(maxsize=64)
-def particle_parts(observe: Callable, shape: Shape, weights: int) -> ParticleParts:
-    """The parts for a model's observation function and shape; `weights` is the row of weights."""
-    n, m = shape.n, shape.m
-    places, source = memory_places(n, m), number_places(n, m)
-    logarithms, scratch, size_place = n, weights + 1, places.extras
-    constants, state, store_predicted = constants_reader(shape), column_reader(n), column_writer(m, scratch)
-    means, covariances = weighted_means(0, n, weights), weighted_covariances(0, n, weights)
-    means_of_predicted = weighted_means(scratch, m, weights)
-    covariances_of_predicted = weighted_covariances(scratch, m, weights)
-    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    read_r, mask, add, factor = (
-        matrix_reader(m, m, source.r),
-        matrices.masked(m),
-        matrices.symmetric_sum(m),
-        matrices.cholesky_factor(m),
-    )
-    difference, measured = innovation_of(shape), vector_reader(m)
-    half_square, constant = matrices.log_density(m)
-    silence = silencer(scratch, shape.measurement_angles, weights)
-    of_states = means, covariances
-    if any(shape.state_angles):
-        of_states = aligned_moments(*of_states, row_aligner(0, shape.state_angles, weights))
-    means, covariances = of_states
-
-    @inlined
-    def set_equal(memory, size):
-        row, table, _ = memory
-        for j in range(table.shape[1]):
-            table[logarithms, j] = -math.log(size)
-        row[size_place] = size
-
-    @inlined
-    def summarise(memory, size):
-        row, table, _ = memory
-        read_weights(table, logarithms, weights, size)
-        mean = means(table, size)
-        store_mean(row, mean)
-        store_cov(row, covariances(table, size, mean))
-
-    @inlined
-    def expect(memory, z, numbers, size):
-        row, table, _ = memory
-        c, present = constants(numbers), measured(z)
-        for j in range(table.shape[1]):
-            store_predicted(table, j, observe(state(table, j), c))
-        read_weights(table, logarithms, weights, size)
-        silence(table, z, size)
-        mean = means_of_predicted(table, size)
-        store_innovation(row, difference(present, mean))
-        s = add(covariances_of_predicted(table, size, mean), mask(read_r(numbers), present))
-        store_s(row, s)
-
-    @inlined
-    def normal(z, cov):
-        present = measured(z)
-        return present, factor(mask(cov, present))
-
-    @inlined
-    def distance(y, normal):
-        return half_square(difference(normal[0], y), normal[1], normal[0])
-
-    @inlined
-    def level(normal):
-        return constant(normal[1], normal[0])
-
-    @inlined
-    def weigh(memory, size):
-        row, table, _ = memory
-        total, row[size_place] = normalise(table, logarithms, weights, size)
-        mean = means(table, size)
-        store_mean(row, mean)
-        store_cov(row, covariances(table, size, mean))
-        return total
-
-    return ParticleParts(set_equal, expect, normal, distance, level, weigh, summarise)
-
-
-def aligned_moments(means: Callable, covariances: Callable, align: Callable) -> tuple[Callable, Callable]:
-    """The functions `means` and `covariances` of a table, after its angles were put on one branch."""
-
-    @inlined
-    def means_aligned(table, size):
-        align(table, size)
-        return means(table, size)
-
-    return means_aligned, covariances
-
-
-@inlined
-def anything_measured(z):
-    """Whether a channel of z is present."""
-    for i in range(z.shape[0]):
-        if z[i] == z[i]:
-            return True
-    return False
+    return (4.0 / ((count + 2.0) * size)) ** (1.0 / (count + 4.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class WeightedFilter(Filter):
+class WeightedFilter(FilterWithPage):
     """Base of the particle filters.
 
     Attributes:
@@ -149,6 +66,7 @@ class WeightedFilter(Filter):
 
     gaussian_likelihood: ClassVar[bool] = False
     any_step: ClassVar[bool] = False
+    resampled: ClassVar[bool] = True
     ensemble_size: int = 1000
     regularisation: float = 0.0
 
@@ -162,14 +80,29 @@ class WeightedFilter(Filter):
         object.__setattr__(self, "regularisation", width)
 
     @property
-    def own_parameters(self) -> tuple[float, ...]:
-        """The factor on the kernel's width."""
-        return (self.regularisation,)
+    def parameters(self) -> Mapping[str, Any]:
+        """What the page reads: the width of the kernel, over the deviations of all particles."""
+        return {"width": self.regularisation * kernel_width(self.spread_states, self.ensemble_size)}
+
+    @property
+    def spread_states(self) -> int:
+        """How many states the kernel spreads."""
+        return self.model.n
+
+    @property
+    def written_page(self) -> Page:
+        """The page, with the kernel where that does something."""
+        page = super().written_page
+        return page if self.regularisation else page._replace(renew=None)
 
     @property
     def size(self) -> int:
         """Number of particles."""
         return self.ensemble_size
+
+    def kernels(self) -> Kernels:
+        """Kernels of the page for the model's functions; see `Filter.kernels`."""
+        return particle_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
 
     @staticmethod
     def effective_sample_size(belief: Belief) -> float:
@@ -197,6 +130,6 @@ class ResampledFilter(WeightedFilter):
         object.__setattr__(self, "resampling_threshold", threshold)
 
     @property
-    def own_parameters(self) -> tuple[float, ...]:
-        """The factor on the kernel's width, and the threshold."""
-        return *super().own_parameters, self.resampling_threshold
+    def parameters(self) -> Mapping[str, Any]:
+        """What the page and resampling read."""
+        return {**super().parameters, "resampling_threshold": self.resampling_threshold}

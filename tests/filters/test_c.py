@@ -350,7 +350,7 @@ def small(**functions):
     [
         (
             lambda: c_filter(make_filter("pf", scalar_model())),
-            "a filter in C must have a page, as 'ekf' and 'enkf' have, but got 'pf'",
+            "a filter in C must have a page without resampling, as 'ekf' and 'enkf' have, but got 'pf'",
         ),
         (
             lambda: c_filter(make_filter("etkf", scalar_model(), rotations=1)),

@@ -310,7 +310,7 @@ def if_fast(x, u, c):
     [
         (
             lambda: filters.torch(make_filter("pf", scalar_model())),
-            "on tensors must have a page, as 'ekf' and 'enkf' have, but got 'pf'",
+            "on tensors must have a page without resampling, as 'ekf' and 'enkf' have, but got 'pf'",
         ),
         (lambda: filters.torch(made("ekf", scalar_model()), dtype=torch.int64), "torch.float64 or torch.float32"),
         (lambda: filters.torch(made("kf", thruster_model()), transition=if_fast), "a filter on the model itself"),

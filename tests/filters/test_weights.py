@@ -1,17 +1,26 @@
-"""The kernels of weights and of resampling against NumPy and the textbook's formulas."""
+"""Weights, weighted sums and resampling against NumPy and the textbook's formulas."""
 
 import math
 
 import numpy as np
 import pytest
 
-from filters.particles.weights import (
-    exponential,
-    normalise,
-    systematic_resampler,
-    weighted_covariances,
-    weighted_means,
+from filters.pages.members import of_members
+from filters.pages.stages import Stage, as_calls
+from filters.particles.resampling import systematic_resampler
+from thruster_env.numerics.algebra.matrices import given
+from thruster_env.numerics.algebra.programs import OF_MEMBERS, Place
+from thruster_env.numerics.algebra.samples import (
+    effective_size,
+    normalised,
+    weighted_covariance,
+    weighted_mean,
+    weighted_square,
+    weights,
 )
+from thruster_env.numerics.exponential import exponential
+
+SIZE = 11
 
 
 def test_resampling_draws_each_particle_as_often_as_its_weight_says():
@@ -50,25 +59,87 @@ def test_the_exponential_is_one():
     assert exponential(-math.inf) == exponential(math.nan) == pytest.approx(math.exp(-46.0))
 
 
-def test_weights_are_normalised_and_tell_their_effective_size():
-    logarithms = np.array([-1000.0, -1001.0, -1002.5, -1900.0])
-    table = np.zeros((2, 8))
-    table[0, :4] = logarithms
-    total, size = normalise(table, 0, 1, 4)
-    w = np.exp(logarithms + 1000.0)
-    assert total == pytest.approx(-1000.0 + math.log(w.sum()), rel=1e-14)
-    np.testing.assert_allclose(table[1, :4], w / w.sum(), rtol=1e-12, atol=1e-19)
-    np.testing.assert_allclose(table[0, :4], logarithms - total, rtol=1e-12)
-    assert size == pytest.approx(w.sum() ** 2 / (w**2).sum())
-    table[0, :4] = -math.inf
-    assert all(math.isnan(value) for value in (normalise(table, 0, 1, 4)[0], *table[1, :4]))
+def on_arrays(page, x, log_w):
+    """A page's results on NumPy's arrays."""
+    return [np.squeeze(one) for one in page(x, log_w)]
 
 
-def test_the_covariance_of_equal_weights_is_the_sample_covariance():
-    table = np.zeros((3, 16))
-    table[:2, :11] = np.random.default_rng(2).normal(size=(2, 11))
-    table[2, :11] = 1.0 / 11
-    means = weighted_means(0, 2, 2)(table, 11)
-    found = weighted_covariances(0, 2, 2)(table, 11, means)
-    np.testing.assert_allclose(means, table[:2, :11].mean(axis=1), rtol=1e-12)
-    np.testing.assert_allclose(found, np.cov(table[:2, :11]), rtol=1e-12)
+def in_memory(page, x, log_w, make):
+    """The same in memory whose columns are whole vectors; behind the last particle lies what must not count."""
+    n, size = x.shape
+    table = np.full((n + 2, 16), 9.0)
+    table[n], table[:n, :size], table[n, :size] = log_w[0], x, log_w
+    states = given(Place("table", 0), (n,), member=True)
+    results = page(states, given(Place("table", n), (), member=True, like=states))
+    places = [Place("table", n + 1) if one.member else Place("rows", 20 * k) for k, one in enumerate(results)]
+    rows, nothing = np.zeros(20 * len(results)), np.zeros(1)
+    make(Stage(dict(zip(places, results, strict=True)), {}))(rows, nothing, nothing, table, nothing, size)
+    return [
+        table[n + 1, :size] if one.member else rows[at : at + math.prod(one.shape)].reshape(one.shape)
+        for (_, at), one in zip(places, results, strict=True)
+    ]
+
+
+def as_program(page, x, log_w):
+    """The same as a program of all particles."""
+    return in_memory(page, x, log_w, lambda stage: of_members(stage, len(x) + 2).work)
+
+
+def as_functions(page, x, log_w):
+    """The same as calls of functions."""
+    return in_memory(page, x, log_w, lambda stage: as_calls(stage, 0, {}, {}, OF_MEMBERS).values)
+
+
+each_way = pytest.mark.parametrize("work", [on_arrays, as_program, as_functions])
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_weights_are_normalised_and_tell_their_effective_size(work):
+    def page(x, log_w):
+        w, level = normalised(log_w)
+        return w, level, effective_size(w)
+
+    for logarithms in ([-1000.0, -1001.0, -1002.5, -1900.0], [-3.0, -math.inf, math.nan, -2.0]):
+        found, total, size = work(page, np.zeros((1, 4)), np.array(logarithms))
+        w = np.exp(np.nan_to_num(np.array(logarithms), nan=-math.inf) - max(logarithms[0], logarithms[-1]))
+        assert total == pytest.approx(max(logarithms[0], logarithms[-1]) + math.log(w.sum()), rel=1e-14)
+        np.testing.assert_allclose(found, w / w.sum(), rtol=1e-12, atol=2e-20)
+        assert size == pytest.approx(w.sum() ** 2 / (w**2).sum())
+    _, total, _ = work(page, np.zeros((1, 4)), np.full(4, -math.inf))
+    assert math.isnan(total)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_weighted_moments_are_those_of_their_sums(work):
+    def page(x, log_w):
+        w = weights(log_w)
+        return weighted_mean(x, w), weighted_covariance(x, w), weighted_square(x, w)
+
+    rng = np.random.default_rng(2)
+    x, w = rng.normal(size=(2, SIZE)), rng.dirichlet(np.ones(SIZE))
+    mean, cov, square = work(page, x, np.log(w))
+    d = x - x @ w[:, None]
+    np.testing.assert_allclose(mean, x @ w, rtol=1e-12)
+    np.testing.assert_allclose(cov, d @ np.diag(w) @ d.T / (1.0 - (w**2).sum()), rtol=1e-12)
+    np.testing.assert_allclose(square, x @ np.diag(w) @ x.T, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_the_covariance_of_equal_weights_is_the_sample_covariance(work):
+    x = np.random.default_rng(2).normal(size=(2, SIZE))
+    (found,) = work(lambda x, log_w: (weighted_covariance(x, weights(log_w)),), x, np.full(SIZE, -math.log(SIZE)))
+    np.testing.assert_allclose(found, np.cov(x), rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_the_covariance_of_one_weight_that_is_nearly_all_is_what_the_others_say(work):
+    x, small = np.random.default_rng(3).normal(size=(2, SIZE)), 1e-17
+    log_w = np.full(SIZE, math.log(small))
+    log_w[4] = 0.0
+    (found,) = work(lambda x, log_w: (weighted_covariance(x, weights(log_w)),), x, log_w)
+    d = np.delete(x - x[:, 4:5], 4, axis=1)
+    np.testing.assert_allclose(found, d @ d.T / (2 * (SIZE - 1)), rtol=1e-12)

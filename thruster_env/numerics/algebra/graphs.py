@@ -29,6 +29,7 @@ from thruster_env.numerics.algebra.folding import difference, negative, product,
 
 UNARY = ("sqrt", "exp", "log", "sin", "cos", "tan", "arctan", "tanh", "sinh", "cosh", "floor", "ceil")
 TWO_SIDED = {"+", "*"}  # operations whose arguments may change places
+REDUCTIONS = ("sum", "largest")  # operations that make one number of those of all members
 
 
 class TooLarge(TypeError):
@@ -108,7 +109,7 @@ class Number:
         self.graph, self.operation, self.arguments, self.place = graph, operation, arguments, place
         self.of: tuple[Number, ...] = tuple([a for a in arguments if isinstance(a, Number)])
         self.value = float.fromhex(arguments[0]) if operation == "constant" else None
-        self.member: bool = operation != "sum" and any([a.member for a in self.of])
+        self.member: bool = operation not in REDUCTIONS and any([a.member for a in self.of])
 
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"
@@ -237,6 +238,11 @@ def arctan2(y, x):
 def over_members(a: Number) -> Number:
     """The sum of a number that each member of an ensemble has."""
     return a.graph.make("sum", a) if a.member else a * size_of(a)
+
+
+def largest_of_members(a: Number) -> Number:
+    """The largest of the numbers that the members have; NaN is none."""
+    return a.graph.make("largest", a) if a.member else a
 
 
 def size_of(a: Number) -> Number:

@@ -17,6 +17,7 @@ from numba.np.arrayobj import populate_array
 from thruster_env.numerics.algebra.graphs import Number
 from thruster_env.numerics.algebra.programs import BY_MEMBERS, CALLED, SIDE_BY_SIDE, Place, Program
 from thruster_env.numerics.compiled import FASTMATH
+from thruster_env.numerics.exponential import ROUNDER, ROUNDER_BITS
 
 FLAGS = tuple(sorted(FASTMATH))
 OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
@@ -126,11 +127,23 @@ class Writer:
             return values[0][number.arguments[1]]
         if operation == "and":
             return builder.and_(*values)
+        if operation == "two_to":
+            return self._two_to(*values)
         if operation == "!=":
             return builder.fcmp_unordered(operation, *values)
         if operation in ("<", "<=", ">", ">=", "=="):
             return builder.fcmp_ordered(operation, *values)
         return self._called(operation, values)
+
+    def _two_to(self, whole: ir.Value) -> ir.Value:
+        """2^k of whole numbers k, whose last bits become the exponent's."""
+        builder, longs = self._builder, ir.VectorType(LONG, self._width)
+        rounder, offset = (
+            ir.Constant(kind, [value] * self._width)
+            for kind, value in ((self._vector, ROUNDER), (longs, 1023 - ROUNDER_BITS))
+        )
+        bits = builder.add(builder.bitcast(builder.fadd(whole, rounder), longs), offset)
+        return builder.bitcast(builder.shl(bits, ir.Constant(longs, [52] * self._width)), self._vector)
 
     def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
         """What a function of two arrays makes of numbers, run after run."""

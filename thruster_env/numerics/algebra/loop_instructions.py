@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import lower_builtin, type_callable
@@ -78,8 +79,8 @@ class _LoopWriter:
         at.add_incoming(ir.Constant(LONG, 0), before)
         vector = ir.VectorType(DOUBLE, width)
         sums = [builder.phi(vector) for _ in body.sums]
-        for one in sums:
-            one.add_incoming(ir.Constant(vector, [0.0] * width), before)
+        for one, of in zip(sums, body.sums, strict=True):
+            one.add_incoming(ir.Constant(vector, [-np.inf if of.operation == "largest" else 0.0] * width), before)
         each.pointer_of = lambda place: self._pointer(place, at, vector)
         each.read(body.reads)
         each.work(body.works)
@@ -89,14 +90,19 @@ class _LoopWriter:
             left = self._to_all(builder.sub(self._size, at), ir.VectorType(LONG, width))
             counts = builder.icmp_signed("<", mask, left)
             for one, total in zip(body.sums, sums, strict=True):
-                more = builder.fadd(total, each.values[one.of[0].place], flags=FLAGS)
-                total.add_incoming(builder.select(counts, more, total), builder.block)
+                value = each.values[one.of[0].place]
+                if one.operation == "largest":
+                    more, found = value, builder.and_(counts, builder.fcmp_ordered(">", value, total))
+                else:
+                    more, found = builder.fadd(total, value, flags=FLAGS), counts
+                total.add_incoming(builder.select(found, more, total), builder.block)
         at.add_incoming(following, builder.block)
         builder.cbranch(builder.icmp_signed("<", following, self._columns), inside, after)
-        ends = {one.place: phi.incomings[-1][0] for one, phi in zip(body.sums, sums, strict=True)}
+        ends = [(one, phi.incomings[-1][0]) for one, phi in zip(body.sums, sums, strict=True)]
         builder.position_at_end(after)
-        for place, value in ends.items():
-            self._once.values[place] = self._as_vector(self._added(value))
+        for one, value in ends:
+            of_all = self._largest(value) if one.operation == "largest" else self._added(value)
+            self._once.values[one.place] = self._as_vector(of_all)
 
     def _same_for_all(self, each: Writer, body: Body) -> None:
         """Vectors of the numbers that a loop needs and that are the same for all members."""
@@ -122,7 +128,13 @@ class _LoopWriter:
         return self._builder.bitcast(pointer, vector.as_pointer())
 
     def _added(self, value: ir.Value) -> ir.Value:
-        name, module = f"llvm.vector.reduce.fadd.v{self._width}f64", self._builder.module
-        kind = ir.FunctionType(DOUBLE, [DOUBLE, value.type])
+        return self._reduced("fadd", [ir.Constant(DOUBLE, 0.0), value])
+
+    def _largest(self, value: ir.Value) -> ir.Value:
+        return self._reduced("fmax", [value])
+
+    def _reduced(self, operation: str, values: list[ir.Value]) -> ir.Value:
+        name, module = f"llvm.vector.reduce.{operation}.v{self._width}f64", self._builder.module
+        kind = ir.FunctionType(DOUBLE, [one.type for one in values])
         function = module.globals.get(name) or ir.Function(module, kind, name)
-        return self._builder.call(function, [ir.Constant(DOUBLE, 0.0), value], fastmath=FLAGS)
+        return self._builder.call(function, values, fastmath=FLAGS)

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from thruster_env.numerics.algebra.graphs import Number, needed_by
+from thruster_env.numerics.algebra.graphs import REDUCTIONS, Number, needed_by
 from thruster_env.numerics.algebra.programs import BY_MEMBERS, Place, Program
 
 SUMS = 16  # of one loop: as many vectors, and what they are made of, fit into the registers
@@ -79,7 +79,7 @@ class _Cutter:
         self._numbers = {one.place: one for one in [*(one for _, one in program.reads), *program.works]}
         self._turn: dict[int, int] = {}
         for k, one in self._numbers.items():
-            self._turn[k] = max((self._turn[a.place] for a in one.of), default=0) + (one.operation == "sum")
+            self._turn[k] = max((self._turn[a.place] for a in one.of), default=0) + (one.operation in REDUCTIONS)
         self._last = max(self._turn.values(), default=0)
         self._loops: dict[Loop, list[Number]] = {}
         for turn in range(self._last + 1):
@@ -103,7 +103,9 @@ class _Cutter:
 
     def _add_loops(self, turn: int) -> None:
         sums = [
-            one for one in self._numbers.values() if one.operation == "sum" and self._turn[one.place] == turn + 1
+            one
+            for one in self._numbers.values()
+            if one.operation in REDUCTIONS and self._turn[one.place] == turn + 1
         ]
         for k in range(0, max(len(sums), 1), SUMS):
             self._loops[turn, k // SUMS] = sums[k : k + SUMS]

@@ -69,17 +69,17 @@ def centred(e):
     return _deviations(e) * (size / (size - 1.0)) ** 0.5
 
 
-def on_branch(x, angles):
-    """Members whose components that are angles (flags) lie within half a turn of their circular mean."""
-    return on_one_branch(x, tuple(angles)) if any(angles) else x
+def on_branch(x, angles, *weights):
+    """Members whose angles (flags) lie within half a turn of their circular mean, by weights or not."""
+    return on_one_branch(x, tuple(angles), *weights) if any(angles) else x
 
 
 @operation(same)
-def on_one_branch(x, angles):
+def on_one_branch(x, angles, weights=1.0):
     """The same, if some are."""
 
     def moved(row):
-        middle = arctan2(_total(np.sin(row)), _total(np.cos(row)))
+        middle = arctan2(_total(weights * np.sin(row)), _total(weights * np.cos(row)))
         return row - whole_turns(row - middle)
 
     return np.array([moved(row) if angle else row for row, angle in zip(x, angles, strict=True)])

@@ -41,7 +41,9 @@ SPECIAL = {
     "pow": "{} ** {}",
     "and": "{} & {}",
     "sum": "over_members({}, size)",
+    "largest": "largest_of_members({}, size)",
     "size": "float(size)",
+    "two_to": "exp2({})",
 }
 
 
@@ -170,7 +172,13 @@ def _in_python(text: list[str], arrays: Sequence[str] = ARRAYS) -> Callable:
 
 def work_names() -> dict:
     """What names in a program's text mean."""
-    return {**vars(np), "where": _chosen, "over_members": _total, "called": _called}
+    return {
+        **vars(np),
+        "where": _chosen,
+        "over_members": _total,
+        "largest_of_members": _largest,
+        "called": _called,
+    }
 
 
 def _chosen(condition, a, b):
@@ -181,6 +189,11 @@ def _chosen(condition, a, b):
 def _total(row, size):
     """The sum of what the first `size` members have, which may be the same for all."""
     return row[:size].sum() if np.ndim(row) else row * size
+
+
+def _largest(row, size):
+    """The largest that the first `size` members have; NaN is none."""
+    return np.fmax.reduce(row[:size], initial=-np.inf) if np.ndim(row) else row
 
 
 def _called(name: str, count: int, *given):
