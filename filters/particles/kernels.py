@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from math import prod
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
@@ -26,20 +25,8 @@ from filters.pages.equations import PagedModel
 from filters.pages.kernels import anything_measured
 from filters.pages.members import MembersMemory, works_of
 from filters.pages.page import Page
-from filters.pages.programs import stored, with_kept
-from filters.pages.stages import Stage
 from filters.particles.resampling import SCRATCH_ROWS, systematic_resampler
-from thruster_env.numerics.algebra.matrices import Matrix, given
-from thruster_env.numerics.algebra.members import on_branch
-from thruster_env.numerics.algebra.operations import wrap
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.algebra.samples import (
-    effective_size,
-    normalised,
-    weighted_covariance,
-    weighted_mean,
-    weights,
-)
+from filters.particles.stages import Layout, stages_of
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.streams import (
     FILTER_KERNEL,
@@ -52,70 +39,6 @@ from thruster_env.numerics.streams import (
 )
 from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import Functions, Shape
-
-
-class Layout:
-    """Where everything lies.
-
-    Attributes:
-        x, logarithm, weight: rows of the table, of which the weights are scratch, and lie behind what is kept.
-        kept: what is kept besides, in the table or the row.
-        size: the place of the ESS.
-        rows, extras: how many rows of the table and numbers of the row belong to the belief.
-    """
-
-    def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
-        """Give each its place."""
-        n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
-        self.x, self.logarithm = memory.x, given(Place("table", n), (), member=True, like=memory.x)
-        self.size, self.kept = Place("rows", first), {}
-        ends = {"table": n + 1, "rows": first + 1}
-        self.start = with_kept(page.start(model, memory.w))  # type: ignore[misc]
-        for name, one in self.start[-1].items():
-            array, member = ("table", True) if name in page.of_each else ("rows", False)
-            place = Place(array, ends[array])
-            self.kept[name] = given(place, one.shape, symmetric=one.symmetric, member=member, like=memory.x)
-            ends[array] += prod(one.shape)
-        self.rows, self.extras, self.weight = ends["table"], ends["rows"] - first, Place("table", ends["table"])
-        model.kept = self.kept
-
-    def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:
-        """Particles with their angles on one branch, their mean and their covariance."""
-        x = on_branch(x, model.state_angles, w)
-        cov = weighted_covariance(x, w)
-        return x, wrap(weighted_mean(x, w), model.state_angles), cov if P is None else cov + weighted_mean(P, w)
-
-
-def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
-    """What a page stores; the stages are named in `particle_kernels`."""
-    at = Layout(page, memory, model)
-    x, log_w, kept = at.x, at.logarithm, at.kept
-    innovation, cov, likelihood = memory.told
-    found = {
-        "advance": page.advance(model, x, memory.u),
-        "settle": page.settle(model, x, memory.w),
-    }
-    stages = {
-        "start": stored((on_branch(at.start[0], model.state_angles), *at.start[1:]), (x,), kept),
-        "choose": stored((weights(log_w),), (at.weight,)),
-        "summarise": stored(at.moments(model, x, weights(log_w), kept.get("P")), (x, *memory.belief)),
-        **{name: stored(results, (x,), kept) for name, results in found.items()},
-    }
-    if page.renew:
-        stages["renew"] = stored(page.renew(model, x, memory.mean, memory.P, memory.w), (x,), kept)
-    if page.foresee:
-        mu, level, v, S = page.foresee(model, x, log_w, memory.z)
-        w, first = normalised(log_w + level)
-        chosen = (at.moments(model, mu, w, None)[1:], memory.belief) if page.renew else ((), ())
-        places = (x, log_w, innovation, cov, at.weight, likelihood, *chosen[1])
-        stages["foresee"] = stored((mu, -level, v, S, w, first, *chosen[0]), places)
-        log_w = log_w + memory.read("rows", likelihood.at)
-    x, log_w, *told, changed = with_kept(page.update(model, x, log_w, memory.z, memory.e))
-    w, level = normalised(log_w)
-    x, *moments = at.moments(model, x, w, changed.get("P"))
-    results = x, log_w - level, level, effective_size(w), *moments, *told, changed
-    places = at.x, at.logarithm, likelihood, at.size, *memory.belief, *(innovation, cov)[: len(told)]
-    return {**stages, "update": stored(results, places, kept)}
 
 
 @lru_cache(maxsize=64)

@@ -148,22 +148,6 @@ def innovation_likelihood(size: int) -> Callable:
 
 
 @cache
-def log_density(size: int) -> tuple[Callable, Callable]:
-    """Functions `half_square(v, l, z)` and `constant(l, z)`: log N(v; 0, l l') = constant - half_square.
-
-    Channels that are NaN in z are left out; l must be the factor of a covariance without correlations to them.
-    """
-    shapes = {"v": (size,), "l": (size, size), "z": (size,)}
-    source = Source("half_square", "v, l, z", **shapes, work=size * size // 2)
-    y = _forward(source, size, missing=" if z[{i}] == z[{i}] else 0.0")
-    half_square = source.function("0.5 * (" + source.sum(f"{y[i]} * {y[i]}" for i in source.range(size)) + ")")
-    source = Source("constant", "l, z", l=(size, size), z=(size,))
-    level = 0.5 * math.log(2.0 * math.pi)
-    terms = (f"(-log(l[{i}][{i}]) - {level!r} if z[{i}] == z[{i}] else 0.0)" for i in source.range(size))
-    return half_square, source.function(source.sum(terms), log=math.log)
-
-
-@cache
 def square(rows: int, columns: int) -> Callable:
     """Return `square(a)`: a a', exactly symmetric, for a of shape (rows, columns)."""
     if is_array(rows, rows) and is_array(rows, columns):

@@ -73,10 +73,6 @@ def entry(name: str, shape: tuple[int, ...], member: bool) -> str:
     return name + ("", "[i]", f"[i // {shape[-1]}][i % {shape[-1]}]" if shape else "")[len(shape)]
 
 
-def _first_member(kinds: Kinds) -> str:
-    return next(f"a{k}" for k, (_, member) in enumerate(kinds) if member)
-
-
 @cache
 def reader(shape: tuple[int, ...]) -> Callable:
     """A function (array, j) that reads a value from a column."""
