@@ -89,5 +89,12 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     w, level = normalised(log_w)
     x, *moments = at.moments(model, x, w, changed.get("P"))
     results = x, log_w - level, level, effective_size(w), *moments, *told, changed
-    places = at.x, at.logarithm, likelihood, at.size, *memory.belief, *(innovation, cov)[: len(told)]
+    places: tuple[Matrix | Place, ...] = (
+        at.x,
+        at.logarithm,
+        likelihood,
+        at.size,
+        *memory.belief,
+        *(innovation, cov)[: len(told)],
+    )
     return {**stages, "update": stored(results, places, kept)}
