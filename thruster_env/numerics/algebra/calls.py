@@ -148,13 +148,11 @@ def _stored(place: Place, one: Matrix, value: str) -> list[str]:
     if array == "table":
         loops = [f"for i in range({prod(shape)}):", "    for j in range(table.shape[1]):"]
         return [*loops, f"        table[{first} + i, j] = {members_called.entry(value, shape, one.member)}"]
-    if _is_array(shape):
-        names, strides = "ijk"[: len(shape)], (prod(shape[k + 1 :]) for k in range(len(shape)))
-        at = " + ".join(f"{name} * {stride}" for name, stride in zip(names, strides, strict=True))
-        loops = [f"{'    ' * k}for {name} in range({shape[k]}):" for k, name in enumerate(names)]
-        return [*loops, f"{'    ' * len(shape)}{array}[{first} + {at}] = {value}[{', '.join(names)}]"]
-    entries = ("".join(f"[{i}]" for i in at) for at in np.ndindex(*shape))
-    return [f"{array}[{first + k}] = {value}{entry}" for k, entry in enumerate(entries)]
+    names, strides = "ijk"[: len(shape)], (prod(shape[k + 1 :]) for k in range(len(shape)))
+    at = " + ".join([str(first), *(f"{name} * {stride}" for name, stride in zip(names, strides, strict=True))])
+    loops = [f"{'    ' * k}for {name} in range({shape[k]}):" for k, name in enumerate(names)]
+    entry = f"[{', '.join(names)}]" if _is_array(shape) else "".join(f"[{name}]" for name in names)
+    return [*loops, f"{'    ' * len(shape)}{array}[{at}] = {value}{entry}"]
 
 
 def _is_array(shape: tuple[int, ...]) -> bool:
