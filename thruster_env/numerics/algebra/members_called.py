@@ -93,22 +93,22 @@ def writer(shape: tuple[int, ...]) -> Callable:
     return source.function()
 
 
-def _by_entries(kinds: Kinds, text: str, **names: Any) -> Callable | None:
+def _by_entries(kinds: Kinds, text: str) -> Callable | None:
     """A function of values, some of them of members, whose entries have a source of those of a0, a1.
 
-    None if members have matrices: more is done with these at once.
+    None if members have matrices, or numbers that registers hold: more is done with these at once.
     """
-    if any(member and len(shape) > 1 for shape, member in kinds):
-        return None
     longest = max(range(len(kinds)), key=lambda k: (prod(kinds[k][0]), kinds[k][1]))
+    if not is_array(*kinds[longest][0]) or any(member and len(shape) > 1 for shape, member in kinds):
+        return None
     entries = {f"a{k}": entry(f"a{k}", *kind) for k, kind in enumerate(kinds)}
     first = next(f"a{k}" for k, (_, member) in enumerate(kinds) if member)
     size = f"a{longest}.shape[0], {first}.shape[1]"
-    return _of_entries(", ".join(entries), size, text.format(**entries), tuple(names.items()))
+    return _of_entries(", ".join(entries), size, text.format(**entries))
 
 
 @cache
-def _of_entries(arguments: str, size: str, text: str, names: tuple) -> Callable:
+def _of_entries(arguments: str, size: str, text: str) -> Callable:
     lines = (
         f"out = np.empty(({size}))",
         "for i in range(out.shape[0]):",
@@ -116,7 +116,7 @@ def _of_entries(arguments: str, size: str, text: str, names: tuple) -> Callable:
         f"        out[i, j] = {text}",
         "out",
     )
-    return not_inlined(written_out("by_entries", arguments, *lines, _loops=True, np=np, **dict(names)))
+    return not_inlined(written_out("by_entries", arguments, *lines, _loops=True, np=np))
 
 
 @not_inlined
@@ -238,8 +238,8 @@ def _on_branch(others: tuple, kinds: Kinds) -> Callable:
 
 
 def _product(others: tuple, kinds: Kinds) -> Callable | None:
-    (_, first), (shape, _) = kinds
-    return None if first or len(shape) > 1 else arrays.sparse_product
+    (matrix, first), (shape, _) = kinds
+    return None if first or len(shape) > 1 or not is_array(*matrix) else arrays.sparse_product
 
 
 def _multiple(others: tuple, kinds: Kinds) -> Callable | None:
@@ -252,7 +252,6 @@ _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
     matrices.scale: _multiple,
     matrices.multiply: _product,
     scalars.entries_product: lambda others, kinds: _by_entries(kinds, "{a0} * {a1}"),
-    samples.weights: lambda others, kinds: _by_entries(kinds, "exponential({a0})", exponential=exponential),
     samples.total: lambda others, kinds: _total,
     samples.weighted_mean: _weighted_mean,
     samples.largest: lambda others, kinds: _largest,
@@ -286,4 +285,7 @@ def _stretches(result: tuple, before: tuple, after: tuple, part: tuple) -> Calla
     return source.function(source.vector(result[0], entry))
 
 
-FUNCTIONS: dict[Operation, Callable] = {members.stretches: _stretches}
+FUNCTIONS: dict[Operation, Callable] = {
+    members.stretches: _stretches,
+    samples.weights: lambda result, logarithm: exponential,
+}
