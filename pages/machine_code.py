@@ -21,6 +21,7 @@ from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as stages_of_members
 from filters.pages.memory import RowMemory
 from filters.pages.stages import Stage, as_programs
+from filters.particles import particle, weighted
 from pages.page import make_page
 from thruster_env.numerics.algebra.loops import cut
 from thruster_env.numerics.algebra.matrices import Matrix, in_order
@@ -134,6 +135,13 @@ def members() -> str:
     return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
 
 
+def particles() -> str:
+    """The bootstrap particle filter's update as it stands in a textbook."""
+    return block(
+        "\n\n\n".join(inspect.getsource(one).rstrip() for one in (weighted.expect, weighted.fit, particle.update))
+    )
+
+
 def loops() -> str:
     """The loops of a deterministic ensemble's update, of what they do for each member."""
     model, kind = body(), deterministic.DeterministicEnsembleKalmanFilter
@@ -168,7 +176,7 @@ def _lines(program: Program) -> list[str]:
 
 
 TABLES = {"page": page, "graph": graph, "program": program, "slopes": slopes, "numbers": numbers}
-TABLES |= {"members": members, "loops": loops}
+TABLES |= {"members": members, "loops": loops, "particles": particles}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
