@@ -8,7 +8,8 @@ from typing import ClassVar
 from filters.ensembles.ensemble import advance
 from filters.pages.page_filter import Page
 from filters.particles import weighted
-from filters.particles.weighted import WeightedFilter, expect, fit, spread
+from filters.particles.renewal import spread
+from filters.particles.weighted import WeightedFilter, expect, fit
 from thruster_env.numerics.algebra.blocks import zeros
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import on_branch

@@ -12,10 +12,8 @@ from filters.ensembles.ensemble import advance, settle
 from filters.pages.page_filter import Page
 from filters.particles.kernels import particle_kernels
 from filters.particles.proposal import OPTIMAL
-from filters.particles.weighted import ResampledFilter, expect, fit, spread, start
-from thruster_env.numerics.algebra import members
-from thruster_env.numerics.algebra.points import outer, root
-from thruster_env.numerics.algebra.scalars import entries_product
+from filters.particles.renewal import draw, smooth, spread
+from filters.particles.weighted import ResampledFilter, expect, fit, start
 from thruster_env.numerics.checks import one_of
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
@@ -25,18 +23,6 @@ def update(model, x, log_w, z, e):
     """The measurement z; channels that are NaN are missing."""
     y, v, S = expect(model, x, log_w, z)
     return x, log_w + fit(model, y, z), v, S
-
-
-def draw(model, x, mean, P, e):
-    """Particles of a Gaussian, in the place of others."""
-    return mean + root(P) @ e
-
-
-def smooth(model, x, mean, P, e):
-    """The states that are `smoothed` drawn together by a, and spread so that their covariance stays."""
-    own = model.own
-    L = root(entries_product(P, outer(own.smoothed, own.smoothed)))
-    return x - entries_product(own.smoothed, x - members.mean(x)) * own.drawn + L @ e * own.width
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,4 +1,4 @@
-"""What particle filters share: what a weighted sample expects to be measured, its kernel, and its size."""
+"""What particle filters share: what a weighted sample expects to be measured, and its size."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.pages.page_filter import FilterWithPage, Page
 from filters.particles.kernels import particle_kernels
+from filters.particles.renewal import kernel_width
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import on_branch
 from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import root
 from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
 from thruster_env.numerics.checks import at_least, finite, positive
 
@@ -36,21 +36,6 @@ def fit(model, y, z):
     seen = present(z)
     rest = only(seen, wrap(z - y, model.measurement_angles))
     return log_density(rest, uncorrelated(seen, model.R), seen)
-
-
-def spread(model, x, mean, P, e):
-    """Particles that are copies of one, spread by a kernel with a part of the covariance of all."""
-    return x + root(P) @ e * model.own.width
-
-
-def kernel_width(count: int, size: int) -> float:
-    """The width h = (4/(d + 2))^(1/(d + 4)) N^(-1/(d + 4)) of a kernel for N particles in d dimensions.
-
-    It makes the mean integrated square error of the density least where that is Gaussian.
-
-    Source: Silverman (1986), Density Estimation for Statistics and Data Analysis, section 4.3.2.
-    """
-    return (4.0 / ((count + 2.0) * size)) ** (1.0 / (count + 4.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
