@@ -15,11 +15,11 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import own_place
-from filters.ensembles.adaptive import row_moments
 from filters.ensembles.deterministic import DeterministicUpdateFilter
-from filters.ensembles.ensemble import compare
 from filters.ensembles.localised import LocalisedFilter
 from filters.ensembles.rotation import with_rotation
+from filters.ensembles.rows import row_moments
+from filters.ensembles.steps import compare
 from filters.pages.members import members_kernels
 from filters.pages.page import Page
 from filters.particles.motion import silencer
@@ -118,7 +118,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     The update goes through channels, each of which moves by `moves_of(y, v, tail, moves, size)`; through states if
     that is None.
     """
-    plain = members_kernels(page._replace(update=look), functions, shape)
+    plain = members_kernels(page, functions, shape)
     n, m, angles, serial = shape.n, shape.m, np.array(shape.measurement_angles), moves_of is not None
     constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     observe, silence = functions.observe, silencer(n, shape.measurement_angles)
@@ -205,11 +205,16 @@ class LocalisedByParts(LocalisedFilter, DeterministicUpdateFilter):
         tail = NormalDist().inv_cdf(1.0 / (self.ensemble_size + 1))
         return {"taper": np.where(taper > LEAST, taper, 0.0), "tail": tail}
 
+    @property
+    def plain_page(self) -> Page:
+        """The page without what controls the spread; one that goes by parts moves no member in an update."""
+        page = super().plain_page
+        return page._replace(update=look) if self.by_parts else page
+
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         if not self.by_parts:
             return super().kernels()
         page, model = self.page_with(self.inflation != 1.0, relaxation=False), self.kernel_model
         kernels = kernels_by_parts(page, model.functions, model.shape, type(self).moves_of)
-        kernels = self.adapted(kernels, page)
         return with_rotation(kernels) if self.rotations else kernels

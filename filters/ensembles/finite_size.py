@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from filters.ensembles.deterministic import DeterministicUpdateFilter
-from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.densities import dot
 from thruster_env.numerics.algebra.geometric import geometric_mean

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from filters.ensembles.by_parts import LocalisedByParts, look
-from filters.ensembles.ensemble import advance, settle
+from filters.ensembles.steps import advance, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.compiled import inlined
 

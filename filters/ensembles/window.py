@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
-from filters.ensembles.adaptive import row_moments, stretch_row
-from filters.ensembles.ensemble import compare, expect
+from filters.ensembles.rows import row_moments, stretch_row
+from filters.ensembles.steps import compare, expect
 from filters.pages.members import MembersMemory, stages_of, works_of
 from filters.pages.page import Page
 from filters.pages.programs import stored

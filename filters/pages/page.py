@@ -34,6 +34,10 @@ class Page(NamedTuple):
     own: tuple[tuple[str, tuple[int, ...]], ...] = ()  # parameters and their shapes
     fixed: tuple[tuple[str, Any], ...] = ()  # values that stand in programs, such as how often a loop runs
 
+    def started(self, model: Any) -> dict[str, Any]:
+        """What a filter keeps, at the prior."""
+        return {} if self.start is None else self.start(model)
+
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
         """What pages find in `model.own`: `read(place, shape)` of each parameter, and fixed values."""
         values, place = [], 0
