@@ -30,5 +30,5 @@ def stretch_row(table, i, factor, size):
 def relax_row(table, i, before, part, size):
     """Give back a part of what the standard deviation of a row has lost, of its variance before an update."""
     _, after = row_moments(table, i, size)
-    if part > 0.0 and after > 0.0:
+    if after > 0.0:
         stretch_row(table, i, 1.0 + part * ((before / after) ** 0.5 - 1.0), size)
