@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.layout import memory_places
-from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.page_is_all import check_page_is_all
 from filters.filter import Filter
 from filters.pages.equations import Equations
 from filters.pages.kernels import stages_of

@@ -106,15 +106,3 @@ def adapted(page: Page) -> Page:
         return after, v, S, level, {"factor": t, "width": p}
 
     return page._replace(start=start, settle=settle, update=update)
-
-
-def width_of(deviation: float) -> float:
-    """The width p of an inverse gamma density, below 1/3, with a standard deviation over its mode."""
-
-    def excess(root):
-        p = root * root
-        return root - deviation * (1.0 - 2.0 * p) * max(1.0 - 3.0 * p, 0.0) ** 0.5
-
-    from scipy.optimize import brentq  # loads half of SciPy, for this line
-
-    return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # of the root, so that small ones are exact, too

@@ -1,46 +1,25 @@
-"""What all ensemble filters share: motion, what a measurement says of the members, and their class."""
+"""The class of all ensemble filters: their page, and what controls the spread of the members."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from filters.engine.belief import Belief, Kernels
-from filters.ensembles.adaptive import adapted, width_of
+from filters.ensembles.adaptive import adapted
 from filters.ensembles.inflation import inflated, relaxed
-from filters.pages.members import analysis_of, members_kernels
+from filters.ensembles.spread import checked, limits
+from filters.pages.members import members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
-from thruster_env.numerics.checks import at_least, positive, short_repr, switch
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.numerics.checks import at_least
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = (  # parameters that no page reads
-    "ensemble_size",
-    "rotations",
-    "radius",
-    "adaptive_inflation",
-    "inflation_by_state",
-    "least_deviation",
-    "window",
+OF_THE_ENGINE = frozenset(  # parameters that no page reads
+    "ensemble_size rotations radius adaptive_inflation inflation_by_state least_deviation window".split()
 )
-
-
-def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
-    """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
-    if getattr(filter_, "rotations", 0):
-        raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
-    if filter_.by_parts:
-        rule = f"an ensemble {where} must have a page for its whole update, as 'etkf' has"
-        raise ValueError(f"{rule}, but got {named(filter_)}")
-
-
-def named(filter_: EnsembleFilter) -> str:
-    """The name of a filter, with what makes its update more than its page."""
-    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "window"))
-    return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,25 +59,9 @@ class EnsembleFilter(FilterWithPage):
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
-        size = at_least("ensemble_size", self.ensemble_size, 2)
-        if size > LARGEST_ENSEMBLE:
-            raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
-        relaxation = positive("relaxation", self.relaxation, zero_allowed=True)
-        if relaxation > 1.0:
-            raise ValueError(f"relaxation must be at most 1, but got {short_repr(self.relaxation)}")
-        object.__setattr__(self, "ensemble_size", size)
-        object.__setattr__(self, "inflation", positive("inflation", self.inflation))
-        object.__setattr__(self, "relaxation", relaxation)
-        deviation = positive("adaptive_inflation", self.adaptive_inflation, zero_allowed=True)
-        object.__setattr__(self, "adaptive_inflation", deviation)
-        switch("inflation_by_state", self.inflation_by_state)
-        if self.inflation_by_state and not deviation:
-            raise ValueError("adaptive_inflation of a filter with inflation_by_state must be positive, but got 0")
-        least = positive("least_deviation", self.least_deviation, zero_allowed=True)
-        if least > deviation:
-            rule = f"least_deviation must be at most adaptive_inflation, {deviation:g}"
-            raise ValueError(f"{rule}, but got {short_repr(self.least_deviation)}")
-        object.__setattr__(self, "least_deviation", least)
+        size = at_least("ensemble_size", self.ensemble_size, 2, LARGEST_ENSEMBLE)
+        for name, number in {"ensemble_size": size, **checked(self)}.items():
+            object.__setattr__(self, name, number)
 
     @property
     def by_parts(self) -> bool:
@@ -113,20 +76,12 @@ class EnsembleFilter(FilterWithPage):
     @property
     def parameters(self) -> Mapping[str, Any]:
         """Fields that the page reads, and limits of each factor of an adaptive inflation, if it is chosen."""
-        limits = {"deviation": self.adaptive_inflation}
-        if self.least_deviation:
-            limits = {"widest": width_of(self.adaptive_inflation), "narrowest": width_of(self.least_deviation)}
-        factors = np.ones(self.model.n) if self.inflation_by_state else 1.0
-        adaptive = {name: factors * limit for name, limit in limits.items()} if self.adaptive_inflation else {}
-        return {**super().parameters, **adaptive}
+        count = np.ones(self.model.n) if self.inflation_by_state else 1.0
+        limits_of_factors = limits(self.adaptive_inflation, self.least_deviation).items()
+        return {**super().parameters, **{name: count * limit for name, limit in limits_of_factors}}
 
     def _fields(self) -> Iterator[str]:
         return (name for name in super()._fields() if name not in OF_THE_ENGINE)
-
-    @property
-    def plain_page(self) -> Page:
-        """The page without what controls the spread."""
-        return super().written_page
 
     @property
     def written_page(self) -> Page:
@@ -149,7 +104,3 @@ class EnsembleFilter(FilterWithPage):
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
-
-    def analysis(self, functions: Functions, shape: Shape) -> Callable:
-        """Return `analyse(memory, z, numbers, size)`: the update of a model's members, without relaxation."""
-        return analysis_of(self.plain_page, functions, shape)
