@@ -5,7 +5,6 @@ from __future__ import annotations
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import covariance, mean, on_branch
 from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import entries_product
 
 
 def advance(model, x, u):
@@ -33,6 +32,6 @@ def compare(model, x, z):
     v = only(seen, wrap(z - mean(y), model.measurement_angles))
     C, A = covariance(x, y), covariance(y, y)
     if hasattr(model.own, "between"):
-        C, A = entries_product(C, model.own.taper), sym(entries_product(A, model.own.between))
+        C, A = C * model.own.taper, sym(A * model.own.between)
     S = A + R
     return y - mean(y), C, v, S, R, log_density(v, S, seen)
