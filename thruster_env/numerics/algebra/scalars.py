@@ -13,6 +13,7 @@ from thruster_env.numerics.algebra.graphs import where
 from thruster_env.numerics.algebra.matrices import (
     Matrix,
     entries_product,
+    magnitude,
     operation,
     plus,
     power,
@@ -138,6 +139,17 @@ def _of_entries(result, arguments, slopes):
 def _of_limit(result, arguments, slopes):
     v, value = arguments
     return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@at_least.derivative
+def _of_lower_limit(result, arguments, slopes):
+    a, value = arguments
+    return through(lambda slope: choose(exceeds(a, value), slope, slope * 0.0), slopes[0])
+
+
+@magnitude.derivative
+def _of_magnitude(result, arguments, slopes):
+    return through(lambda slope: choose(exceeds(arguments[0], 0.0), slope, slope * -1.0), slopes[0])
 
 
 @diagonal.derivative
