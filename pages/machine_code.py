@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from filters import StateSpaceModel
 from filters.differentiated.memory import Memory
 from filters.differentiated.recursion import MOST, Wanted, stages_of
-from filters.ensembles import deterministic, ensemble, stochastic
+from filters.ensembles import deterministic, steps, stochastic
 from filters.gaussian import extended
 from filters.pages import kernels
 from filters.pages.equations import Equations
@@ -131,7 +131,7 @@ def program() -> str:
 
 def members() -> str:
     """The ensemble Kalman filter as it stands in a textbook."""
-    functions = ensemble.advance, ensemble.settle, ensemble.compare, stochastic.update
+    functions = steps.advance, steps.settle, steps.compare, stochastic.update
     return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
 
 

@@ -74,7 +74,7 @@ class EnsembleWriter(Writer):
     {self.real} normals[{normals}]; /* scratch */
     uint32_t key[2];        /* with the step, what random numbers depend on */
     uint32_t step;          /* steps predicted */
-"""
+{super().kept()}"""
 
     def constants(self) -> Mapping[str, np.ndarray]:
         """Arrays by their names."""

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.layout import memory_places
-from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.page_is_all import check_page_is_all
 from filters.filter import Filter
 from filters.pages.equations import Equations
 from filters.pages.kernels import stages_of
@@ -150,13 +151,16 @@ def _of_members(paged: EnsembleFilter) -> FilterPrograms:
     places = memory_places(shape.n, shape.m)
     v, s = (told[Place("rows", at)] for at in (places.innovation, places.innovation_cov))
     stages["update"].values[Place("rows", NIS)] = _nis(v, s)
+    kept = {name: one.shape for name, one in memory.kept.items()}
+    others = [(one.operation.at, one.shape, f"filter->{name}") for name, one in memory.kept.items()]
     begin = Program([], [], [])
     start, advance, settle, update, summarise = (
-        _program(dict(stages[name].stores[0]), _where(shape, "filter->x", given, []), numbers, Graph(MOST, size))
+        _program(dict(stages[name].stores[0]), lies, numbers, Graph(MOST, size))
         for name, given in (("start", "u"), ("advance", "u"), ("settle", "u"), ("update", "z"), ("summarise", "z"))
+        for lies in [_where(shape, "filter->x", given, others)]
     )
     programs = start, begin, advance, settle, update, summarise
-    return FilterPrograms(*programs, {}, 0, 0, size, model, type(paged).page.update.__module__)
+    return FilterPrograms(*programs, kept, 0, 0, size, model, type(paged).page.update.__module__)
 
 
 def _nis(v: Matrix, s: Matrix) -> Matrix:

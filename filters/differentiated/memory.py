@@ -43,7 +43,7 @@ class Memory(NumbersMemory):
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
         flying = (x, self.P) if page.begin is None else together(page.begin(model, x, self.P))
-        started = {} if page.start is None else page.start(model)
+        started = page.started(model)
         self.begun, self.notes = n + n * n, m + m * m
         starts = starts_of(*(prod(one.shape) for one in flying))
         self.kept_from = max(self.begun, starts[-1])

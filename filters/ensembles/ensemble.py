@@ -1,83 +1,25 @@
-"""What all ensemble filters share: motion, what a measurement says of the members, and their class."""
+"""The class of all ensemble filters: their page, and what controls the spread of the members."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from filters.engine.belief import Belief, Kernels
-from filters.engine.layout import own_place
-from filters.ensembles.adaptive import width_of, with_adaptive_inflation, with_inflation_by_state
+from filters.ensembles.adaptive import adapted
 from filters.ensembles.inflation import inflated, relaxed
-from filters.pages.members import analysis_of, members_kernels
+from filters.ensembles.spread import checked, limits
+from filters.pages.members import members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.members import covariance, mean, on_branch
-from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import entries_product
-from thruster_env.numerics.checks import at_least, positive, short_repr, switch
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.numerics.checks import at_least
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = (  # parameters that no page reads
-    "ensemble_size",
-    "rotations",
-    "radius",
-    "adaptive_inflation",
-    "inflation_by_state",
-    "least_deviation",
-    "window",
+OF_THE_ENGINE = frozenset(  # parameters that no page reads
+    "ensemble_size rotations radius adaptive_inflation inflation_by_state least_deviation window".split()
 )
-
-
-def advance(model, x, u):
-    """One of the model's substeps."""
-    return model.f(x, u)
-
-
-def settle(model, x, w):
-    """The end of a step."""
-    return on_branch(x + model.Q_root @ w, model.state_angles)
-
-
-def expect(model, x, z):
-    """What a member expects to be measured; zero in channels that are NaN in z."""
-    return on_branch(only(present(z), model.h(x)), model.measurement_angles)
-
-
-def compare(model, x, z):
-    """A member's y less their mean, cov(x, y), innovation v, S, R, log N(v; 0, S).
-
-    Covariances are tapered where a filter has tapers between channels.
-    """
-    seen, y = present(z), expect(model, x, z)
-    R = uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - mean(y), model.measurement_angles))
-    C, A = covariance(x, y), covariance(y, y)
-    if hasattr(model.own, "between"):
-        C, A = entries_product(C, model.own.taper), sym(entries_product(A, model.own.between))
-    S = A + R
-    return y - mean(y), C, v, S, R, log_density(v, S, seen)
-
-
-def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
-    """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
-    if getattr(filter_, "rotations", 0):
-        raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
-    if number := filter_.adaptive_inflation:
-        raise ValueError(f"an ensemble {where} must have no adaptive_inflation, but got {number:g}")
-    if filter_.by_parts:
-        rule = f"an ensemble {where} must have a page for its whole update, as 'etkf' has"
-        raise ValueError(f"{rule}, but got {named(filter_)}")
-
-
-def named(filter_: EnsembleFilter) -> str:
-    """The name of a filter, with what makes its update more than its page."""
-    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "window"))
-    return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,25 +59,9 @@ class EnsembleFilter(FilterWithPage):
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
-        size = at_least("ensemble_size", self.ensemble_size, 2)
-        if size > LARGEST_ENSEMBLE:
-            raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
-        relaxation = positive("relaxation", self.relaxation, zero_allowed=True)
-        if relaxation > 1.0:
-            raise ValueError(f"relaxation must be at most 1, but got {short_repr(self.relaxation)}")
-        object.__setattr__(self, "ensemble_size", size)
-        object.__setattr__(self, "inflation", positive("inflation", self.inflation))
-        object.__setattr__(self, "relaxation", relaxation)
-        deviation = positive("adaptive_inflation", self.adaptive_inflation, zero_allowed=True)
-        object.__setattr__(self, "adaptive_inflation", deviation)
-        switch("inflation_by_state", self.inflation_by_state)
-        if self.inflation_by_state and not deviation:
-            raise ValueError("adaptive_inflation of a filter with inflation_by_state must be positive, but got 0")
-        least = positive("least_deviation", self.least_deviation, zero_allowed=True)
-        if least > deviation:
-            rule = f"least_deviation must be at most adaptive_inflation, {deviation:g}"
-            raise ValueError(f"{rule}, but got {short_repr(self.least_deviation)}")
-        object.__setattr__(self, "least_deviation", least)
+        size = at_least("ensemble_size", self.ensemble_size, 2, LARGEST_ENSEMBLE)
+        for name, number in {"ensemble_size": size, **checked(self)}.items():
+            object.__setattr__(self, name, number)
 
     @property
     def by_parts(self) -> bool:
@@ -149,12 +75,10 @@ class EnsembleFilter(FilterWithPage):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Fields that the page reads, and the deviation of an adaptive inflation, if it is chosen."""
-        if not self.adaptive_inflation:
-            return super().parameters
-        limits = self.adaptive_inflation, self.least_deviation
-        deviation = np.array([width_of(one) for one in limits]) if self.least_deviation else limits[0]
-        return {**super().parameters, "deviation": deviation}
+        """Fields that the page reads, and limits of each factor of an adaptive inflation, if it is chosen."""
+        count = np.ones(self.model.n) if self.inflation_by_state else 1.0
+        limits_of_factors = limits(self.adaptive_inflation, self.least_deviation).items()
+        return {**super().parameters, **{name: count * limit for name, limit in limits_of_factors}}
 
     def _fields(self) -> Iterator[str]:
         return (name for name in super()._fields() if name not in OF_THE_ENGINE)
@@ -165,11 +89,13 @@ class EnsembleFilter(FilterWithPage):
         return self.page_with(self.inflation != 1.0, self.relaxation != 0.0)
 
     def page_with(self, inflation: bool = True, relaxation: bool = True) -> Page:
-        """The page, with inflation, relaxation, or both."""
-        page = super().written_page
+        """The page, with inflation, relaxation, or both, and adaptive inflation if it is chosen."""
+        page = self.plain_page
         if inflation:
             page = page._replace(settle=inflated(page.settle))
-        return page._replace(update=relaxed(page.update)) if relaxation else page
+        if relaxation:
+            page = page._replace(update=relaxed(page.update))
+        return adapted(page) if self.adaptive_inflation else page
 
     def sample(self, belief: Belief) -> np.ndarray:
         """The members of a belief, (n, N), without what a filter keeps beside them."""
@@ -177,20 +103,4 @@ class EnsembleFilter(FilterWithPage):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        model, page = self.kernel_model, self.written_page
-        return self.adapted(members_kernels(page, model.functions, model.shape), page)
-
-    def adapted(self, kernels: Kernels, page: Page) -> Kernels:
-        """Kernels of a page with adaptive inflation, if it is chosen."""
-        if not self.adaptive_inflation:
-            return kernels
-        model = self.kernel_model
-        places, updates_deviation = page.places(own_place(model.shape)), self.least_deviation > 0.0
-        if self.inflation_by_state:
-            chosen = places["deviation"], updates_deviation, places.get("taper")
-            return with_inflation_by_state(kernels, model.functions, model.shape, *chosen)
-        return with_adaptive_inflation(kernels, places["deviation"], updates_deviation)
-
-    def analysis(self, functions: Functions, shape: Shape) -> Callable:
-        """Return `analyse(memory, z, numbers, size)`: the update of a model's members, without relaxation."""
-        return analysis_of(super().written_page, functions, shape)
+        return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)

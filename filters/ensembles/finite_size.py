@@ -8,23 +8,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from filters.ensembles.deterministic import DeterministicUpdateFilter
-from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.densities import dot
 from thruster_env.numerics.algebra.geometric import geometric_mean
 from thruster_env.numerics.algebra.members import mean
 from thruster_env.numerics.algebra.operations import divide, eye, present, sym
 from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.scalars import (
-    choose,
-    constant,
-    count,
-    exceeds,
-    exponential,
-    power,
-    ratio,
-    trace,
-)
+from thruster_env.numerics.algebra.scalars import at_least, choose, constant, count, exceeds, exponential, trace
 from thruster_env.numerics.checks import positive
 
 ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
@@ -37,15 +28,15 @@ def variance_factor(own, A, R, v):
     B = divide(L.T, R)
     G, g = sym(B @ L), B @ v
     unit = eye(G)
-    shift = exponential((ratio(trace(divide(G, unit + G)), own.size) - constant(1.0, own.size)) * own.log_mode)
-    low, high = own.low * shift, ratio(own.high, shift)
-    t, least = constant(1.0, own.size), ratio(low, high)
+    shift = exponential((trace(divide(G, unit + G)) / own.size - 1.0) * own.log_mode)
+    low, high = own.low * shift, own.high / shift
+    t, least = constant(1.0, own.size), low / high
     for _ in range(ROUNDS):
         of = unit + G * t
         q = divide(g, of)  # t q'q is the square of the members' weights
-        rest = t - ratio(low + ratio(t * t * dot(q, q), own.degrees), high)
-        slope = constant(1.0, t) - ratio(t * 2.0 * dot(q, divide(q, of)), own.degrees * high)
-        t = t - ratio(rest, choose(exceeds(slope, FLATTEST), slope, constant(FLATTEST, t)))
+        rest = t - (low + t * t * dot(q, q) / own.degrees) / high
+        slope = 1.0 - t * 2.0 * dot(q, divide(q, of)) / (own.degrees * high)
+        t = t - rest / at_least(slope, FLATTEST)
         t = choose(exceeds(t - least, 0.0), t, least)
     return t
 
@@ -55,8 +46,8 @@ def update(model, x, z, e):
     d, C, v, S, R, level = compare(model, x, z)
     t = variance_factor(model.own, S - R, R, v)
     t = choose(exceeds(count(present(z)), 0.0), t, constant(1.0, t))
-    spread, C, total = power(t, 0.5), C * t, (S - R) * t + R
-    x = x + (x - mean(x)) * (spread - constant(1.0, spread))
+    spread, C, total = t**0.5, C * t, (S - R) * t + R
+    x = x + (x - mean(x)) * (spread - 1.0)
     return x + (divide(C, total) @ v - divide(C, total + geometric_mean(R, total)) @ (d * spread)), v, S, level
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from functools import cache
 
 from thruster_env.numerics.algebra.members import mean, stretches, variances
-from thruster_env.numerics.algebra.scalars import entries_product
 
 
 @cache
@@ -34,6 +33,6 @@ def relaxed(update: Callable) -> Callable:
     def update_relaxed(model, x, z, e):
         after, *told = update(model, x, z, e)
         factors = stretches(variances(x), variances(after), model.own.relaxation)
-        return mean(after) + entries_product(factors, after - mean(after)), *told
+        return mean(after) + (after - mean(after)) * factors, *told
 
     return update_relaxed

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.engine.belief import Kernels
-from filters.ensembles.ensemble import EnsembleFilter, advance, compare, expect, settle
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.steps import advance, compare, expect, settle
 from filters.ensembles.window import seen_anew, window_kernels
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.geometric import geometric_mean

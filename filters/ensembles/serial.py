@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.ensembles.by_parts import LocalisedByParts, gaussian_moves
-from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.by_parts import LocalisedByParts
+from filters.ensembles.parts import gaussian_moves
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.blocks import triangle_quotient
 from thruster_env.numerics.algebra.operations import divide

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.ensembles.ensemble import advance, compare, settle
 from filters.ensembles.localised import LocalisedFilter
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.members import centred
 from thruster_env.numerics.algebra.operations import divide

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from filters.ensembles.by_parts import LocalisedByParts
 from filters.ensembles.deterministic import DeterministicUpdateFilter
-from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.geometric import geometric_mean
 from thruster_env.numerics.algebra.operations import divide

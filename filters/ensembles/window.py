@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
-from filters.ensembles.adaptive import row_moments, stretch_row
-from filters.ensembles.ensemble import compare, expect
+from filters.ensembles.rows import relax_row, row_moments, stretch_row
+from filters.ensembles.steps import compare, expect
 from filters.pages.members import MembersMemory, stages_of, works_of
 from filters.pages.page import Page
 from filters.pages.programs import stored
@@ -138,9 +138,8 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     row_places, substeps = memory_places(n, m), number_places(n, m).substeps
     step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
     own = page.places(own_place(shape))
-    inflation, relaxation = own["inflation"], own["relaxation"]
+    inflation, relaxation, rows = own["inflation"], own["relaxation"], n * (length + 1)
     window, moved, slopes, pulls, _, steps, inputs, _, _ = at
-    rows = n * (length + 1)
 
     @inlined
     def start(memory, numbers, size):
@@ -228,13 +227,8 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
                 for i in range(rows):
                     pull_row(table, window + i, moved + i, slopes, pulls, m, size)
                     if iteration == iterations and numbers[relaxation] > 0.0:
-                        (_, before), (_, after) = (
-                            row_moments(table, window + i, size),
-                            row_moments(table, moved + i, size),
-                        )
-                        if after > 0.0:
-                            factor = 1.0 + numbers[relaxation] * ((before / after) ** 0.5 - 1.0)
-                            stretch_row(table, moved + i, factor, size)
+                        _, before = row_moments(table, window + i, size)
+                        relax_row(table, moved + i, before, numbers[relaxation], size)
                 run_window(memory, moved, numbers, size)
                 if iteration < iterations:
                     again(row, z, numbers, table, draws, size)
@@ -247,16 +241,5 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         moments_of(row, row, row, table, draws, size)
 
     used = max(at.scratch, *(work.rows for work in works.values()))
-    return Kernels(
-        n,
-        m,
-        used,
-        max(n, m),
-        start,
-        predict,
-        update,
-        summarise,
-        extras=1 + length * p,
-        extra_kept_rows=rows,
-        scratch=m + m * m,
-    )
+    sizes = 1 + length * p, rows, m + m * m  # of what is kept of the row and of the table, and scratch
+    return Kernels(n, m, used, max(n, m), start, predict, update, summarise, *sizes)

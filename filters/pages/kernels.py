@@ -22,9 +22,8 @@ from thruster_env.plants.shape import Functions, Shape
 def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     """What a page stores: at the start, where a prediction begins, in each substep, at its end, in an update."""
     places, x, p = memory_places(memory.shape.n, memory.shape.m), memory.x, memory.P
-    started = {} if page.start is None else page.start(model)
-    memory.keep(started)
-    model.kept = memory.kept
+    started = page.started(model)
+    model.kept = memory.keep(started)
     begun = (x, p) if page.begin is None else together(page.begin(model, x, p))
     flying = (x, p) if page.begin is None else [memory.another(one) for one in begun]
     advanced = together(page.advance(model, *flying, memory.u))

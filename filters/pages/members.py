@@ -12,7 +12,7 @@ from filters.engine.layout import memory_places, own_place
 from filters.pages.equations import Equations, PagedModel
 from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
-from filters.pages.programs import stored
+from filters.pages.programs import stored, with_kept
 from filters.pages.stages import Stage, as_calls, as_programs
 from thruster_env.numerics.algebra.graphs import TooLarge
 from thruster_env.numerics.algebra.loops import cut
@@ -26,13 +26,13 @@ from thruster_env.plants.layout import LANES, constants_reader, number_places
 from thruster_env.plants.shape import Functions, Shape
 
 # Operations and sums of a stage: beyond, instructions take longer to compile than calls.
-MOST, MOST_SUMS = 10_000, 500
+MOST, MOST_SUMS = 14_000, 600
 
 
 class MembersMemory(NumbersMemory):
     """The memory of an ensemble.
 
-    rows     the row of `filters.engine.layout`
+    rows     the row of `filters.engine.layout`: its extras are what the filter keeps beside its members
     given    u or z
     numbers  the model's, then the filter's own
     table    a row for each component of the members x, then scratch
@@ -56,14 +56,16 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     x, places = memory.x, memory_places(memory.shape.n, memory.shape.m)
     told = places.innovation, places.innovation_cov, places.log_likelihood
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
-    moved, *rest = page.update(model, x, memory.z, memory.e)
+    started = page.started(model)
+    kept = model.kept = memory.keep(started)
+    moved, *rest, changed = with_kept(page.update(model, x, memory.z, memory.e))
     of_belief = memory.mean, memory.P
     return {
-        "start": stored((prior,), (x,)),
+        "start": stored((prior, started), (x,), kept),
         "advance": stored((page.advance(model, x, memory.u),), (x,)),
         "settle": stored((page.settle(model, x, memory.w),), (x,)),
         "analyse": stored((moved,), (x,)),
-        "update": stored((moved, *rest, *moments(model, moved)), (x, *told, *of_belief)),
+        "update": stored((moved, *rest, *moments(model, moved), changed), (x, *told, *of_belief), kept),
         "summarise": stored(moments(model, x), of_belief),
     }
 
@@ -171,6 +173,11 @@ def _correction(work: Works, shape: Shape) -> Callable:
     return update_with_noise if draws_noise else update
 
 
+def kept_size(page: Page, shape: Shape) -> int:
+    """How many numbers a page keeps beside the members."""
+    return sum(prod(one.shape) for one in page.started(PagedModel(MembersMemory(shape, page))).values())
+
+
 @lru_cache(maxsize=64)
 def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of an ensemble's page for a model's functions and shape."""
@@ -200,4 +207,4 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         moments_of(row, row, row, table, draws, size)
 
     update, rows = _correction(works["update"], shape), max(work.rows for work in works.values())
-    return Kernels(n, m, rows, max(n, m), start, predict, update, summarise)
+    return Kernels(n, m, rows, max(n, m), start, predict, update, summarise, extras=kept_size(page, shape))

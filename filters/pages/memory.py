@@ -20,6 +20,7 @@ class NumbersMemory:
     Attributes:
         own: parameters, as pages find them.
         kept: what the filter keeps besides mean and covariance, by name.
+        end: the next place in a filter's row, behind what is kept.
         constants_slope, size: along a parameter that moves constants, if there are such.
         ratio: the last input as a number, if it is the step ratio.
         belief: where mean and covariance lie.
@@ -45,6 +46,7 @@ class NumbersMemory:
         self.constants = self.read("numbers", at, shape.constants)
         self.own = page.parameters(lambda place, size: self.read("numbers", own + place, *size))
         self.kept: Mapping[str, Matrix] = {}
+        self.end = row.extras
         self.constants_slope: Matrix | None = None
         self.ratio: Matrix | None = None
         self.size: Matrix | None = None
@@ -56,6 +58,17 @@ class NumbersMemory:
     def read(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
         """A matrix that lies in an array from a place on."""
         return given(Place(array, first), shape, symmetric=symmetric, like=self.x)
+
+    def keep(self, started: Mapping[str, Any]) -> Mapping[str, Matrix]:
+        """Give what a filter keeps its place, one behind the other."""
+        self.kept = {name: self.another(one, symmetric=one.symmetric) for name, one in started.items()}
+        return self.kept
+
+    def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
+        """A matrix of the same shape in the next places of the row."""
+        made = self.read("rows", self.end, *like.shape, symmetric=symmetric)
+        self.end += prod(like.shape)
+        return made
 
 
 class RowMemory(NumbersMemory):
@@ -74,14 +87,3 @@ class RowMemory(NumbersMemory):
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
-        self.end = row.extras
-
-    def keep(self, started: Mapping[str, Any]) -> None:
-        """Give what a filter keeps its place, one behind the other."""
-        self.kept = {name: self.another(one, symmetric=one.symmetric) for name, one in started.items()}
-
-    def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
-        """A matrix of the same shape in the next places of the row."""
-        made = self.read("rows", self.end, *like.shape, symmetric=symmetric)
-        self.end += prod(like.shape)
-        return made

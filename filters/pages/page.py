@@ -37,6 +37,10 @@ class Page(NamedTuple):
     foresee: Callable | None = None  # of particles that are resampled in the update, before that
     of_each: tuple[str, ...] = ()  # what is kept of each particle
 
+    def started(self, model: Any) -> dict[str, Any]:
+        """What a filter keeps, at the prior."""
+        return {} if self.start is None else self.start(model)
+
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
         """What pages find in `model.own`: `read(place, shape)` of each parameter, and fixed values."""
         values, place = [], 0

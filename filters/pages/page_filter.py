@@ -49,10 +49,15 @@ class FilterWithPage(Filter):
         return tuple(float(number) for value in self.parameters.values() for number in np.ravel(value))
 
     @property
-    def written_page(self) -> Page:
+    def plain_page(self) -> Page:
         """The page, with the shapes of the parameters."""
         own = tuple((name, np.shape(value)) for name, value in self.parameters.items())
         return self.page._replace(own=own, fixed=tuple((name, getattr(self, name)) for name in self.unrolled))
+
+    @property
+    def written_page(self) -> Page:
+        """The page that is run: the plain one, unless a filter says otherwise."""
+        return self.plain_page
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +73,7 @@ class PageFilter(FilterWithPage):
     @property
     def written_page(self) -> Page:
         """The page of the form, with the shapes of the parameters."""
-        page = super().written_page
+        page = self.plain_page
         form = self.forms.get(getattr(self, "form", ""))
         return page if form is None else form._replace(own=page.own, fixed=page.fixed)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.ensembles.ensemble import advance
+from filters.ensembles.steps import advance
 from filters.pages.page_filter import Page
 from filters.particles import weighted
 from filters.particles.renewal import spread

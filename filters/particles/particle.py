@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from filters.baselines.baselines import places_of
 from filters.engine.belief import Kernels
-from filters.ensembles.ensemble import advance, settle
+from filters.ensembles.steps import advance, settle
 from filters.pages.page_filter import Page
 from filters.particles.kernels import particle_kernels
 from filters.particles.proposal import OPTIMAL

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from filters.ensembles.ensemble import advance
+from filters.ensembles.steps import advance
 from filters.pages.page import Page
 from filters.particles import auxiliary
 from filters.particles.weighted import expect

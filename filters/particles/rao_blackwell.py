@@ -18,7 +18,6 @@ from thruster_env.numerics.algebra.members import on_branch
 from thruster_env.numerics.algebra.operations import sym, wrap
 from thruster_env.numerics.algebra.points import outer, root, square
 from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
-from thruster_env.numerics.algebra.scalars import entries_product
 from thruster_env.numerics.streams import FILTER_PROPOSAL, GROUP, fill_normals
 from thruster_env.plants.layout import padded
 
@@ -59,7 +58,7 @@ def settle(model, x, w):
 def spread(model, x, mean, P, e):
     """Copies of a particle, whose sampled states get a kernel's covariance, of which the next step draws."""
     flags = model.own.flags
-    return x, {"P": model.kept["P"] + sym(entries_product(P, outer(flags, flags))) * model.own.kernel}
+    return x, {"P": model.kept["P"] + sym(P * outer(flags, flags)) * model.own.kernel}
 
 
 def update(model, x, log_w, z, e):

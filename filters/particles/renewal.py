@@ -7,9 +7,8 @@ filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d
 
 from __future__ import annotations
 
-from thruster_env.numerics.algebra import members
+from thruster_env.numerics.algebra.members import mean as mean_of
 from thruster_env.numerics.algebra.points import outer, root
-from thruster_env.numerics.algebra.scalars import entries_product
 
 
 def spread(model, x, mean, P, e):
@@ -35,5 +34,5 @@ def draw(model, x, mean, P, e):
 def smooth(model, x, mean, P, e):
     """The states that are `smoothed` drawn together by a, and spread so that their covariance stays."""
     own = model.own
-    L = root(entries_product(P, outer(own.smoothed, own.smoothed)))
-    return x - entries_product(own.smoothed, x - members.mean(x)) * own.drawn + L @ e * own.width
+    L = root(P * outer(own.smoothed, own.smoothed))
+    return x - own.smoothed * (x - mean_of(x)) * own.drawn + L @ e * own.width

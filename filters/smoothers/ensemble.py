@@ -13,7 +13,9 @@ from filters.engine.belief import Kernels
 from filters.engine.compile import new_memory
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
-from filters.ensembles.ensemble import EnsembleFilter, named
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.page_is_all import named
+from filters.pages.members import analysis_of
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.numerics.threads import spread
 from thruster_env.numerics.tuples import joiner, vector_part, written_out
@@ -41,7 +43,7 @@ def smooth_ensembles(
         raise ValueError(f"a smoothed ensemble must have one gain for all states, but got {named(filter_)}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
-    analyse_pair = filter_.analysis(paired.model.functions, paired.model.shape)
+    analyse_pair = analysis_of(filter_.plain_page, paired.model.functions, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
     means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))

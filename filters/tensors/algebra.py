@@ -55,9 +55,9 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
 
 
 def _with(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
-    """The value of an argument; a vector that is added to vectors of members, or multiplies them, is a column."""
-    found = values[a]
-    return found[..., None] if one.member and not a.member and one.operation in BY_ENTRIES else found
+    """The value of an argument; a number, or a vector beside those of members, gets the result's dimensions."""
+    found, missing = values[a], len(one.shape) + one.member - len(a.shape) - a.member
+    return found[(..., *[None] * missing)] if one.operation in BY_ENTRIES and missing else found
 
 
 def _wrapped(x: Tensor) -> Tensor:
@@ -144,10 +144,6 @@ def where(condition: Tensor, a: Tensor, b: Tensor, dimensions: int) -> Tensor:
     return torch.where(condition[(..., *[None] * dimensions)], a, b)
 
 
-def _multiple(dimensions: int, a: Tensor, by: Tensor | float) -> Tensor:
-    return a * (by[(..., *[None] * dimensions)] if isinstance(by, Tensor) else by)
-
-
 def _reciprocal(a: Tensor) -> Tensor:
     """1/a; infinite, and without a slope, where a is zero, so that what is not chosen has no NaN for a slope."""
     return torch.where(a == 0, math.inf, 1.0 / torch.where(a == 0, 1.0, a))
@@ -214,7 +210,7 @@ def _unit(root: Tensor) -> Tensor:
     return (2.0 * torch.diagonal(root, dim1=-2, dim2=-1).log().mean(-1)).exp()[..., None, None]
 
 
-BY_ENTRIES = {matrices.add, matrices.subtract, scalars.entries_product}
+BY_ENTRIES = {matrices.add, matrices.subtract, matrices.scale, matrices.entries_product, scalars.choose}
 CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of their arguments alone
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
@@ -223,17 +219,17 @@ OF_SHAPE: dict[Operation, Callable] = {
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
     members.on_one_branch: _on_one_side,
-    matrices.scale: _multiple,
-    scalars.choose: lambda dimensions, condition, a, b: where(condition, a, b, dimensions),
 }
 """Rules that first take whether the result is a vector or a matrix."""
 RULES: dict[Operation, Callable] = {
     matrices.transposed: lambda a: a.mT,
+    matrices.reciprocal: _reciprocal,
     operations.mirrored: _symmetric,
     operations.congruence: lambda a, p, pa: _symmetric(a @ pa),
     operations.present: lambda z: z == z,
     operations.uncorrelated: _uncorrelated,
     operations.factor: factor,
+    operations.inverse: lambda root, seen: torch.cholesky_inverse(root),
     densities.density: density,
     densities.dot: lambda a, b: (a * b).sum(-1),
     points.root: root,
@@ -241,16 +237,14 @@ RULES: dict[Operation, Callable] = {
     points.square: lambda a: a @ a.mT,
     points.first: lambda a: a[..., 0],
     points.others: lambda a: a[..., 1:],
-    scalars.reciprocal: _reciprocal,
-    scalars.power: lambda a, exponent: a**exponent,
+    scalars.choose: torch.where,
     scalars.exceeds: lambda a, value: a > value,
     scalars.is_number: lambda a: a == a,
     scalars.trace: lambda a: torch.diagonal(a, dim1=-2, dim2=-1).sum(-1),
     scalars.count: lambda seen: seen.sum(-1),  # a whole number, which leaves the precision of others
-    scalars.shifted: lambda a, value: a + value,
     scalars.exponential: torch.exp,
-    scalars.entries_product: lambda a, b: a * b,
     scalars.at_most: lambda v, value: torch.clamp(v, max=value),
+    scalars.at_least: lambda a, value: torch.where(a > value, a, value),
     scalars.diagonal: torch.diag_embed,
     points.hats: _hats,
     blocks.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
@@ -270,4 +264,4 @@ RULES: dict[Operation, Callable] = {
     members.stretches: _stretches,
     geometric.geometric_mean: _geometric_mean,
 }
-"""Rules of others; sums, differences and multiples are those of tensors."""
+"""Rules of others; sums, products and powers are those of tensors."""

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.page_is_all import check_page_is_all
 from filters.filter import Filter
 from filters.pages.page_filter import with_page
 from filters.tensors.algebra import root, where, wrapped_where

@@ -169,14 +169,16 @@ class EnsembleStages(Stages):
         self._parts = parts
         self.reads = {one for part in parts.values() for one in part.given}
         self._belief, self._told = memory.belief, memory.told
-        self._kept, self.kept = {"members": memory.x.operation}, {"members": 2}
+        kept = {"members": memory.x, **memory.kept}
+        self._kept = {name: one.operation for name, one in kept.items()}
+        self.kept = {name: len(one.shape) + one.member for name, one in kept.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The members at the prior, their mean and covariance."""
         tensors = {**numbers, NORMALS: draw(FILTER_PRIOR, self.memory.shape.n)}
         mean, cov, kept = self._after(tensors, ("start", "summarise"), prior[0])
         batch = prior[0].shape[:-1]
-        kept = {name: one.expand(*batch, -1, -1) for name, one in kept.items()}
+        kept = {name: one.expand(*batch, *one.shape[one.ndim - self.kept[name] :]) for name, one in kept.items()}
         return mean.expand(*batch, -1), cov.expand(*batch, -1, -1), kept
 
     def predict(

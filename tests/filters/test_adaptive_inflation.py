@@ -6,8 +6,6 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
 from filters import StateSpaceModel, make_filter, run
-from filters.c.source import c_filter
-from filters.tensors import torch
 from tests.filters.test_localised import ring
 from tests.models import KEY, plane_model, random_affine, simulated
 from thruster_env.numerics.compiled import interpreted
@@ -215,11 +213,7 @@ def test_compiled_code_and_python_are_one_with_a_factor_for_each_state():
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
-def test_pages_alone_and_wrong_numbers_are_refused():
-    filter_ = make_filter("etkf", plane_model(), adaptive_inflation=0.2)
-    for use, where in ((torch, "on tensors"), (c_filter, "in C")):
-        with pytest.raises(ValueError, match=f"an ensemble {where} must have no adaptive_inflation, but got 0.2"):
-            use(filter_)
+def test_wrong_numbers_are_refused():
     with pytest.raises(ValueError, match="adaptive_inflation must be zero or positive, but got -1"):
         make_filter("etkf", plane_model(), adaptive_inflation=-1)
     with pytest.raises(ValueError, match="with inflation_by_state must be positive, but got 0"):

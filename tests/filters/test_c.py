@@ -60,6 +60,8 @@ ENSEMBLES = {
     "denkf": {},
     "ienkf": {"iterations": 2},
     "enkf-n": {"certainty": 1.5, "inflation": 1.02},
+    "denkf adaptive": {"adaptive_inflation": 0.3, "inflation": 1.02, "relaxation": 0.3},
+    "etkf by state": {"adaptive_inflation": 0.3, "least_deviation": 0.05, "inflation_by_state": 1},
 }
 KEPT = {
     "kf square-root": ["L"],
@@ -67,6 +69,8 @@ KEPT = {
     "ekf-robust": ["weight"],
     "sage-husa": ["R", "Q", "predicted"],
     "vb": ["V", "nu"],
+    "denkf adaptive": ["factor"],
+    "etkf by state": ["factor", "width"],
 }
 MODELS = {
     "thruster": lambda: thruster_model(operating_voltage=3.0),
@@ -203,7 +207,7 @@ def test_what_a_filter_keeps_has_a_name_and_the_numbers_of_the_belief(name, tmp_
     inputs, z = simulated(model, 60, level=10.0, missing=0.2)
     header = c_filter(filter_, "one").header
     assert all(re.search(rf"double {one}\W", header) for one in KEPT.get(name, ["c"]))
-    belief, extras = filter_.init(), []
+    belief, extras = filter_.init(filter_keys([0])[0]), []
     for k, seen in enumerate(z[0]):
         belief = filter_.predict(belief, inputs[0, k - 1]) if k else belief
         belief, _ = filter_.update(belief, seen)

@@ -8,8 +8,10 @@ import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.differentiated.differentiable import differentiable
-from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page import Page
+from filters.pages.programs import with_kept
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, turning_pendulum, wide_pendulum
 from tests.models import random_affine, simulated, wide_model
@@ -58,7 +60,10 @@ def on_one_branch(x, angles):
 def run_page(filter_, key, inputs, measurements):
     """Means, covariances, innovations, their covariances and log-likelihoods of one run, by the page itself."""
     page, model = filter_.written_page, filter_.kernel_model
-    equations = OfMembers(model, parameters_of(page, np.array(filter_.own_parameters)))
+    own = parameters_of(page, np.array(filter_.own_parameters))
+    columns = {name: one[:, None] for name, one in own._asdict().items() if np.ndim(one) == 1}
+    equations = OfMembers(model, own._replace(**columns))
+    equations.kept = page.started(equations)
     width, found = padded(filter_.size, LANES), []
 
     def normals(rows, step, stream):
@@ -73,7 +78,8 @@ def run_page(filter_, key, inputs, measurements):
             for _ in range(model.substeps):
                 x = page.advance(equations, x, inputs[k - 1][:, None])
             x = page.settle(equations, x, normals(model.n, k, FILTER_PROCESS))
-        x, v, s, level = page.update(equations, x, z[:, None], normals(model.m, k, FILTER_MEASUREMENT))
+        told = page.update(equations, x, z[:, None], normals(model.m, k, FILTER_MEASUREMENT))
+        x, v, s, level, equations.kept = with_kept(told)
         mean = x.mean(axis=1)
         wrapped = np.where(equations.state_angles, np.angle(np.exp(1j * mean)), mean)
         found.append((wrapped, np.cov(x).reshape(model.n, model.n), v[:, 0], s, level))
@@ -100,6 +106,16 @@ def test_all_ensemble_filters_are_tried():
 @pytest.mark.parametrize("name", CHOICES)
 def test_a_page_of_arrays_is_the_filter(name, chosen, make):
     assert_page_is_the_filter(make_filter(name, make(), ensemble_size=SIZE, **CHOICES[name] if chosen else {}))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("least_deviation", [0.0, 0.05])
+@pytest.mark.parametrize("by_state", [0, 1])
+@pytest.mark.parametrize("name", ["enkf", "etkf"])
+def test_a_page_of_arrays_with_adaptive_inflation_is_the_filter(name, by_state, least_deviation):
+    own = {"adaptive_inflation": 0.3, "inflation_by_state": by_state, "least_deviation": least_deviation}
+    for model in (wide_model(), turning_pendulum().replace(transition=turn_if)):
+        assert_page_is_the_filter(make_filter(name, model, ensemble_size=SIZE, **own))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from thruster_env.numerics.algebra.matrices import Matrix, evaluate, given, in_o
 from thruster_env.numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import first, on_circle, ones, others, outer, root, square, units
 from thruster_env.numerics.algebra.programs import Place
+from thruster_env.numerics.algebra.scalars import at_least, choose, exceeds
 
 RNG = np.random.default_rng(0)
 N, M = 3, 2
@@ -62,6 +63,8 @@ FORMULAS = {
         square(others(g["F"])) + outer(first(g["F"]), first(g["F"])) + outer(g["x"], g["F"] @ g["x"])
     ),
     "circle": lambda g: on_circle(g["F"], (True, False) + (True,) * (len(g["x"]) - 2)),
+    "entries": lambda g: abs(g["x"]) * g["x"] ** 3.0 / (1.0 + g["x"] ** 2.0) - 0.3 + at_least(g["x"], 0.0) ** 4.0,
+    "chosen": lambda g: choose(exceeds(g["F"], 0.0), 2.0 - g["F"] ** 4.0, 2.0 + g["F"] * g["F"] ** 3.0),
     "density": lambda g: log_density(only(present(g["z"]), g["v"]), innovation_covariance(g), present(g["z"])),
 }
 ENTRIES = ("P", "R", "H", "F", "x", "v", "z")

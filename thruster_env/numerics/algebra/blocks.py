@@ -102,7 +102,7 @@ def forward_quotient(lower, v):
 @operation(same)
 def triangle_quotient(a, lower):
     """A L^-1 of a lower triangular L."""
-    found = np.array(a)
+    found = np.array(a, dtype=np.result_type(a, lower))
     for i in reversed(range(len(lower))):
         rest = found[:, i] - sum(found[:, k] * lower[k, i] for k in range(i + 1, len(lower)))
         found[:, i] = rest * (1.0 / lower[i, i])

@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from thruster_env.numerics import matrices as made
-from thruster_env.numerics.algebra import blocks, scalars
+from thruster_env.numerics.algebra import blocks, matrices, scalars
 from thruster_env.numerics.algebra.matrices import Operation
-from thruster_env.numerics.sources import Source, entrywise, is_array, matrix_of, written_out
+from thruster_env.numerics.sources import Source, is_array, matrix_of, written_out
 from thruster_env.numerics.tuples import assembled, part_of, zeros_of
 
 
-def _number(text: str, names: str = "a, b") -> Callable:
-    return written_out("number", names, text)
+def by_entries(template: str, **functions: Any) -> Callable:
+    """What makes functions of a, b, c whose entries have a source, such as "{a} + {b}" or "{a} > {0}"."""
 
+    def make(result: tuple, *others: Any) -> Callable:
+        known = [one for one in others if not isinstance(one, tuple)]
+        shapes = dict(zip("abc", others[len(known) :], strict=False))
 
-def _chosen(result: tuple, condition: tuple, a: tuple, b: tuple) -> Callable:
-    if not a:
-        return _number("(a if c else b)", "c, a, b")
-    at = "[{}]" * len(a)
-    entry = f"(a{at} if c else b{at})"
-    return entrywise("chosen", "c, a, b", a, lambda *place: entry.format(*place, *place), a=a, b=b)
+        def entry(*place) -> str:
+            at = "".join(f"[{i}]" for i in place)
+            return template.format(*known, **{name: name + at * bool(shape) for name, shape in shapes.items()})
+
+        if not result:
+            return written_out("entries", ", ".join(shapes), entry(), **functions)
+        source = Source("entries", ", ".join(shapes), result=result, **{k: v for k, v in shapes.items() if v})
+        return source.function(source.entries(result, entry), **functions)
+
+    return make
 
 
 def _trace(result: tuple, a: tuple) -> Callable:
@@ -38,13 +46,6 @@ def _count(result: tuple, z: tuple) -> Callable:
 def _together(result: tuple, a: tuple, b: tuple) -> Callable:
     at = (0, a[1]) if a[0] == result[0] else (a[0], 0)
     return assembled("together", "a, b", result, {"a": (a, 0, 0), "b": (b, *at)})
-
-
-def _exponential(result: tuple, v: tuple) -> Callable:
-    if not v:
-        return written_out("exponential", "v", "exp(v)", exp=np.exp)
-    source = Source("exponential", "v", result=result, v=v)
-    return source.function(source.vector(v[0], lambda i: f"exp(v[{i}])"), exp=np.exp)
 
 
 def _diagonal(result: tuple, v: tuple) -> Callable:
@@ -68,24 +69,24 @@ def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tup
 
 
 FUNCTIONS: dict[Operation, Callable] = {
-    scalars.reciprocal: lambda result, a: _number("1.0 / a", "a"),
-    scalars.power: lambda result, exponent, a: _number(f"a ** {exponent!r}", "a"),
-    scalars.exceeds: lambda result, value, a: _number(f"a > {value!r}", "a"),
-    scalars.is_number: lambda result, a: _number("a == a", "a"),
-    scalars.choose: _chosen,
+    matrices.add: by_entries("{a} + {b}"),
+    matrices.subtract: by_entries("{a} - {b}"),
+    matrices.entries_product: by_entries("{a} * {b}"),
+    matrices.shifted: by_entries("{a} + {0!r}"),
+    matrices.reciprocal: by_entries("1.0 / {a}"),
+    matrices.power: by_entries("{a} ** {0!r}"),
+    matrices.magnitude: by_entries("abs({a})"),
+    scalars.exceeds: by_entries("{a} > {0!r}"),
+    scalars.is_number: by_entries("{a} == {a}"),
+    scalars.choose: by_entries("({b} if {a} else {c})"),
+    scalars.exponential: by_entries("exp({a})", exp=np.exp),
+    scalars.logarithm: by_entries("log({a})", log=np.log),
+    scalars.at_most: by_entries("min({a}, {0!r})"),
+    scalars.at_least: by_entries("({a} if {a} > {0!r} else {0!r})"),
+    scalars.below: by_entries("(0.0 if {a} > {0!r} else 1.0)"),
     scalars.trace: _trace,
-    scalars.exponential: _exponential,
-    scalars.logarithm: lambda result, a: written_out("logarithm", "a", "log(a)", log=np.log),
-    scalars.entries_product: lambda result, a, b: entrywise(
-        "product", "a, b", a, lambda *at: "a[{0}] * b[{0}]".format("][".join(map(str, at))), a=a, b=b
-    ),
-    scalars.at_most: lambda result, value, v: entrywise("most", "v", v, lambda i: f"min(v[{i}], {value!r})", v=v),
-    scalars.below: lambda result, value, v: entrywise(
-        "below", "v", v, lambda i: f"(0.0 if v[{i}] > {value!r} else 1.0)", v=v
-    ),
     scalars.diagonal: _diagonal,
     scalars.count: _count,
-    scalars.shifted: lambda result, value, a: _number(f"a + {value!r}", "a"),
     blocks.careful: lambda result, s: made.careful_factor(*s[:1]),
     blocks.inverted: lambda result, of: made.factored_inverse(of[0]),
     blocks.triangle: lambda result, a: made.triangular_root(*a),

@@ -53,18 +53,34 @@ class Matrix:
         return self.shape[0]
 
     def __add__(self, other):
-        return add(self, other)
+        return add(self, other) if isinstance(other, Matrix) else shifted(self, float(other))
+
+    __radd__ = __add__
 
     def __sub__(self, other):
-        return subtract(self, other)
+        return subtract(self, other) if isinstance(other, Matrix) else shifted(self, -float(other))
+
+    def __rsub__(self, other):
+        return -self + other
 
     def __matmul__(self, other):
         return multiply(self, other)
 
     def __mul__(self, factor):
-        return scale(self, factor if isinstance(factor, Matrix) else float(factor))
+        if not isinstance(factor, Matrix):
+            return scale(self, float(factor))
+        return entries_product(self, factor) if factor.shape else scale(self, factor)
 
     __rmul__ = __mul__
+
+    def __truediv__(self, other):
+        return self * (reciprocal(other) if isinstance(other, Matrix) else 1.0 / other)
+
+    def __pow__(self, exponent):
+        return power(self, exponent)
+
+    def __abs__(self):
+        return magnitude(self)
 
     def __neg__(self):
         return scale(self, -1.0)
@@ -155,6 +171,36 @@ def subtract(a, b):
 def scale(a, factor):
     """A matrix times a number."""
     return a * factor
+
+
+@operation(same)
+def entries_product(a, b):
+    """The products of the entries of two vectors, or of two matrices."""
+    return a * b
+
+
+@operation(same)
+def shifted(a, value):
+    """A number, or each entry, plus a number that is known now."""
+    return a + value
+
+
+@operation(same)
+def reciprocal(a):
+    """1/a of a number, or of each entry."""
+    return 1.0 / a
+
+
+@operation(same)
+def power(a, exponent):
+    """A number, or each entry, to a power that is known now."""
+    return a**exponent
+
+
+@operation(same)
+def magnitude(a):
+    """The absolute value of a number, or of each entry."""
+    return abs(a)
 
 
 @operation(lambda shape: shape[::-1])

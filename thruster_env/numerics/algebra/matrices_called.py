@@ -19,6 +19,7 @@ from thruster_env.numerics.algebra import (
     operations,
     points_called,
 )
+from thruster_env.numerics.algebra.blocks_called import by_entries
 from thruster_env.numerics.algebra.matrices import Matrix, Operation
 from thruster_env.numerics.angles import NAMES, short_way
 from thruster_env.numerics.sources import Source, entrywise, written_out
@@ -56,25 +57,8 @@ def _function(operation: Operation, result: tuple, by_transpose: bool, others: t
     return _FUNCTIONS[operation](result, *others, *shapes)
 
 
-def _by_entries(template: str, *shapes: tuple[int, ...]) -> Callable:
-    """The function of arguments a, b of such shapes whose entries have a source, such as "{a} + {b}"."""
-    arguments = dict(zip("ab", shapes, strict=False))
-    names = ", ".join(arguments)
-
-    def entry(*place) -> str:
-        at = "".join(f"[{i}]" for i in place)
-        return template.format(**{name: name + at * bool(shape) for name, shape in arguments.items()})
-
-    if not shapes[0]:
-        return written_out("total", names, entry())
-    sizes: dict[str, Any] = {name: shape for name, shape in arguments.items() if shape}
-    return entrywise("total", names, shapes[0], entry, **sizes)
-
-
 def _multiple(result: tuple, *others) -> Callable:
-    if isinstance(others[0], float):
-        return _by_entries("{a} * " + repr(others[0]), others[1])
-    return _by_entries("{a} * {b}", *others)
+    return by_entries("{a} * {0!r}" if isinstance(others[0], float) else "{a} * {b}")(result, *others)
 
 
 def _product(by_transpose: bool, a: tuple, b: tuple) -> Callable:
@@ -95,7 +79,7 @@ def _congruence(shape: tuple, a: tuple, p: tuple, pa: tuple) -> Callable:
 
 def _of_best_gain(shape: tuple, value: tuple, p: tuple, c: tuple, s: tuple, k: tuple) -> Callable:
     names: dict[str, Any] = {"times": made.transposed_multiplier(*c, shape[0]), "mirror": _mirrored(shape, shape)}
-    names["less"] = _by_entries("{a} - {b}", p, p)
+    names["less"] = by_entries("{a} - {b}")(p, p, p)
     return written_out("of_best_gain", "p, c, k", "less(p, mirror(times(c, k)))", **names)
 
 
@@ -165,8 +149,6 @@ HEAVIER = "tail[1 + int(d)] + 0.5 * q - 0.5 * (1.0 / tail[0] + d) * log(1.0 + ta
 WEIGHT = "(1.0 + tail[0] * d) / (1.0 - 2.0 * tail[0] + tail[0] * q)"
 
 _FUNCTIONS: dict[Operation, Callable] = {
-    matrices.add: lambda result, *shapes: _by_entries("{a} + {b}", *shapes),
-    matrices.subtract: lambda result, *shapes: _by_entries("{a} - {b}", *shapes),
     matrices.scale: _multiple,
     matrices.transposed: lambda result, shape: made.transposer(*shape),
     operations.mirrored: _mirrored,

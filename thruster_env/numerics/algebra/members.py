@@ -10,6 +10,8 @@ import numpy as np
 
 from thruster_env.numerics.algebra.graphs import Number, arctan2, over_members, size_of, where
 from thruster_env.numerics.algebra.matrices import operation, same
+from thruster_env.numerics.algebra.points import outer
+from thruster_env.numerics.algebra.scalars import choose, constant, exceeds
 from thruster_env.numerics.angles import whole_turns
 
 
@@ -60,6 +62,12 @@ def variances(x):
         return d.var(axis=1, ddof=1, keepdims=True)
     factor = 1.0 / (size_of(x[0]) - 1.0)
     return np.array([over_members(one * one) * factor for one in d])
+
+
+def correlations(x, y):
+    """The sample correlations (n, m) of two vectors of the members; 0 of what is constant."""
+    squares = outer(variances(x), variances(y))
+    return covariance(x, y) / choose(exceeds(squares, 0.0), squares, constant(1.0, squares)) ** 0.5
 
 
 @operation(same)

@@ -1,4 +1,4 @@
-"""What pages of filters say beside + - @ and .T: of symmetry, angles, missing channels, quotients, Joseph's form.
+"""What pages say beside + - @ * / ** and .T: symmetry, angles, missing channels, quotients, Joseph's form.
 
 Each is a function of arrays, an operation on Matrices, and a derivative along a parameter, such as
 

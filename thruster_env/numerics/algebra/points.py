@@ -70,7 +70,7 @@ def ones(a):
 @operation(lambda a, b: (*a, *b), lambda a, b: a is b)
 def outer(a, b):
     """The matrix a b' of two vectors."""
-    return a[:, None] * b[None, :]
+    return np.ravel(a)[:, None] * np.ravel(b)
 
 
 @operation(lambda a: (a[0], a[0]), lambda a: True)

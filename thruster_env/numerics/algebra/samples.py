@@ -13,7 +13,7 @@ import numpy as np
 from thruster_env.numerics.algebra.graphs import Number, largest_of_members, over_members, where
 from thruster_env.numerics.algebra.matrices import operation, same
 from thruster_env.numerics.algebra.operations import mirrored
-from thruster_env.numerics.algebra.scalars import logarithm, reciprocal
+from thruster_env.numerics.algebra.scalars import logarithm
 from thruster_env.numerics.exponential import LOWEST, parts
 
 
@@ -55,7 +55,7 @@ def normalised(logarithms):
     top = largest(logarithms)
     scaled = weights(logarithms - top)
     some = total(scaled)
-    return scaled * reciprocal(some), top + logarithm(some)
+    return scaled / some, top + logarithm(some)
 
 
 @operation(same, reduces=True)
@@ -89,4 +89,4 @@ def weighted_covariance(x, w):
 
     It is unbiased for weights that do not depend on x; for equal ones the divisor is N - 1.
     """
-    return weighted_square(x - weighted_mean(x, w), w) * reciprocal(spread_share(w))
+    return weighted_square(x - weighted_mean(x, w), w) / spread_share(w)

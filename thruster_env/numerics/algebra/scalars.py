@@ -5,10 +5,23 @@ A choice works out both sides. So a page that divides guards its divisor, not it
 
 from __future__ import annotations
 
+import operator
+
 import numpy as np
 
 from thruster_env.numerics.algebra.graphs import where
-from thruster_env.numerics.algebra.matrices import Matrix, operation, plus, same, through
+from thruster_env.numerics.algebra.matrices import (
+    Matrix,
+    entries_product,
+    magnitude,
+    operation,
+    plus,
+    power,
+    reciprocal,
+    same,
+    shifted,
+    through,
+)
 
 
 def ratio(a, b):
@@ -16,16 +29,17 @@ def ratio(a, b):
     return a * (reciprocal(b) if isinstance(b, Matrix) else 1.0 / b)
 
 
-@operation(lambda shape: ())
-def reciprocal(a):
-    """1/a of a number."""
-    return 1.0 / a
+def _by_entries(function, *given):
+    """What a function of numbers makes of the entries of arrays."""
+    with np.errstate(invalid="ignore"):
+        found = np.frompyfunc(function, len(given), 1)(*given)
+    return np.array(found.tolist()) if np.ndim(found) else found
 
 
-@operation(lambda a, value: ())
+@operation(same)
 def exceeds(a, value):
-    """Whether a number is larger than one that is known now."""
-    return a > value
+    """Whether a number, or each entry, is larger than a number that is known now."""
+    return _by_entries(operator.gt, a, value)
 
 
 @operation(lambda a: ())
@@ -34,21 +48,10 @@ def is_number(a):
     return a == a
 
 
-@operation(lambda a, exponent: ())
-def power(a, exponent):
-    """A number to a power that is known now."""
-    return a**exponent
-
-
 @operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
 def choose(condition, a, b):
-    """`a` if the condition holds, else `b`: two numbers, or two matrices of the same shape."""
-    if not np.shape(a):
-        return where(condition, a, b)
-    pairs = zip(np.ravel(a), np.ravel(b), strict=True)
-    return np.array([where(condition, one, other) for one, other in pairs], dtype=np.result_type(a, b)).reshape(
-        a.shape
-    )
+    """`a` if the condition holds, else `b`, of numbers or of matrices; the condition may be one of each entry."""
+    return _by_entries(where, condition, a, b)
 
 
 @operation(lambda shape: ())
@@ -75,10 +78,16 @@ def logarithm(a):
     return np.log(a)
 
 
-@operation(lambda v, value: v)
+@operation(same)
 def at_most(v, value):
     """Entries of a vector, none of which is larger than a number that is known now."""
     return np.array([where(one > value, value, one) for one in v])
+
+
+@operation(same)
+def at_least(a, value):
+    """A number, or entries, none of which is smaller than a number that is known now; this in place of NaN."""
+    return _by_entries(lambda one: where(one > value, one, value), a)
 
 
 @operation(lambda v, value: v)
@@ -87,27 +96,15 @@ def below(v, value):
     return np.array([where(one > value, 0.0, 1.0) for one in v])
 
 
-@operation(lambda a, b: a)
-def entries_product(a, b):
-    """The products of the entries of two vectors, or of two matrices."""
-    return a * b
-
-
 @operation(lambda v: (v[0], v[0]), lambda v: True)
 def diagonal(v):
     """The diagonal matrix of a vector."""
-    return np.diag(v)
+    return np.diag(np.ravel(v))
 
 
 def constant(value: float, like):
-    """A number that is known, beside a number `like` that may not be."""
-    return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else value
-
-
-@operation(lambda a, value: a)
-def shifted(a, value):
-    """A number plus one that is known now."""
-    return a + value
+    """A number that is known, beside a number `like` that may not be, or a vector of it."""
+    return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else np.full(np.shape(like), value)[()]
 
 
 @reciprocal.derivative
@@ -142,6 +139,17 @@ def _of_entries(result, arguments, slopes):
 def _of_limit(result, arguments, slopes):
     v, value = arguments
     return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@at_least.derivative
+def _of_lower_limit(result, arguments, slopes):
+    a, value = arguments
+    return through(lambda slope: choose(exceeds(a, value), slope, slope * 0.0), slopes[0])
+
+
+@magnitude.derivative
+def _of_magnitude(result, arguments, slopes):
+    return through(lambda slope: choose(exceeds(arguments[0], 0.0), slope, slope * -1.0), slopes[0])
 
 
 @diagonal.derivative
