@@ -20,10 +20,11 @@ from filters.gaussian.fading import FadingMemoryFilter
 from filters.gaussian.fuzzy import FuzzyKalmanFilter
 from filters.gaussian.gaussian_sum import GaussianSumFilter
 from filters.gaussian.h_infinity import HInfinityFilter
+from filters.gaussian.interacting import InteractingMultipleModelFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
-from filters.gaussian.multiple_models import InteractingMultipleModelFilter, MultipleModelAdaptiveEstimator
 from filters.gaussian.schmidt import SchmidtKalmanFilter
+from filters.gaussian.static_models import MultipleModelAdaptiveEstimator
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter

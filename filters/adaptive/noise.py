@@ -1,9 +1,11 @@
-"""The second moment of the measurement noise, from which adaptive and robust filters estimate R."""
+"""What filters that estimate R and Q share: the moment of the measurement noise, bounded steps, factors."""
 
 from __future__ import annotations
 
 from thruster_env.numerics.algebra.operations import divide, eye, only, sym, uncorrelated
 from thruster_env.numerics.algebra.points import outer
+from thruster_env.numerics.algebra.scalars import choose, exceeds, is_number, ratio, trace
+from thruster_env.numerics.checks import finite
 
 
 def noise_moment(seen, HPH, R, v):
@@ -16,3 +18,22 @@ def noise_moment(seen, HPH, R, v):
     G = divide(only(seen, R).T, sym(HPH + uncorrelated(seen, R)))
     A, e = eye(R) - G, G @ v
     return outer(e, e) + sym(A @ R @ A.T) + sym(G @ HPH @ G.T)
+
+
+def bounded_step(A, more, less, d):
+    """A + d (more - less), with d shortened to 1/(2 trace(A^-1 less)) if that is less.
+
+    With A positive definite, and `more` and `less` positive semidefinite, `less` is at most trace(A^-1 less) A, so
+    the result is at least A/2. A matrix A that is not positive definite stays as it is.
+    """
+    size = trace(divide(less, A))
+    d = choose(exceeds(d * size, 0.5), ratio(0.5, size), d)
+    return choose(is_number(size), A + (more - less) * d, A)
+
+
+def part_that_is_kept(name: str, value) -> float:
+    """Return value as a float; raise ValueError unless it is above 0 and at most 1."""
+    factor = finite(name, value)
+    if not 0.0 < factor <= 1.0:
+        raise ValueError(f"{name} must be above 0 and at most 1, but got {factor}")
+    return factor

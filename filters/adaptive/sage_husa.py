@@ -7,25 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from filters.adaptive.noise import bounded_step, part_that_is_kept
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, constant, exceeds, is_number, ratio, shifted, trace
-from thruster_env.numerics.checks import finite
-
-
-def bounded_step(A, more, less, d):
-    """A + d (more - less), with d shortened to 1/(2 trace(A^-1 less)) if that is less.
-
-    With A positive definite, and `more` and `less` positive semidefinite, `less` is at most trace(A^-1 less) A, so
-    the result is at least A/2. A matrix A that is not positive definite stays as it is.
-    """
-    size = trace(divide(less, A))
-    d = choose(exceeds(d * size, 0.5), ratio(0.5, size), d)
-    return choose(is_number(size), A + (more - less) * d, A)
+from thruster_env.numerics.algebra.scalars import choose, constant, exceeds, shifted
 
 
 def start(model):
@@ -109,11 +98,3 @@ class SageHusaFilter(PageFilter):
         """The estimate of Q (n, n) in a belief."""
         n, first = self.model.n, self.model.m**2
         return belief.extras[first : first + n * n].reshape(n, n).copy()
-
-
-def part_that_is_kept(name: str, value) -> float:
-    """Return value as a float; raise ValueError unless it is above 0 and at most 1."""
-    factor = finite(name, value)
-    if not 0.0 < factor <= 1.0:
-        raise ValueError(f"{name} must be above 0 and at most 1, but got {factor}")
-    return factor

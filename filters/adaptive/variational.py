@@ -7,8 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.adaptive.noise import noise_moment
-from filters.adaptive.sage_husa import part_that_is_kept
+from filters.adaptive.noise import noise_moment, part_that_is_kept
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from filters.gaussian.mixture import Parts, nothing
 from thruster_env.numerics.compiled import inlined
 
 
@@ -49,105 +50,70 @@ def absent_states(places: Sequence[tuple[int, ...]], n: int, given: Sequence[int
     return tuple(Absent(tuple(states), modes, state >= 0) for (modes, state), states in found.items())
 
 
-class Parts(NamedTuple):
-    """Places of a mixture in a row: of the first part, the distance to the next, their number, and scratch."""
-
-    means: int
-    covs: int
-    weights: int
-    stride: int
-    number: int
-    scratch: int  # number + n + n * n
-
-
 def completer(
     absent: tuple[Absent, ...],
     parts: Parts,
     n: int,
     blend: Callable,
-    store: tuple[Callable, Callable],
     priors: Sequence[tuple[int, int]],
+    scratch: int,
 ) -> Callable:
-    """Return `complete(row, numbers)`: give all parts all states; see this module.
+    """Return `complete(row, weights, numbers)`: give all parts all states; see this module.
 
-    Args:
-        absent: what modes lack.
-        parts: where the mixture is in the row.
-        n: number of states.
-        blend: `blend(row, count)`, mean and covariance of the mixture by its weights.
-        store: functions (row, mean) and (row, covariance) that write to the beginning of a row.
-        priors: places of the prior mean and covariance of each mode's model in the filter's numbers.
+    Mean and covariance come first in each part. `priors` are the places of the prior mean and covariance of each
+    mode's model in the filter's numbers; from `scratch` on there is room for weights, a mean and a covariance.
     """
-    complete = _nothing
+    complete = nothing
     for one in absent:
-        work = _given(one, parts, n, priors) if one.given else _of_others(one, parts, n, blend, store)
-        complete = _both(complete, work)
+        if one.given:
+            complete = _given(complete, one, parts, n, priors)
+        else:
+            complete = _of_others(complete, one, parts, n, blend, scratch)
     return complete
 
 
-@inlined
-def _nothing(row, numbers):
-    """Before the first states that some modes lack."""
-
-
-def _both(first: Callable, then: Callable) -> Callable:
-    @inlined
-    def both(row, numbers):
-        first(row, numbers)
-        then(row, numbers)
-
-    return both
-
-
-def _given(absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]) -> Callable:
+def _given(before: Callable, absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]) -> Callable:
     """A state with the moments of the modes' own models."""
-    (state,), means, covs = absent.states, parts.means, parts.covs
-    places = tuple((k * parts.stride, priors[k][0] + state, priors[k][1] + state * (n + 1)) for k in absent.modes)
+    (state,), (first, stride, _) = absent.states, parts
+    places = tuple(
+        (first + k * stride, priors[k][0] + state, priors[k][1] + state * (n + 1)) for k in absent.modes
+    )
 
     @inlined
-    def work(row, numbers):
+    def complete(row, weights, numbers):
+        before(row, weights, numbers)
         for part, mean, variance in places:
-            row[part + means + state] = numbers[mean]
+            row[part + state] = numbers[mean]
             for t in range(n):
-                row[part + covs + state * n + t] = row[part + covs + t * n + state] = 0.0
-            row[part + covs + state * (n + 1)] = numbers[variance]
+                row[part + n + state * n + t] = row[part + n + t * n + state] = 0.0
+            row[part + n + state * (n + 1)] = numbers[variance]
 
-    return work
+    return complete
 
 
-def _of_others(
-    absent: Absent, parts: Parts, n: int, blend: Callable, store: tuple[Callable, Callable]
-) -> Callable:
+def _of_others(before: Callable, absent: Absent, parts: Parts, n: int, blend: Callable, scratch: int) -> Callable:
     """States with the moments that they have in the mixture of the other modes."""
-    means, covs, weights, stride, count, kept = parts
-    states, modes, (store_mean, store_cov) = absent.states, absent.modes, store
-    begin, end = kept + count, kept + count + n + n * n
-    have = tuple(0.0 if k in modes else 1.0 for k in range(count))
+    (states, modes, _), (first, stride, count), moments = absent, parts, scratch + parts.number
 
     @inlined
-    def work(row, numbers):
+    def complete(row, weights, numbers):
+        before(row, weights, numbers)
         total = 0.0
         for k in range(count):
-            row[kept + k] = row[weights + k * stride]
-            row[weights + k * stride] *= have[k]
-            total += row[weights + k * stride]
+            row[scratch + k] = 0.0 if k in modes else row[weights + k]
+            total += row[scratch + k]
         if total > 0.0:
             for k in range(count):
-                row[weights + k * stride] /= total
-            mean, p = blend(row, count)
-            moments = row[begin:end]
-            store_mean(moments, mean)
-            store_cov(moments, p)
+                row[scratch + k] /= total
+            blend(row, scratch, moments)
             for k in modes:
-                part = k * stride
+                part = first + k * stride
                 for s in states:
-                    row[part + means + s] = row[begin + s]
+                    row[part + s] = row[moments + s]
                     for t in range(n):
-                        row[part + covs + s * n + t] = row[part + covs + t * n + s] = 0.0
+                        row[part + n + s * n + t] = row[part + n + t * n + s] = 0.0
                 for s in states:
                     for t in states:
-                        row[part + covs + s * n + t] = row[begin + n + s * n + t]
-        for k in range(count):
-            row[weights + k * stride] = row[kept + k]
+                        row[part + n + s * n + t] = row[moments + n + s * n + t]
 
-    return work
+    return complete

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.gaussian.unscented import advance
+from filters.gaussian.unscented_points import advance
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap

@@ -2,105 +2,39 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
 from filters.baselines.baselines import place_of
-from filters.engine.belief import Belief, Kernels
-from filters.engine.layout import memory_places, own_place, row_access
-from filters.filter import Filter
 from filters.gaussian import extended
-from filters.gaussian.mixture import blender, part_update
-from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
+from filters.gaussian.mixture_filter import MixtureFilter, MixturePage
+from thruster_env.numerics.algebra.densities import dot
+from thruster_env.numerics.algebra.points import outer
+from thruster_env.numerics.algebra.scalars import choose, exceeds, power
 from thruster_env.numerics.checks import at_least
-from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.shape import Functions, Shape
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
 OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
 
 
-@lru_cache(maxsize=64)
-def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernels:
-    """Kernels for model functions, sizes and a number of parts; extras as the class says."""
-    n, m = shape.n, shape.m
-    places, own = memory_places(n, m), own_place(shape)
-    stride, likelihood_place = n + n * n + 1 + m + m * m + 1, places.log_likelihood
-    mean_place, cov_place, means = places.mean, places.cov, places.extras
-    covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
-    seen_covs, likelihoods = seen + m, seen + m + m * m
-    of_states = blender(n, means, covs, weights, stride, shape.state_angles)
-    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles)
-    component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
-    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    condition = part_update(functions, shape)
-    plain = page_kernels(extended.ExtendedKalmanFilter.page, functions, shape)
-    begin, predict = plain.start, plain.predict
+def begin(model, x, P):
+    """Weights of the parts before a measurement, and the direction g = P e/sqrt(e' P e) of the split."""
+    e = model.own.unit
+    variance = dot(e, P @ e)
+    return model.own.weights, P @ e * choose(exceeds(variance, 0.0), power(variance, -0.5), variance * 0.0)
 
-    @inlined
-    def start(memory, numbers, size):
-        row, _, _ = memory
-        begin(memory, numbers, size)
-        for k in range(parts * stride):
-            row[means + k] = 0.0
 
-    @inlined
-    def update_parts(row, z, numbers):
-        """Split the belief and update each part by itself; its weight is still that before the measurement."""
-        i = int(numbers[component_place])
-        variance = row[cov_place + i * (n + 1)]
-        narrower = (numbers[variance_place] - 1.0) / variance if variance > 0.0 else 0.0
-        for k in range(parts):
-            part = row[means + k * stride : means + (k + 1) * stride]
-            step = numbers[nodes_place + k] * variance**-0.5 if variance > 0.0 else 0.0
-            for a in range(n):
-                along = row[cov_place + a * n + i]
-                part[a] = row[mean_place + a] + step * along
-                for b in range(n):
-                    part[n + a * n + b] = (
-                        row[cov_place + a * n + b] + narrower * along * row[cov_place + b * n + i]
-                    )
-            part[n + n * n] = numbers[shares_place + k]
-            condition(part, z, numbers)
-
-    @inlined
-    def weigh(row):
-        """Weights after the measurement; returns the log of what they summed up to."""
-        top = row[likelihoods]
-        for k in range(parts):
-            top = row[likelihoods + stride * k] if row[likelihoods + stride * k] > top else top
-        total = 0.0
-        for k in range(parts):
-            row[weights + stride * k] *= math.exp(row[likelihoods + stride * k] - top)
-            total += row[weights + stride * k]
-        for k in range(parts):
-            row[weights + stride * k] /= total
-        return top + math.log(total)
-
-    @inlined
-    def update(memory, z, numbers, size):
-        row, _, _ = memory
-        update_parts(row, z, numbers)
-        innovation, s = of_innovations(row, parts)
-        store_innovation(row, innovation)
-        store_s(row, s)
-        row[likelihood_place] = 0.0
-        if anything_measured(z):
-            row[likelihood_place] = weigh(row)
-            mean, p = of_states(row, parts)
-            store_mean(row, mean)
-            store_cov(row, p)
-
-    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=parts * stride)
+def update(model, t, g, x, P, z):
+    """The part at the node t, after the measurement z."""
+    return extended.update(model, x + g * t, P - outer(g, g) * model.own.narrower, z)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GaussianSumFilter(Filter):
+class GaussianSumFilter(MixtureFilter):
     """Gaussian sum filter: an extended filter whose belief is a sum of Gaussians within each update.
 
         predict: the extended filter's
@@ -116,8 +50,8 @@ class GaussianSumFilter(Filter):
     this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than a
     Gaussian.
 
-    `Belief.extras` holds what the last update made of each part: mean, covariance, weight, innovation, its
-    covariance and its log-likelihood; `part_estimates` takes the first three apart.
+    `Belief.extras` holds what the last update made of each part: mean, covariance, innovation, its covariance and
+    its log-likelihood; then the weights. `part_estimates` takes it apart.
 
     Attributes:
         parts: number of Gaussians, at least 7.
@@ -131,6 +65,7 @@ class GaussianSumFilter(Filter):
     """
 
     name: ClassVar[str] = "gsf"
+    page: ClassVar[MixturePage] = MixturePage(begin, update)
     gaussian_likelihood: ClassVar[bool] = False
     parts: int = 15
     component: int = -1
@@ -149,18 +84,13 @@ class GaussianSumFilter(Filter):
         weights /= weights.sum()
         return nodes * np.sqrt((1.0 - variance) / (weights @ nodes**2)), weights, float(variance)
 
-    @property
-    def own_parameters(self) -> tuple[float, ...]:
-        """The component, s^2, nodes and weights."""
-        nodes, weights, variance = self.standard_split
-        return (float(self.component), variance, *nodes, *weights)
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """The unit vector of the component, 1 - s^2, and the weights."""
+        _, weights, variance = self.standard_split
+        return {"unit": np.eye(self.model.n)[self.component], "narrower": 1.0 - variance, "weights": weights}
 
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        return gaussian_sum_kernels(self.kernel_model.functions, self.kernel_model.shape, parts=self.parts)
-
-    def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (parts, n), covariances (parts, n, n) and weights (parts,) that the last update merged."""
-        n, held = self.model.n, belief.extras.reshape(self.parts, -1)
-        means, covs, weights, _ = np.split(held, [n, n + n * n, n + n * n + 1], axis=1)
-        return means.copy(), covs.reshape(-1, n, n).copy(), weights[:, 0].copy()
+    @cached_property
+    def of_parts(self) -> np.ndarray:
+        """The nodes."""
+        return self.standard_split[0]

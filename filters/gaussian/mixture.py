@@ -1,140 +1,128 @@
-"""A mixture in a row of numbers, its parts one behind the other at equal distances: entries, mean, covariance."""
+"""A mixture of Gaussians with weights w, each of whose parts is a row of numbers: sums over the parts.
+
+mean = sum of w_k x_k,  P = sum of w_k (P_k + (x_k - mean)(x_k - mean)')
+after a measurement:  w_k becomes w_k N(v_k; 0, S_k)/L,  L = sum of w_k N(v_k; 0, S_k)
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
+from typing import NamedTuple
 
-from filters.gaussian import extended
-from filters.pages.equations import Equations
-from filters.pages.memory import RowMemory
-from filters.pages.programs import programs_of, stored
-from filters.pages.stages import Stage
-from thruster_env.numerics.angles import NAMES, places_of
+import numpy as np
+
+from thruster_env.numerics.angles import places_of, whole_turns, wrapped
 from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.sources import Source, lower_pairs, written_out
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.numerics.sources import Source, lower_pairs
 
 
-@cache
-def _mean_blender(count: int, means: int, weights: int, stride: int) -> Callable:
-    """Return `mean_of(row, parts)`."""
-    source = Source("mean_of", "row, parts", result=(count,))
-    total = source.local("s", count)
-    if not source.loops:
-        for i in range(count):
-            source.line(f"{total[i]} = 0.0")
-    for _ in source.inside("for part in range(parts):"):
-        source.line(f"k = {stride} * part")
-        source.line(f"w = row[k + {weights}]")
-        for i in source.range(count):
-            source.line(f"{total[i]} += w * row[k + {means + i}]")
-    return source.function(source.whole(total))
+class Parts(NamedTuple):
+    """Where the parts of a mixture lie in a row."""
+
+    first: int
+    stride: int  # from one to the next
+    number: int
 
 
 @cache
 def blender(
-    count: int,
-    means: int,
-    covs: int,
-    weights: int,
-    stride: int,
-    angles: tuple[bool, ...] = (),
-    between: bool = True,
+    parts: Parts, size: int, x: int, p: int, angles: tuple[bool, ...], *, between: bool = True, wraps: bool = True
 ) -> Callable:
-    """Return `blend(row, parts)`: mean and covariance of a mixture from those of its parts and their weights.
+    """Return `blend(row, weights, target)`: mean and covariance of a mixture, which lie from a place on.
 
-    The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'), or that
-    within them alone, sum of w P. The means, covariances and weights of the first part lie from row[means],
-    row[covs] and row[weights] on. Means of parts that are angles are put on one branch
-    (`thruster_env.numerics.angles`).
+    In each part x and P begin at such places; the weights begin at one in the row. Angles of parts are put on one
+    branch (`thruster_env.numerics.angles`); if it `wraps`, those of the mean lie in (-pi, pi]. Without what lies
+    `between` the parts the covariance is the sum of w_k P_k.
     """
-    mean_of = _mean_blender(count, means, weights, stride)
-    source = Source("cov_of", "row, parts, mean", result=(count, count), mean=(count,))
-    total, d = source.local("s", count, count), source.local("d", count)
+    source = Source("blend", "row, weights, target", result=(size, size))
+    mean, cov, d = source.local("m", size), source.local("c", size, size), source.local("d", size)
+    each = f"for k in range({parts.number}):", f"part = {parts.first} + {parts.stride} * k"
     if not source.loops:
-        for i, j in lower_pairs(count):
-            source.line(f"{total[i, j]} = 0.0")
-    for _ in source.inside("for part in range(parts):"):
-        source.line(f"k = {stride} * part")
-        source.line(f"w = row[k + {weights}]")
-        if between:
-            for i in source.range(count):
-                source.line(f"{d[i]} = row[k + {means + i}] - mean[{i}]")
-        for i in source.range(count):
+        source.line(
+            " = ".join([*(mean[i] for i in range(size)), *(cov[i, j] for i, j in lower_pairs(size)), "0.0"])
+        )
+    for _ in source.inside(each[0]):
+        source.line(each[1])
+        for i in source.range(size):
+            source.line(f"{mean[i]} += row[weights + k] * row[part + {x + i}]")
+    for _ in source.inside(each[0]):
+        source.line(each[1])
+        source.line("w = row[weights + k]")
+        for i in source.range(size if between else 0):
+            source.line(f"{d[i]} = row[part + {x + i}] - {mean[i]}")
+        for i in source.range(size):
             for j in source.range(i + 1):
-                apart = f" + {d[i]} * {d[j]}" if between else ""
-                source.line(f"{total[i, j]} += w * (row[k + {covs + i * count + j}]{apart})")
-    cov_of = source.function(source.mirrored(total))
-
-    @inlined
-    def blend(row, parts):
-        mean = mean_of(row, parts)
-        return mean, cov_of(row, parts, mean)
-
+                apart = f" + {d[i]} * {d[j]}" * between
+                source.line(f"{cov[i, j]} += w * (row[part + {p + i * size + j}]{apart})")
+    for i in source.range(size):
+        source.line(f"row[target + {i}] = {mean[i]}")
+        for j in source.range(i + 1):
+            source.line(f"row[target + {i * size + j + size}] = row[target + {j * size + i + size}] = {cov[i, j]}")
+    blend = source.function()
     if not any(angles):
         return blend
-    align = part_aligner(means, weights, stride, angles)
+    align, angle_places = part_aligner(parts, x, angles), places_of(angles)
 
     @inlined
-    def blend_aligned(row, parts):
-        align(row, parts)
-        return blend(row, parts)
+    def blend_aligned(row, weights, target):
+        align(row, weights)
+        blend(row, weights, target)
+        if wraps:
+            for i in angle_places:
+                row[target + i] = wrapped(row[target + i])
 
     return blend_aligned
 
 
 @cache
-def part_aligner(means: int, weights: int, stride: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `align(row, parts)`: put means of parts that are angles on the branch of their circular mean."""
-    lines = (
-        f"for place in {places_of(angles, means)}:",
-        "    s = c = 0.0",
-        "    for part in range(parts):",
-        f"        k = {stride} * part",
-        f"        s += row[k + {weights}] * sin(row[k + place])",
-        f"        c += row[k + {weights}] * cos(row[k + place])",
-        "    middle = arctan2(s, c)",
-        "    for part in range(parts):",
-        f"        k = {stride} * part + place",
-        "        row[k] -= whole_turns(row[k] - middle)",
-    )
-    return written_out("align", "row, parts", *lines, "None", **NAMES)
+def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `align(row, weights)`: put angles of a vector x of all parts on one branch, that of their mean."""
+    (_, stride, count), places = parts, places_of(angles, parts.first + x_place)
+
+    @inlined
+    def align(row, weights):
+        for i in places:
+            s = c = 0.0
+            for k in range(count):
+                s += row[weights + k] * np.sin(row[i + k * stride])
+                c += row[weights + k] * np.cos(row[i + k * stride])
+            middle = np.arctan2(s, c)
+            for k in range(count):
+                row[i + k * stride] -= whole_turns(row[i + k * stride] - middle)
+
+    return align
 
 
-@lru_cache(maxsize=64)
-def part_update(functions: Functions, shape: Shape) -> Callable:
-    """Return `condition(part, z, numbers)`: the extended filter's update of a part of a mixture.
+@cache
+def weigher(parts: Parts, level: int) -> Callable:
+    """Return `weigh(row, weights)`: weights after a measurement, by log-likelihoods; the log of their sum."""
+    (_, stride, count), first = parts, parts.first + level
 
-    A part is mean, covariance, weight, innovation, its covariance and log-likelihood.
-    """
-    n, m = shape.n, shape.m
+    @inlined
+    def weigh(row, weights):
+        top = -math.inf
+        for k in range(count):
+            top = max(top, row[first + k * stride])
+        total = 0.0
+        for k in range(count):
+            row[weights + k] *= math.exp(row[first + k * stride] - top)
+            total += row[weights + k]
+        for k in range(count):
+            row[weights + k] /= total
+        return top + math.log(total)
 
-    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        x, p = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
-        seen = n + n * n + 1
-        return [stored(extended.update(model, x, p, memory.z), (x, p, seen, seen + m, seen + m + m * m))]
-
-    return programs_of(extended.ExtendedKalmanFilter.page, functions, shape, stages).works[0]
+    return weigh
 
 
-@lru_cache(maxsize=64)
-def rule_programs(functions: Functions, shape: Shape) -> tuple[Callable, Callable]:
-    """Functions `predict(rule, given, numbers)` and `update(rule, given, numbers)` of one rule's Kalman filter.
+def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means (number, n), covariances (number, n, n) and weights of the parts in a belief's extras."""
+    parts, weights = np.split(extras, [-number])
+    means, covs, _ = np.split(parts.reshape(number, -1), [n, n + n * n], axis=1)
+    return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()
 
-    A rule is its mean, covariance, membership, innovation and the covariance of that; given are the constants of
-    its affine model, then u or z.
-    """
-    n, m, count = shape.n, shape.m, shape.constants
 
-    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        x, p = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
-        rule = model.at(memory.read("given", 0, count))
-        u, z = memory.read("given", count, shape.inputs), memory.read("given", count, m)
-        predicted = extended.settle(rule, *extended.advance(rule, x, p, u))
-        *updated, _ = extended.update(rule, x, p, z)
-        seen = n + n * n + 1
-        return [stored(predicted, (x, p)), stored(tuple(updated), (x, p, seen, seen + m))]
-
-    predict, update = programs_of(extended.ExtendedKalmanFilter.page, functions, shape, stages).works
-    return predict, update
+@inlined
+def nothing(memory, given, numbers):
+    """What comes before the first of several functions."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place, row_access
+from filters.engine.layout import memory_places, own_place
 from filters.engine.restart import restart_if_lost
-from filters.gaussian.absent import Absent, Parts, completer
-from filters.gaussian.mixture import blender
+from filters.gaussian.absent import Absent, completer
+from filters.gaussian.mixture import Parts, blender, nothing, weigher
 from filters.pages.kernels import anything_measured, nothing_to_summarise
+from filters.pages.programs import stored, works_of
+from thruster_env.numerics.algebra.matrices import given
+from thruster_env.numerics.algebra.programs import Place
 from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.layout import number_places
+from thruster_env.plants.layout import number_places, starts_of
 from thruster_env.plants.shape import Shape
 
 
@@ -25,62 +28,39 @@ class Mode(NamedTuple):
     length: int
 
 
-class Places(NamedTuple):
-    """First places in the row: K parts, each a filter's row and a weight; the probabilities; then scratch."""
-
-    parts: int
-    stride: int
-    probabilities: int
-    foreseen: int  # probabilities before the measurement
-    mixed: int  # means and covariances with which filters begin a step
-    end: int
-
-
-def mode_places(modes: tuple[Mode, ...], n: int, m: int) -> Places:
-    """Places for some modes of n states and m measurements."""
-    row = memory_places(n, m).extras
-    stride = row + 1 + max(one.kernels.extras + one.kernels.scratch for one in modes)
-    probabilities = row + len(modes) * stride
-    foreseen = probabilities + len(modes)
-    mixed = foreseen + len(modes)
-    return Places(row, stride, probabilities, foreseen, mixed, mixed + len(modes) * (n + n * n))
-
-
 @lru_cache(maxsize=64)
-def mode_kernels(modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ...] = ()) -> Kernels:
+def mode_kernels(
+    modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ...] = (), mixing: Callable | None = None
+) -> Kernels:
     """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
 
-    The filter's own numbers are p (K,), Pi (K, K) by rows, and those of each mode.
+    The filter's own numbers are p (K,), Pi (K, K) by columns, and those of each mode. Extras: the memory of each
+    mode's filter, then the probabilities. `mixing(p, mu)` gives for a column of Pi the weights of all modes with
+    which one begins a step, and its probability; without it each filter runs by itself.
     """
-    n, m, count = shape.n, shape.m, len(modes)
-    row_places, places, own = memory_places(n, m), mode_places(modes, n, m), own_place(shape)
-    first, stride, probabilities, foreseen, mixed, completing = places
-    mean_place, cov_place, likelihood_place = row_places.mean, row_places.cov, row_places.log_likelihood
-    step_place, lost_place, weight_place = row_places.step, row_places.divergences, first + stride - 1
-    transitions, belief = own + count, n + n * n
-    means, covs, seen, seen_covs = (
-        first + place for place in (mean_place, cov_place, row_places.innovation, row_places.innovation_cov)
-    )
-    of_states = blender(n, means, covs, weight_place, stride, shape.state_angles)
-    of_innovations = blender(m, seen, seen_covs, weight_place, stride, shape.measurement_angles)
-    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    start_all, predict_all, update_all = _of_all(modes, first, stride, own + count + count * count)
-    parts = Parts(means, covs, weight_place, stride, count, completing)
-    complete = completer(absent, parts, n, of_states, (store_mean, store_cov), _priors(modes, shape))
-    end = completing + (count + belief if absent else 0)
+    n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
+    at, own = memory_places(n, m), own_place(shape)
+    first, stride = at.extras, at.extras + max(one.kernels.extras + one.kernels.scratch for one in modes)
+    parts, probabilities = Parts(first, stride, count), first + count * stride
+    scratch = probabilities + count
+    completing = scratch + count * (2 + belief)  # behind what `_mixer` needs
+    end = completing + (count + belief) * bool(absent)
+    of_states = blender(parts, n, at.mean, at.cov, shape.state_angles)
+    of_innovations = blender(parts, m, at.innovation, at.innovation_cov, shape.measurement_angles, wraps=False)
+    innovation, level, step, lost = at.innovation, at.log_likelihood, at.step, at.divergences
+    of_modes = [own + count + count * count + start for start in starts_of(*(one.length for one in modes))]
+    start_all, predict_all, update_all = _of_all(modes, parts, of_modes)
+    model = number_places(n, m)
+    priors = [(place + model.prior_mean, place + model.prior_cov) for place in of_modes[:-1]]
+    complete = completer(absent, parts, n, of_states, priors, completing)
+    weigh = weigher(parts, level)
 
     @inlined
-    def take_weights(row, place):
-        for j in range(count):
-            row[weight_place + j * stride] = row[place + j]
+    def blend(row, weights, numbers, target):
+        complete(row, weights, numbers)
+        of_states(row, weights, target)
 
-    @inlined
-    def merge(row, numbers):
-        take_weights(row, probabilities)
-        complete(row, numbers)
-        mean, p = of_states(row, count)
-        store_mean(row, mean)
-        store_cov(row, p)
+    mix = nothing if mixing is None else _mixer(mixing, parts, belief, probabilities, own + count, blend)
 
     @inlined
     def start(memory, numbers, size):
@@ -90,125 +70,99 @@ def mode_kernels(modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ..
         for j in range(count):
             row[probabilities + j] = numbers[own + j]
         start_all(memory, numbers, numbers)
-        merge(row, numbers)
-
-    @inlined
-    def mix(row, numbers):
-        """Each filter begins with the mixture of all, weighted by how likely its mode follows from theirs."""
-        for j in range(count):
-            total = 0.0
-            for i in range(count):
-                total += numbers[transitions + i * count + j] * row[probabilities + i]
-            row[foreseen + j] = total
-            for i in range(count):
-                came = numbers[transitions + i * count + j] * row[probabilities + i]
-                row[weight_place + i * stride] = came / total if total > 0.0 else 1.0 if i == j else 0.0
-            complete(row, numbers)
-            mean, p = of_states(row, count)
-            begun = row[mixed + j * belief : mixed + (j + 1) * belief]
-            store_mean(begun, mean)
-            store_cov(begun, p)
-        for j in range(count):
-            row[probabilities + j] = row[foreseen + j]
-            for i in range(belief):
-                row[means + j * stride + i] = row[mixed + j * belief + i]
+        blend(row, probabilities, numbers, 0)
 
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
-        mix(row, numbers)
+        mix(memory, u, numbers)
         predict_all(memory, u, numbers)
-        merge(row, numbers)
-        row[step_place] += 1.0
-
-    @inlined
-    def weigh(row):
-        """Probabilities after the measurement; returns the log of what they summed up to."""
-        top = -math.inf
-        for j in range(count):
-            part = first + j * stride
-            if row[part + lost_place] > 0.0:  # it has begun anew: it says nothing of this measurement
-                row[part + lost_place], row[part + likelihood_place] = 0.0, -math.inf
-            top = max(top, row[part + likelihood_place])
-        total = 0.0
-        for j in range(count):
-            row[probabilities + j] *= math.exp(row[first + j * stride + likelihood_place] - top)
-            total += row[probabilities + j]
-        for j in range(count):
-            row[probabilities + j] /= total
-        return top + math.log(total)
+        blend(row, probabilities, numbers, 0)
+        row[step] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         update_all(memory, z, numbers)
-        take_weights(row, probabilities)
-        innovation, s = of_innovations(row, count)
-        store_innovation(row, innovation)
-        store_s(row, s)
-        row[likelihood_place] = weigh(row) if anything_measured(z) else 0.0
-        merge(row, numbers)
+        of_innovations(row, probabilities, innovation)
+        row[level] = 0.0
+        if anything_measured(z):
+            for j in range(count):
+                part = first + j * stride
+                if row[part + lost] > 0.0:  # it has begun anew: it says nothing of this measurement
+                    row[part + lost], row[part + level] = 0.0, -math.inf
+            row[level] = weigh(row, probabilities)
+        blend(row, probabilities, numbers, 0)
 
-    kept = foreseen - first
+    kept = scratch - first
     return Kernels(
         n, m, n, 0, start, predict, update, nothing_to_summarise, extras=kept, scratch=end - first - kept
     )
 
 
-def _priors(modes: tuple[Mode, ...], shape: Shape) -> list[tuple[int, int]]:
-    """Places of the prior mean and covariance of each mode's model in the filter's numbers."""
-    place, model, found = own_place(shape) + len(modes) * (len(modes) + 1), number_places(shape.n, shape.m), []
-    for one in modes:
-        found.append((place + model.prior_mean, place + model.prior_cov))
-        place += one.length
-    return found
+def _mixer(
+    mixing: Callable, parts: Parts, belief: int, probabilities: int, transitions: int, blend: Callable
+) -> Callable:
+    """Return `mix(memory, u, numbers)`: the belief with which each filter begins is a mixture of all."""
+    first, stride, count = parts
+    foreseen, shares, mixed = (probabilities + k * count for k in (1, 2, 3))
+    p, mu = given(Place("numbers", 0), (count,)), given(Place("rows", probabilities), (count,))
+    (share,) = works_of(stored(mixing(p, mu), (Place("rows", shares), Place("given", 0))))
+
+    @inlined
+    def mix(memory, u, numbers):
+        row, _, _ = memory
+        for j in range(count):
+            share(row, row[foreseen + j :], numbers[transitions + j * count :])
+            if not row[foreseen + j] > 0.0:  # no mode leads to this one: its filter goes on
+                for i in range(count):
+                    row[shares + i] = 1.0 if i == j else 0.0
+            blend(row, shares, numbers, mixed + j * belief)
+        for j in range(count):
+            row[probabilities + j] = row[foreseen + j]
+            for i in range(belief):
+                row[first + j * stride + i] = row[mixed + j * belief + i]
+
+    return mix
 
 
-def _of_all(modes: tuple[Mode, ...], first: int, stride: int, numbers_place: int) -> tuple[Callable, ...]:
+def _of_all(modes: tuple[Mode, ...], parts: Parts, numbers: Sequence[int]) -> tuple[Callable, ...]:
     """Functions (memory, given, numbers) that start, predict and update the filters of all modes."""
     at: dict[Kernels, list[tuple[int, int, int]]] = {}
     for j, one in enumerate(modes):
-        at.setdefault(one.kernels, []).append((first + j * stride, numbers_place, numbers_place + one.length))
-        numbers_place += one.length
-    start = predict = update = _nothing
+        at.setdefault(one.kernels, []).append((parts.first + j * parts.stride, numbers[j], numbers[j + 1]))
+    works: tuple[Callable, ...] = nothing, nothing, nothing
     for kernels, places in at.items():
-        begin, move, correct, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
-        start = _then(start, _started(begin), tuple(places), stride)
-        predict = _then(predict, move, tuple(places), stride)
-        update = _then(update, _or_restarted(correct, restart), tuple(places), stride)
-    return start, predict, update
+        works = _then(works, kernels, tuple(places), parts.stride)
+    return works
 
 
-@inlined
-def _nothing(memory, given, numbers):
-    """Before the first kind of filter."""
-
-
-def _started(begin: Callable) -> Callable:
-    @inlined
-    def start(memory, given, numbers, size):
-        begin(memory, numbers, size)
-
-    return start
-
-
-def _or_restarted(correct: Callable, restart: Callable) -> Callable:
-    @inlined
-    def update(memory, z, numbers, size):
-        correct(memory, z, numbers, size)
-        restart(memory, numbers, size)
-
-    return update
-
-
-def _then(before: Callable, work: Callable, places: tuple[tuple[int, int, int], ...], stride: int) -> Callable:
-    """Do `before`, then work on the rows and numbers of some modes."""
+def _then(before: tuple, kernels: Kernels, places: tuple, stride: int) -> tuple[Callable, ...]:
+    """The same with some modes more, which have the same kernels, by the places of their rows and numbers."""
+    start_others, predict_others, update_others = before
+    begin, move, correct, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
 
     @inlined
-    def both(memory, given, numbers):
-        before(memory, given, numbers)
+    def start(memory, given, numbers):
+        start_others(memory, given, numbers)
         row, table, draws = memory
-        for place, begin, end in places:
-            work((row[place : place + stride - 1], table, draws), given, numbers[begin:end], 0)
+        for place, first, last in places:
+            begin((row[place : place + stride], table, draws), numbers[first:last], 0)
 
-    return both
+    @inlined
+    def predict(memory, u, numbers):
+        predict_others(memory, u, numbers)
+        row, table, draws = memory
+        for place, first, last in places:
+            move((row[place : place + stride], table, draws), u, numbers[first:last], 0)
+
+    @inlined
+    def update(memory, z, numbers):
+        update_others(memory, z, numbers)
+        row, table, draws = memory
+        for place, first, last in places:
+            mode, of_mode = (row[place : place + stride], table, draws), numbers[first:last]
+            correct(mode, z, of_mode, 0)
+            restart(mode, of_mode, 0)
+
+    return start, predict, update

@@ -1,9 +1,9 @@
-"""Filters for a plant that switches among models: the interacting multiple model filter, and its static form."""
+"""What filters that run a filter for each of several models share: the models, and their probabilities."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -12,16 +12,15 @@ import numpy as np
 
 from filters.embedded import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels
-from filters.engine.layout import memory_places
 from filters.filter import Filter
 from filters.gaussian.absent import Absent, absent_states
+from filters.gaussian.mixture import parts_of
 from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.numerics.checks import between, one_of, positive, short_repr, vector
+from thruster_env.numerics.checks import as_floats, one_of, positive, short_repr, vector
 from thruster_env.plants.state_space import StateSpaceModel
 
 MOST_MODES = 32
 SUM_TOLERANCE = 1e-9
-USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +40,7 @@ class MultipleModelFilter(Filter):
     any_step: ClassVar[bool] = False
     gaussian_likelihood: ClassVar[bool] = False
     varying_noise: ClassVar[bool] = False  # each mode has Q and R of its own
+    mixing: ClassVar[Callable | None] = None  # see `modes.mode_kernels`
     modes: Any = None
     mode_filter: Any = "ekf"
     probabilities: Any = None
@@ -69,7 +69,7 @@ class MultipleModelFilter(Filter):
     def p(self) -> np.ndarray:
         """Probabilities (K,) of the modes at first."""
         given = self.usual_probabilities if self.probabilities is None else self.probabilities
-        return _probabilities("probabilities", given, (len(self.mode_filters),))
+        return probabilities_of("probabilities", given, (len(self.mode_filters),))
 
     @cached_property
     def mode_filters(self) -> tuple[Filter, ...]:
@@ -151,17 +151,14 @@ class MultipleModelFilter(Filter):
 
     @cached_property
     def own_parameters(self) -> tuple[float, ...]:
-        """p, Pi, and the numbers of all modes."""
+        """p, Pi by columns, and the numbers of all modes."""
         of_modes = [one.numbers for one in self.mode_filters]
-        return tuple(np.concatenate([self.p, self.transition_matrix.ravel(), *of_modes]).tolist())
+        return tuple(np.concatenate([self.p, self.transition_matrix.T.ravel(), *of_modes]).tolist())
 
     def kernels(self) -> Kernels:
         """Kernels for the modes; see `Filter.kernels`."""
-        return mode_kernels(
-            tuple(Mode(one.kernels(), len(one.numbers)) for one in self.mode_filters),
-            self.model.shape,
-            self.absent_states,
-        )
+        modes = tuple(Mode(one.kernels(), len(one.numbers)) for one in self.mode_filters)
+        return mode_kernels(modes, self.model.shape, self.absent_states, self.mixing)
 
     def mode_probabilities(self, belief: Belief) -> np.ndarray:
         """Probabilities mu (K,) of the modes of a belief."""
@@ -169,122 +166,21 @@ class MultipleModelFilter(Filter):
 
     def mode_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (K, n), covariances (K, n, n) and probabilities (K,) of the modes of a belief."""
-        count, n, row = len(self.mode_filters), self.model.n, memory_places(self.model.n, self.model.m)
-        parts = belief.extras[:-count].reshape(count, -1)
-        covs = parts[:, row.cov : row.cov + n * n].reshape(count, n, n)
-        return parts[:, row.mean : row.mean + n].copy(), covs.copy(), self.mode_probabilities(belief)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class InteractingMultipleModelFilter(MultipleModelFilter):
-    """Interacting multiple models (IMM): the plant is in one of K modes, each with its own model and filter.
-
-        mix:     c_j = sum over i of Pi_ij mu_i,  mu_i|j = Pi_ij mu_i/c_j; the filter of mode j begins with
-                 x0_j = sum of mu_i|j x_i,  P0_j = sum of mu_i|j (P_i + (x_i - x0_j)(x_i - x0_j)')
-        predict: each filter with its model
-        update:  each filter; L_j = N(v_j; 0, S_j),  mu_j = c_j L_j/L,  L = sum of c_j L_j
-        merge:   mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
-
-    mu are the probabilities of the modes (`mode_probabilities`), Pi_ij that of mode j a step after mode i. Unless
-    it is given, Pi = stay I + (1 - stay) 1 p': a step keeps its mode with probability `stay`, and else draws one
-    with probabilities p, which are those of the first step, too. The log-likelihood is log L; innovation and S
-    are those of the mixture before the measurement.
-
-    Modes are models, or changes of `model`, such as `{"measurement_noise_cov": 100 * R}`. Without modes there are
-    two, the model and the same with R times `outlier_scale`, with probabilities 1 - `outlier_rate` and
-    `outlier_rate`: a filter for outliers. What a mode lacks of the model's states the others say (unbiased mixing,
-    `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
-
-    `Belief.extras` holds the memory of the modes' filters and the probabilities: see `mode_estimates`.
-
-    Attributes:
-        stay: probability that a step keeps its mode without a draw, within 0 and 1.
-        transition: Pi (K, K), whose rows sum to 1, in place of `stay`.
-        outlier_scale: factor on R in the second mode, where no modes are given.
-        outlier_rate: probability of that mode.
-
-    Raises:
-        ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.
-
-    Source: Blom, Bar-Shalom (1988), "The interacting multiple model algorithm for systems with Markovian switching
-    coefficients"; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation,
-    section 11.6.6; unequal states: Granstrom, Willett, Bar-Shalom (2015).
-    """
-
-    name: ClassVar[str] = "imm"
-    stay: float = 0.9
-    transition: Any = None
-    outlier_scale: float = 100.0
-    outlier_rate: float = 0.05
-
-    def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
-        for name, check in (("stay", between), ("outlier_rate", between), ("outlier_scale", positive)):
-            ends = (0.0, 1.0) if check is between else ()
-            object.__setattr__(self, name, check(name, getattr(self, name), *ends))
-        super().__post_init__()
-
-    @property
-    def usual_modes(self) -> Sequence[Mapping[str, Any]]:
-        """The model, and the same with a larger R."""
-        return {}, {"measurement_noise_cov": self.outlier_scale * self.model.measurement_noise_cov}
-
-    @property
-    def usual_probabilities(self) -> Sequence[float] | np.ndarray:
-        """As outliers come, where no modes are given; else all equal."""
-        return (
-            super().usual_probabilities if self.modes is not None else (1.0 - self.outlier_rate, self.outlier_rate)
-        )
-
-    @property
-    def transition_matrix(self) -> np.ndarray:
-        """Pi (K, K): the probability of mode j a step after mode i."""
-        count, given = len(self.mode_filters), self.transition
-        given = self.stay * np.eye(count) + (1.0 - self.stay) * self.p if given is None else given
-        return _probabilities("transition", given, (count, count))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MultipleModelAdaptiveEstimator(MultipleModelFilter):
-    """Multiple model adaptive estimation (MMAE): one of K models is right at all times, and the data say which.
-
-        mu_j is proportional to mu_j L_j,  L_j = N(v_j; 0, S_j); each filter runs by itself
-        mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
-
-    Without modes these are the model with Q times 0.1, 1 and 10. The log-likelihood is that of the mixture, and so
-    are innovation and S; `mode_probabilities` and `mode_estimates` say more. A model whose probability has come to
-    nothing does not come back: where the plant switches, take `imm`.
-
-    Raises:
-        ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.
-
-    Source: Magill (1965), "Optimal adaptive estimation of sampled stochastic processes".
-    """
-
-    name: ClassVar[str] = "mmae"
-
-    @property
-    def usual_modes(self) -> Sequence[Mapping[str, Any]]:
-        """The model with a smaller Q, its own, and a larger one."""
-        return [{"process_noise_cov": factor * self.model.process_noise_cov} for factor in USUAL_FACTORS]
+        return parts_of(belief.extras, len(self.mode_filters), self.model.n)
 
 
 def _sizes(model: StateSpaceModel) -> tuple:
     return model.m, model.inputs, model.shape.measurement_angles
 
 
-def _probabilities(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
+def probabilities_of(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Probabilities, which sum to one over the last axis."""
     try:
-        found = np.array(given, dtype=float)
-    except (TypeError, ValueError):
+        found = as_floats(given)
+    except ValueError:
         found = np.empty(0)
-    sums = found.sum(axis=-1) if found.shape == shape else np.zeros(1)
-    if (
-        found.shape != shape
-        or not (found >= 0.0).all()
-        or not np.allclose(sums, 1.0, rtol=0.0, atol=SUM_TOLERANCE)
-    ):
+    fits = found.shape == shape and (found >= 0.0).all()
+    if not fits or not np.allclose(found.sum(axis=-1), 1.0, rtol=0.0, atol=SUM_TOLERANCE):
         rule = f"{name} must be {' x '.join(map(str, shape))} numbers of at least 0 that sum to 1"
         raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {short_repr(given)}")
     return found

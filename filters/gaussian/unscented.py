@@ -6,40 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.gaussian.square_root import start, updated
+from filters.gaussian.unscented_points import advance, moments, points, scatter
+from filters.gaussian.unscented_root import ROOT
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.blocks import hstack, part, triangle, vstack, zeros
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import first, ones, others, outer, root, square, units
+from thruster_env.numerics.algebra.points import others, root, units
 from thruster_env.numerics.checks import finite, one_of, positive
 
 
 def begin(model, x, P):
     """The points of a belief."""
     return points(model, x, root(P))
-
-
-def points(model, x, L):
-    """The mean, and the points around it."""
-    return outer(x, ones(units(x))) + (L * model.own.spread) @ units(x)
-
-
-def moments(model, Y, angles):
-    """Mean and shift of values at the points, and their deviations."""
-    D = wrap(others(Y) - outer(first(Y), ones(others(Y))), angles)
-    s = (D @ ones(D)) * model.own.weight
-    return first(Y) + s, s, D
-
-
-def scatter(model, D, s):
-    """The covariance of such deviations."""
-    return square(D) * model.own.weight + outer(s, s) * model.own.shift_weight
-
-
-def advance(model, X, u):
-    """One of the model's substeps, of each point."""
-    return model.f(X, u)
 
 
 def settle(model, X):
@@ -60,37 +38,6 @@ def update(model, x, P, z):
     K = divide(C, S)
     rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
     return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
-
-
-# The square-root form: P, S and the gain follow from one triangle, as `square_root` has it
-
-
-def begin_by_root(model, x, P):
-    """The points of a belief, by the root that is kept."""
-    return points(model, x, model.kept["L"])
-
-
-def deviations(model, D, s):
-    """A matrix A with A A' = scatter(D, s)."""
-    return hstack(D * model.own.weight_root, outer(s * model.own.shift_root, ones(part(D, 0, 0, len(s), 1))))
-
-
-def settle_root(model, X):
-    """The end of a step."""
-    x, s, D = moments(model, X, model.state_angles)
-    L = triangle(hstack(deviations(model, D, s), model.Q_root))
-    return wrap(x, model.state_angles), square(L), {"L": L}
-
-
-def update_root(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    n, m, seen, L = len(x), len(z), present(z), model.kept["L"]
-    y, s, D = moments(model, model.h(points(model, x, L)), model.measurement_angles)
-    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - y, model.measurement_angles))
-    of_x = (L * model.own.spread) @ others(units(x)) * model.own.weight_root
-    both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
-    return updated(model, x, triangle(both), v, seen)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,9 +77,7 @@ class UnscentedKalmanFilter(PageFilter):
 
     name: ClassVar[str] = "ukf"
     page: ClassVar[Page] = Page(advance, settle, update, begin)
-    forms: ClassVar[Mapping[str, Page]] = {
-        "square-root": Page(advance, settle_root, update_root, begin_by_root, start)
-    }
+    forms: ClassVar[Mapping[str, Page]] = {"square-root": ROOT}
     alpha: float = 1.0
     beta: float = 2.0
     kappa: float = 0.0
@@ -145,23 +90,19 @@ class UnscentedKalmanFilter(PageFilter):
         if n + kappa <= 0:
             raise ValueError(f"kappa must be above minus the number of states, {-n}, but got {kappa}")
         if alpha**2 * kappa + beta * n < 0:
-            raise ValueError(
-                "alpha^2 kappa + beta n must not be negative, or covariances could be, "
-                f"but got alpha={alpha}, beta={beta}, kappa={kappa} for n = {n} states"
-            )
+            rule = "alpha^2 kappa + beta n must not be negative, or covariances could be"
+            raise ValueError(f"{rule}, but got alpha={alpha}, beta={beta}, kappa={kappa} for n = {n} states")
         if one_of("form", self.form, self.known_forms) == "square-root" and beta < alpha**2:
-            raise ValueError(
-                f"beta of the square-root form must be at least alpha^2, {alpha**2:g}, but got {beta}"
-            )
+            rule = "beta of the square-root form must be at least alpha^2"
+            raise ValueError(f"{rule}, {alpha**2:g}, but got {beta}")
         for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
             object.__setattr__(self, name, value)
 
     @property
     def parameters(self) -> dict[str, float]:
         """Where the points lie, and their weights."""
-        square = self.alpha**2 * (self.model.n + self.kappa)
-        found = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": self.beta - self.alpha**2}
-        roots = {
-            f"{name}_root": found[f"{name}{rest}"] ** 0.5 for name, rest in (("weight", ""), ("shift", "_weight"))
-        }
-        return found if self.form == "covariance" else found | roots
+        square, curvature = self.alpha**2 * (self.model.n + self.kappa), self.beta - self.alpha**2
+        found = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": curvature}
+        if self.form == "covariance":
+            return found
+        return found | {"weight_root": found["weight"] ** 0.5, "shift_root": curvature**0.5}

@@ -15,13 +15,7 @@ from filters.horizon.window import HUBER, LOSSES, kept_places
 from thruster_env.numerics.checks import at_least, one_of, positive
 
 MOST_STEPS, MOST_ITERATIONS = 200, 50
-KERNEL_HORIZONS = (
-    10,
-    20,
-    50,
-    100,
-    MOST_STEPS,
-)  # steps of the window that kernels are made for, so that studies compile few
+KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # that kernels are made for, so that studies compile few
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -47,6 +47,15 @@ def programs_of(
         return Programs(memory, works, ())
 
 
+@uncollected()
+def works_of(*stages: Stage) -> list[Callable]:
+    """Stages without a model as functions (rows, given, numbers): programs, or calls where these are too long."""
+    try:
+        return [callable_of(as_programs(one, 0, MOST).values, 1, OF_STEPS) for one in stages]
+    except TypeError:
+        return [as_calls(one, 0, {}, {}, OF_STEPS).values for one in stages]
+
+
 def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool) -> tuple[RowMemory, Equations]:
     memory = RowMemory(shape, page)
     return memory, Equations(functions, memory, constants_move=False, trace=trace)

@@ -51,7 +51,7 @@ def smooth_ensembles(
 
     def part(first: int, last: int) -> None:
         now, pair = new_memory(kernels, size), new_memory(pair_kernels, size)
-        history = np.zeros((times, n, now[1].shape[1]))
+        history = np.zeros((times * n, now[1].shape[1]))
         numbers = filter_.numbers, paired.numbers
         smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last)
 
@@ -96,22 +96,10 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined
-    def copy(target, first, source):
+    def copy(target, at, source, first):
         for i in range(n):
             for j in range(target.shape[1]):
-                target[first + i, j] = source[i, j]
-
-    @inlined
-    def keep(history, k, table, first):
-        for i in range(n):
-            for j in range(table.shape[1]):
-                history[k, i, j] = table[first + i, j]
-
-    @inlined
-    def recall(table, first, history, k):
-        for i in range(n):
-            for j in range(table.shape[1]):
-                table[first + i, j] = history[k, i, j]
+                target[at + i, j] = source[first + i, j]
 
     def smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
@@ -134,20 +122,20 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                     predict(now, u, own_parameters, size)
                 else:
                     start(now, own_parameters, size)
-                copy(forecast, 0, table)
+                copy(forecast, 0, table, 0)
                 update(now, z, own_parameters, size)
                 restart(now, own_parameters, size)
-                keep(history, k, table, 0)
+                copy(history, k * n, table, 0)
                 if row[divergences] > 0.0:
                     oldest, row[divergences] = k, 0.0
                 pair_row[pair_step] = row[step]
                 for past in range(max(oldest, k - lag), k):
-                    copy(pair_table, 0, forecast)
-                    recall(pair_table, n, history, past)
+                    copy(pair_table, 0, forecast, 0)
+                    copy(pair_table, n, history, past * n)
                     analyse_pair(pair, z, pair_numbers, size)
-                    keep(history, past, pair_table, n)
+                    copy(history, past * n, pair_table, n)
             for k in range(times):
-                recall(table, 0, history, k)
+                copy(table, 0, history, k * n)
                 summarise(now, size)
                 for i in range(n):
                     means[b, k, i] = row[mean + i]

@@ -12,6 +12,7 @@ points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
 from __future__ import annotations
 
 from filters.gaussian import cubature, unscented
+from filters.gaussian.unscented_points import advance, moments, scatter
 from filters.smoothers.rts import Relation
 from thruster_env.numerics.algebra.blocks import careful
 from thruster_env.numerics.algebra.operations import quotient, sym
@@ -21,10 +22,10 @@ from thruster_env.numerics.algebra.points import others, root, square, units
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
     g, w, L, U = model.own.spread, model.own.weight, root(P), others(units(x))
-    mean, s, D = unscented.moments(model, X, model.state_angles)
+    mean, s, D = moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
-    G = quotient(C, careful(unscented.scatter(model, D, s) + model.Q))
-    left = unscented.scatter(model, (L * g) @ U - G @ D, G @ s)
+    G = quotient(C, careful(scatter(model, D, s) + model.Q))
+    left = scatter(model, (L * g) @ U - G @ D, G @ s)
     return mean, G, left + sym(G @ model.Q @ G.T)
 
 
@@ -37,5 +38,5 @@ def link_cubature(model, x, P, X):
     return mean, G, square((L * g) @ U - G @ D) * w + sym(G @ model.Q @ G.T)
 
 
-UNSCENTED = Relation(unscented.begin, unscented.advance, link_unscented)
-CUBATURE = Relation(cubature.begin, cubature.advance, link_cubature)
+UNSCENTED = Relation(unscented.begin, advance, link_unscented)
+CUBATURE = Relation(cubature.begin, advance, link_cubature)

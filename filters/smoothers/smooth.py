@@ -13,10 +13,10 @@ from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
+from filters.smoothers.backwards import smooth_backwards
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.modes import smooth_modes
 from filters.smoothers.relations import relation_of
-from filters.smoothers.rts import smooth_backwards
 from thruster_env.numerics.checks import at_least
 
 

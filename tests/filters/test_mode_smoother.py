@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, make_filter, run, smooth, smooth_modes
-from filters.smoothers.modes import _merged, _told
+from filters.smoothers.backwards import passes
+from filters.smoothers.mode_steps import merged, told
 from filters.smoothers.relations import relation_of
-from filters.smoothers.rts import passes
 from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
@@ -138,7 +138,7 @@ def mode_probabilities(filter_, z):
 
 def test_angles_of_a_mixture_are_merged_the_short_way_round():
     weights, means = np.array([[0.6, 0.4]]), np.array([[[3.1], [-3.1]]])
-    mean, cov = _merged(weights, means, np.full((1, 2, 1, 1), 0.01), (True,))
+    mean, cov = merged(weights, means, np.full((1, 2, 1, 1), 0.01), (True,))
     apart = 2 * np.pi - 6.2
     np.testing.assert_allclose(mean, 3.1 + 0.4 * apart, rtol=1e-12)
     np.testing.assert_allclose(cov[0, 0, 0], 0.01 + 0.24 * apart**2, rtol=1e-9)
@@ -186,7 +186,7 @@ def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covar
     x, p, later, e = rng.normal(size=3), root @ root.T + np.eye(3), rng.normal(size=(2, 3)), 0.1 * less @ less.T
     step, found = passes(mode, relation_of(mode, "a test")), []
     for one in later:
-        level, mean, cov = _told(mode, [0, 1], x[None], p[None], u, one[None], e[None])
+        level, mean, cov = told(mode, [0, 1], x[None], p[None], u, one[None], e[None])
         ends = np.stack([x, mean[0]])[None], np.stack([p, cov[0]])[None], np.zeros((1, 2), bool)
         found.append((level[0], *(it[0, 0] for it in step(ends, u[:, None], 1))))
     a = small.matrices()[0]

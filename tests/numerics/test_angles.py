@@ -11,7 +11,7 @@ from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_m
 from filters.baselines.inverse import component_solver
 from filters.consistency.report import consistency_report
 from filters.ensembles.recording import record_members
-from filters.gaussian.mixture import part_aligner
+from filters.gaussian.mixture import Parts, part_aligner
 from filters.likelihood import likelihood
 from tests.models import simulated, small
 from thruster_env.numerics.angles import difference, row_aligner, wrapped, wrapped_where
@@ -259,13 +259,13 @@ def test_compiled_and_interpreted_agree_across_the_cut():
 def of_columns(table, size):
     """A table (rows, size) on one branch, its last row weights, and so a mixture of as many parts, row by row."""
     align_columns(table, size)
-    parts = table.T.copy().ravel()
-    align_parts(parts, size)
-    return table, parts.reshape(size, -1).T
+    row = np.concatenate((table.T.copy().ravel(), table[2]))
+    align_parts(row, 3 * size)
+    return table, row[: 3 * size].reshape(size, 3).T
 
 
 align_columns = row_aligner(0, (False, True), 2)
-align_parts = part_aligner(0, 2, 3, (False, True))
+align_parts = part_aligner(Parts(0, 3, 50), 0, (False, True))
 
 
 @pytest.mark.parametrize("compiling", [True, False])

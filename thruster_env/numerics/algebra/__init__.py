@@ -4,7 +4,7 @@ graphs, folding, tracing          what a plain function of floats computes, as a
 slopes                            derivatives of such a graph
 matrices, operations, densities   what is computed of matrices: A @ B.T, divide(C, S), log_density(v, S, seen)
 points                            roots of covariances, and sigma points as columns of a matrix
-scalars, blocks                   numbers, choices and weights; inverses, triangles and blocks of matrices
+scalars, blocks, upper            numbers, choices and weights; inverses, triangles, blocks; factors U, D
 members, geometric                means and covariances of ensembles; the geometric mean of two covariances
 derivatives                       of matrices, by the rules of matrix calculus
 precision                         constants in single precision

@@ -1,0 +1,143 @@
+"""Passes backwards over what a filter estimated, by its `Relation`: the smoother of Rauch, Tung and Striebel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import numpy as np
+
+from filters.engine.batch import Estimates
+from filters.engine.layout import memory_places
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.page_filter import Page, PageFilter
+from filters.pages.programs import programs_of, stored, together
+from filters.pages.stages import Stage
+from filters.smoothers.rts import Relation, back
+from thruster_env.numerics.angles import difference
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.numerics.threads import spread
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
+
+ROUNDING = 1e-12  # of angles that were wrapped [rad]
+Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
+
+
+def smooth_backwards(
+    filter_: PageFilter, relation: Relation, estimates: Estimates, inputs: np.ndarray, lag: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means (B, K + 1, n) and covariances given `lag` later measurements, from a filter's estimates.
+
+    A pass starts `lag` steps after each step; the last lag + 1 steps share one. Nothing is carried back over a
+    restart from the prior.
+
+    Args:
+        filter_: the filter, whose `kernel_model` and `numbers` are used.
+        relation: of two successive states.
+        estimates: of the filter, from `filters.run`.
+        inputs: (B, K, p).
+        lag: number of later measurements, 0 ... K.
+    """
+    model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
+    # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
+    apart = np.abs(difference(estimates.means, model.prior_mean, angles))
+    means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
+    is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
+    given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
+    return passes(filter_, relation)(given, inputs, lag)
+
+
+def passes(filter_: PageFilter, relation: Relation) -> Callable[[Given, np.ndarray, int], tuple]:
+    """Return the function of what a filter estimated, inputs and a lag that makes the smoother's passes."""
+    functions, shape, numbers = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers
+    run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
+
+    def smoothed(given: Given, inputs: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+        means, covs = np.empty_like(given[0]), np.empty_like(given[1])
+        work = partial(run_part, given, inputs, numbers, lag, means, covs)
+        work(0, 1) if len(means) == 1 else spread(work, len(means))
+        return means, covs
+
+    return smoothed
+
+
+@lru_cache(maxsize=64)
+def _smoother(
+    relation: Relation, page: Page, functions: Functions, shape: Shape, interpreting: bool
+) -> CompiledOrPython:
+    """The pass over runs, of programs of a relation."""
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        x, p = memory.x, memory.P
+        begun = together(relation.begin(model, x, p))
+        flying = [memory.another(one) for one in begun]
+        linked = relation.link(model, x, p, *flying)
+        links = [memory.another(one, symmetric=one.symmetric) for one in linked]
+        later = memory.another(x), memory.another(p, symmetric=True)
+        advanced = together(relation.advance(model, *flying, memory.u))
+        return [
+            stored(begun, flying),
+            stored(advanced, flying),
+            stored(linked, links),
+            stored(back(model, x, p, links, later), (x, p)),
+        ]
+
+    memory, works, _ = programs_of(page, functions, shape, stages)
+    first_step, substep, connect, correct = works
+    n, length, belief, mean_place = shape.n, memory.end, shape.n + shape.n**2, memory_places(shape.n, shape.m).mean
+    later_place, width = length - belief, belief + n * n  # behind the link, which is predicted mean, gain, bracket
+    link_place, substeps = later_place - width, number_places(n, shape.m).substeps
+    fingerprint = function_fingerprint(*works, within=__name__)
+
+    @inlined
+    def put(row, at, means, covs, b, k):
+        for i in range(n):
+            row[at + i] = means[b, k, i]
+            for j in range(n):
+                row[at + n + i * n + j] = covs[b, k, i, j]
+
+    @inlined
+    def copy(target, at, source, first, count):
+        for i in range(count):
+            target[at + i] = source[first + i]
+
+    def smooth(given, inputs, numbers, lag, means, out_covs, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        filtered, covs, restarted = given
+        steps = inputs.shape[1]
+        u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)
+        for b in range(first, last):
+            for k in range(steps):
+                for i in range(u.shape[0]):
+                    u[i] = inputs[b, k, i]
+                put(row, mean_place, filtered, covs, b, k)
+                first_step(row, u, numbers)
+                for _ in range(int(numbers[substeps])):
+                    substep(row, u, numbers)
+                connect(row, u, numbers)
+                total = 0.0
+                for i in range(belief):
+                    total += abs(row[link_place + i])
+                if restarted[b, k + 1] or not total < 1e300:
+                    for i in range(belief):
+                        row[link_place + i] = 0.0
+                    copy(row, link_place + belief, row, mean_place + n, n * n)
+                copy(links, k * width, row, link_place, width)
+            for end in range(lag, steps + 1):
+                put(row, later_place, filtered, covs, b, end)
+                for k in range(end, end - lag - 1, -1):
+                    if k < end:
+                        for i in range(n):
+                            row[mean_place + i] = filtered[b, k, i]
+                        copy(row, link_place, links, k * width, width)
+                        correct(row, u, numbers)
+                        copy(row, later_place, row, mean_place, belief)
+                    if end == steps or k == end - lag:
+                        for i in range(n):
+                            means[b, k, i] = row[later_place + i]
+                            for j in range(n):
+                                out_covs[b, k, i, j] = row[later_place + n + i * n + j]
+
+    return CompiledOrPython(smooth)
