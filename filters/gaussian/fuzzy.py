@@ -44,24 +44,33 @@ class FuzzyKalmanFilter(MixtureFilter):
         update:  the Kalman filter's of each rule, from its mean_r and P_r, with a gain of its own (Joseph's form)
         blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r: the belief after each of the two
 
-    `blending` "weights" is this, the recursion of the sources, whose P is too small. "moments" adds what parts the
-    means, P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'), as the filter GPB1 does. With "output" each rule
-    continues from its own mean_r and P_r, and moments are blended for output only. Innovation and S are blended,
-    too. With equal rules, as an affine model has them, all three are the Kalman filter.
+    `blending` "weights" is this, the recursion of the sources. It ignores the differences between the rules'
+    means, so P is too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'):
+    the first-order generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models'
+    probabilities. "output" has autonomous filters: each rule continues from its own mean_r and P_r, which are
+    blended, by moments, for output only. Innovation and S are blended as mean and P are. With equal rules, as an
+    affine model has them, all three are the Kalman filter.
+
+    A blend of linearisations at the corners approximates a model only if the range is narrow: on the thruster the
+    extended filter, which linearises at the estimate, is far better. `rule_estimates` takes a belief apart.
 
     Attributes:
-        low, high: the smallest and the largest states (n,); the model's `state_low` and `state_high` if None.
+        low: the smallest states (n,); the model's `state_low` if None.
+        high: the largest states (n,); the model's `state_high` if None.
         blending: "weights", "moments" or "output", see above.
-        premises: indices of the states that the rules depend on, at most 8; if None, all of up to 8, or the first
-            of a larger affine model. Rules are linearised at the middle of the range of other states.
+        premises: indices of the states that the rules depend on, at most 8; if None, all of up to 8 states, or the
+            first state of a larger affine model. Rules are linearised at the middle of the range of other states.
         offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
     Raises:
         ValueError: if the range of the states is unknown or empty, or a choice is not one of those above.
 
     Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
-    autonomous underwater vehicle"; Takagi, Sugeno (1985), "Fuzzy identification of systems"; for GPB1 Bar-Shalom,
-    Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 11.6.
+    autonomous underwater vehicle", Expert Systems with Applications 68, for the recursion and the memberships of
+    minima and maxima (whose names are exchanged in the authors' slides); Takagi, Sugeno (1985), "Fuzzy
+    identification of systems and its applications to modeling and control", for the rules; Simon (2003), "Kalman
+    filtering for fuzzy discrete time dynamic systems", for filters by rule; Bar-Shalom, Li, Kirubarajan (2001),
+    Estimation with Applications to Tracking and Navigation, section 11.6, for GPB1 and autonomous filters.
     """
 
     name: ClassVar[str] = "fuzzy"
