@@ -44,13 +44,7 @@ from thruster_env.numerics.algebra.operations import (
     wrap,
 )
 from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.scalars import (
-    at_most,
-    diagonal,
-    entries_product,
-    exponential,
-    ratio,
-)
+from thruster_env.numerics.algebra.scalars import at_most, diagonal, exponential
 
 SEEDS = 100
 
@@ -73,7 +67,7 @@ def update(model, x, P, z):
 
 def weights(model, e):
     b = model.own.bandwidth
-    return exponential(at_most(entries_product(e, e) * ratio(0.5, b * b), 100.0))
+    return exponential(at_most(e * e * (0.5 / (b * b)), 100.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from thruster_env.numerics.algebra.operations import divide, eye, only, sym, uncorrelated
 from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, exceeds, is_number, ratio, trace
+from thruster_env.numerics.algebra.scalars import choose, exceeds, is_number, trace
 from thruster_env.numerics.checks import finite
 
 
@@ -27,7 +27,7 @@ def bounded_step(A, more, less, d):
     the result is at least A/2. A matrix A that is not positive definite stays as it is.
     """
     size = trace(divide(less, A))
-    d = choose(exceeds(d * size, 0.5), ratio(0.5, size), d)
+    d = choose(exceeds(d * size, 0.5), 0.5 / size, d)
     return choose(is_number(size), A + (more - less) * d, A)
 
 

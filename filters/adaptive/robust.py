@@ -10,7 +10,7 @@ from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import constant, count, ratio, trace
+from thruster_env.numerics.algebra.scalars import constant, count, trace
 from thruster_env.numerics.checks import at_least, positive
 
 MOST_ITERATIONS = 50  # that are written out
@@ -28,9 +28,9 @@ def update(model, x, P, z):
     v, HPH = only(seen, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
     S = HPH + R
     for _ in range(model.own.iterations):
-        E = only(seen, noise_moment(seen, HPH, ratio(R, weight), v))
-        weight = ratio(d + count(seen), d + trace(divide(E, R)))
-    R = ratio(R, weight)
+        E = only(seen, noise_moment(seen, HPH, R / weight, v))
+        weight = (d + count(seen)) / (d + trace(divide(E, R)))
+    R = R / weight
     K = divide(P @ H.T, HPH + R)
     x = wrap(x + K @ v, model.state_angles)
     return x, joseph(P, K, H, R), v, S, log_density(v, S, seen), {"weight": weight}

@@ -13,7 +13,7 @@ from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import choose, count, exceeds, ratio, shifted
+from thruster_env.numerics.algebra.scalars import choose, count, exceeds
 from thruster_env.numerics.checks import at_least, positive
 
 MOST_ITERATIONS = 50  # that are written out
@@ -29,10 +29,10 @@ def update(model, x, P, z):
     rho, V, nu, seen = model.own.forgetting_factor, model.kept["V"], model.kept["nu"], present(z)
     H = only(seen, model.H(x))
     v, HPH = only(seen, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
-    R, later = ratio(V, nu), shifted(rho * nu, 1.0)
+    R, later = V / nu, rho * nu + 1.0
     S = HPH + uncorrelated(seen, R)
     for _ in range(model.own.iterations):
-        R = ratio(V * rho + noise_moment(seen, HPH, R, v), later)
+        R = (V * rho + noise_moment(seen, HPH, R, v)) / later
     used = uncorrelated(seen, R)
     K, some = divide(P @ H.T, HPH + used), exceeds(count(seen), 0.0)
     kept = {"V": choose(some, R * later, V), "nu": choose(some, later, nu)}

@@ -13,7 +13,7 @@ from filters.gaussian import extended
 from filters.gaussian.mixture_filter import MixtureFilter, MixturePage
 from thruster_env.numerics.algebra.densities import dot
 from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, exceeds, power
+from thruster_env.numerics.algebra.scalars import choose, exceeds
 from thruster_env.numerics.checks import at_least
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
@@ -25,7 +25,7 @@ def begin(model, x, P):
     """Weights of the parts before a measurement, and the direction g = P e/sqrt(e' P e) of the split."""
     e = model.own.unit
     variance = dot(e, P @ e)
-    return model.own.weights, P @ e * choose(exceeds(variance, 0.0), power(variance, -0.5), variance * 0.0)
+    return model.own.weights, P @ e * choose(exceeds(variance, 0.0), variance**-0.5, variance * 0.0)
 
 
 def update(model, t, g, x, P, z):

@@ -10,14 +10,13 @@ import numpy as np
 
 from filters.gaussian.multiple_models import MultipleModelFilter, probabilities_of
 from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.scalars import entries_product, ratio
 from thruster_env.numerics.checks import between, positive
 
 
 def mixing(p, mu):
     """Weights mu_i|j with which mode j begins a step, and its probability c_j; p is column j of Pi."""
     c = dot(p, mu)
-    return ratio(entries_product(p, mu), c), c
+    return p * mu / c, c
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

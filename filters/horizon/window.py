@@ -43,8 +43,6 @@ from thruster_env.numerics.algebra.scalars import (
     count,
     exceeds,
     logarithm,
-    power,
-    ratio,
     shifted,
 )
 from thruster_env.plants.layout import starts_of
@@ -150,7 +148,7 @@ def correct(model, x, d, P, z, fresh, loss):
     if loss != QUADRATIC:
         S = sym(H @ P @ H.T + R)
         square = choose(exceeds(fresh, 0.5), dot(v, divide(v, S)), square)
-        R = ratio(R, weight_of(square, seen, limit, loss))
+        R = R / weight_of(square, seen, limit, loss)
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
     return d + K @ v, joseph(P, K, H, R), eye(P) - K @ H, H.T @ divide(v, S), cost
@@ -160,18 +158,18 @@ def loss_of(square, seen, limit, loss):
     """The loss rho of v' R^-1 v, with the square of the threshold."""
     if loss == QUADRATIC:
         return square * 0.5
-    far = ratio(square, limit)
+    far = square / limit
     if loss == STUDENT:
         return (limit + count(seen)) * logarithm(shifted(far, 1.0)) * 0.5
-    return choose(exceeds(far, 1.0), limit * shifted(power(far, 0.5), -0.5), square * 0.5)
+    return choose(exceeds(far, 1.0), limit * (far**0.5 - 0.5), square * 0.5)
 
 
 def weight_of(square, seen, limit, loss):
     """What the precision of a measurement is multiplied by: rho'(r)/r."""
     if loss == STUDENT:
-        return ratio(limit + count(seen), limit + square)
-    far = ratio(square, limit)
-    return power(choose(exceeds(far, 1.0), far, constant(1.0, far)), -0.5)
+        return (limit + count(seen)) / (limit + square)
+    far = square / limit
+    return choose(exceeds(far, 1.0), far, constant(1.0, far)) ** -0.5
 
 
 def cost_of(v, cov):

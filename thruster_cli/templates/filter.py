@@ -16,7 +16,7 @@ from thruster_env.numerics.algebra.blocks import forward_quotient
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.scalars import at_most, diagonal, entries_product, exponential, ratio
+from thruster_env.numerics.algebra.scalars import at_most, diagonal, exponential
 
 
 def update(model, x, P, z):
@@ -44,7 +44,7 @@ def update(model, x, P, z):
 def inverse_weights(model, e):
     """1/G(e) of errors in standard deviations, with the kernel G(e) = exp(-e^2/(2 bandwidth^2))."""
     b = model.own.bandwidth
-    return exponential(at_most(entries_product(e, e) * ratio(0.5, b * b), 100.0))  # finite, however far off
+    return exponential(at_most(e * e * (0.5 / (b * b)), 100.0))  # finite, however far off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -76,6 +76,9 @@ class Matrix:
     def __truediv__(self, other):
         return self * (reciprocal(other) if isinstance(other, Matrix) else 1.0 / other)
 
+    def __rtruediv__(self, other):
+        return reciprocal(self) * other
+
     def __pow__(self, exponent):
         return power(self, exponent)
 

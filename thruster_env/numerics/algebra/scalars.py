@@ -24,11 +24,6 @@ from thruster_env.numerics.algebra.matrices import (
 )
 
 
-def ratio(a, b):
-    """A matrix or number a, divided by the number b."""
-    return a * (reciprocal(b) if isinstance(b, Matrix) else 1.0 / b)
-
-
 def _by_entries(function, *given):
     """What a function of numbers makes of the entries of arrays."""
     with np.errstate(invalid="ignore"):
@@ -120,7 +115,7 @@ def _of_power(result, arguments, slopes):
 
 @logarithm.derivative
 def _of_logarithm(result, arguments, slopes):
-    return through(lambda slope: ratio(slope, arguments[0]), slopes[0])
+    return through(lambda slope: slope / arguments[0], slopes[0])
 
 
 @exponential.derivative
