@@ -19,7 +19,7 @@ BLENDINGS = ("weights", "moments", "output")
 
 def begin(model, x, P):
     """Weights of the rules, at the last estimate."""
-    return memberships(x, *model.own)
+    return memberships(x, model.own.low, model.own.high, model.own.premises)
 
 
 def predict(model, c, x, P, u):

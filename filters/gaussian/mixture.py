@@ -111,7 +111,7 @@ def weigher(parts: Parts, level: int) -> Callable:
             total += row[weights + k]
         for k in range(count):
             row[weights + k] /= total
-        return top + math.log(total)
+        return top + math.log(total) if total > 0.0 else -math.inf
 
     return weigh
 

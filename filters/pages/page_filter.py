@@ -92,8 +92,8 @@ class PageFilter(FilterWithPage):
 def with_page(filter_: Filter, what: str) -> FilterWithPage:
     """A filter whose page has no resampling; of another one, and of a model with bounds, raise ValueError."""
     if not isinstance(filter_, FilterWithPage) or filter_.resampled:
-        rule = f"{what} must have a page without resampling, as 'ekf' and 'enkf' have"
-        raise ValueError(f"{rule}, but got {filter_.name!r}")
+        which = " without resampling" if isinstance(filter_, FilterWithPage) else ""
+        raise ValueError(f"{what} must have a page{which}, as 'ekf' and 'enkf' have, but got {filter_.name!r}")
     if filter_.model.bounds:
         raise ValueError(f"{what} must have a model without bounds, but got {filter_.model.bounds}")
     return filter_

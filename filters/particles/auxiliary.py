@@ -39,8 +39,11 @@ def foresee(model, x, log_w, z):
 
 
 def update(model, x, log_w, z, e):
-    """The measurement z: particles that were chosen, with the noise of the places to which they went."""
-    x = x + model.kept["noise"]
+    """The measurement z: particles mu that were chosen, with the noise of the places to which they went.
+
+    `log_w` is the logarithm of the mean of all lambda, over N(z; h(mu), R + V).
+    """
+    x = x + model.kept["noise"]  # which was not resampled
     return x, log_w + fit(model, only(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
 
 
@@ -76,5 +79,5 @@ class AuxiliaryParticleFilter(WeightedFilter):
 
     name: ClassVar[str] = "apf"
     page: ClassVar[Page] = Page(
-        advance, settle, update, None, start, renew=spread, foresee=foresee, of_each=("noise",)
+        advance, settle, update, start=start, renew=spread, foresee=foresee, of_each=("noise",)
     )

@@ -27,7 +27,7 @@ from filters.pages.members import MembersMemory, works_of
 from filters.pages.page import Page
 from filters.particles.resampling import SCRATCH_ROWS, systematic_resampler
 from filters.particles.stages import Layout, stages_of
-from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.compiled import inlined, not_inlined
 from thruster_env.numerics.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
@@ -45,7 +45,8 @@ from thruster_env.plants.shape import Functions, Shape
 def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: bool = True) -> Kernels:
     """Kernels of a particle filter's page for a model's functions and shape.
 
-    If they do not resample, a page's `renew` draws all particles anew.
+    If they do not resample, a page's `renew` draws all particles anew. What sums over particles is not inlined, so
+    that single steps and batches, which would round otherwise, agree to the last bit.
     """
     n, m, memory = shape.n, shape.m, MembersMemory(shape, page)
     layout = Layout(page, memory, PagedModel(memory))
@@ -97,7 +98,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         renew, spread = works["renew"].work, works["renew"].draws
         choose_first = chosen_anew if resample else nothing
 
-        @inlined
+        @not_inlined
         def chosen_anew(memory, numbers, size):
             row, table, draws = memory
             choose_first(memory, numbers, size)
@@ -146,7 +147,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
             chosen_anew(memory, numbers, size)
             row[likelihood] -= math.log(size)
 
-    @inlined
+    @not_inlined
     def update(memory, z, numbers, size):
         row, table, draws = memory
         if not anything_measured(z):

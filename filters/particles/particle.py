@@ -51,8 +51,8 @@ class ParticleFilter(ResampledFilter):
     Gaussian particle filter, if the threshold is 1.
 
     If states are `smoothed`, the kernel spreads these alone, and draws them together, so that their covariance
-    stays: x_j = m + (1 - b^2)^(1/2) (x_j - m) + b e_j,  b = c h for as many states. For constants that are states,
-    of `augmented_model` without a walk: resampling alone would soon leave one value of them.
+    stays: x_j = m + a (x_j - m) + b e_j,  b = c h for as many states,  a = (1 - b^2)^(1/2). For constants that are
+    states, of `augmented_model` without a walk: resampling alone would soon leave one value of them.
 
     The log-likelihood is log L. The innovation is z less the weighted mean of h(x_j), and its covariance S the
     weighted covariance of h(x_j) plus R. Resampling waits for the next prediction, so that a belief has the
@@ -105,7 +105,7 @@ class ParticleFilter(ResampledFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the page and resampling read; of smoothed states b, and 1 - a."""
+        """What the page and resampling read; of smoothed states the `width` is b, and `drawn` is 1 - a."""
         given = super().parameters
         if not self.smoothed:
             return given

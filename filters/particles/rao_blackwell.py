@@ -34,7 +34,7 @@ def sample(x, P, e, sampled):
     AB, C = pick(L, back, places[:count]), pick(L, back, places[count:])
     if count == n:
         return x + AB @ e, {"P": P * 0.0}
-    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}
+    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}  # of e the first ones count
 
 
 def start(model, w):

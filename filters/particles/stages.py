@@ -21,6 +21,9 @@ from thruster_env.numerics.algebra.samples import (
     weighted_mean,
     weights,
 )
+from thruster_env.numerics.algebra.scalars import at_least
+
+LOWEST = -1e300  # of logarithms of weights
 
 
 class Layout:
@@ -88,7 +91,8 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     x, log_w, *told, changed = with_kept(page.update(model, x, log_w, memory.z, memory.e))
     w, level = normalised(log_w)
     x, *moments = at.moments(model, x, w, changed.get("P"))
-    results = x, log_w - level, level, effective_size(w), *moments, *told, changed
+    log_w = at_least(log_w - level, LOWEST)  # a particle that expects no number has hardly any weight
+    results = x, log_w, level, effective_size(w), *moments, *told, changed
     places: tuple[Matrix | Place, ...] = (
         at.x,
         at.logarithm,

@@ -150,6 +150,15 @@ def switching(models, stay, steps, rng):
     return modes, states, inputs, seen
 
 
+@pytest.mark.usefixtures("as_python")
+def test_where_no_model_explains_a_measurement_the_belief_restarts():
+    filter_ = make_filter("mmae", pendulum())
+    belief = filter_.init((1, 2))
+    for z in ([0.5, 0.1], [1e3, 1e3], [0.5, 0.1]):
+        belief, _ = filter_.update(filter_.predict(belief, [0.0]), z)
+    assert belief.divergences == 1 and np.isfinite(belief.mean).all()
+
+
 @pytest.mark.slow
 def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
     whole = thruster_model()

@@ -219,6 +219,61 @@ def test_they_are_the_same_on_every_path(numbers):
     np.testing.assert_allclose(belief.mean, found.means[0, 1], rtol=1e-12)
 
 
+def root_of_the_first(x, c):
+    """NaN, for particles that are below zero."""
+    return (np.sqrt(x[0]), x[1])
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.filterwarnings("ignore:invalid value encountered in sqrt")
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [
+        ("pf", {}),
+        ("pf", {"proposal": "optimal"}),
+        ("pf", {"proposal": "optimal", "resampling": "gaussian"}),
+        ("apf", {}),
+        ("apf", {"regularisation": 0.8}),
+        ("rbpf", {}),
+    ],
+)
+def test_particles_that_expect_no_number_have_hardly_any_weight(name, numbers):
+    model = StateSpaceModel(
+        transition=lambda x, u, c: (0.95 * x[0] + u[0], 0.9 * x[1] + 0.1 * x[0]),
+        observe=root_of_the_first,
+        process_noise_cov=[0.05, 0.02],
+        measurement_noise_cov=[0.3, 0.4],
+        prior_mean=[1.0, 0.5],
+        prior_cov=[0.8, 0.3],
+        inputs=1,
+    )
+    filter_, rng = make_filter(name, model, ensemble_size=9, **numbers), np.random.default_rng(3)
+    for key in range(12):
+        belief = filter_.init((key, 7))
+        for step in range(8):
+            belief = filter_.predict(belief, [0.3 * rng.normal()])
+            z = np.array([1.0, 0.5]) + 0.5 * rng.normal(size=2)
+            z[step % 2] = np.nan if step % 3 == 0 else z[step % 2]
+            belief, _ = filter_.update(belief, z)
+            assert np.isfinite(belief.members).all() and np.isfinite(belief.cov).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [("rbpf", {}), ("pf", {"proposal": "optimal", "smoothed": (0,), "regularisation": 1.0})],
+)
+def test_single_steps_and_batches_agree_to_the_last_bit(name, numbers):
+    filter_ = make_filter(name, scalar_model(), ensemble_size=9, **numbers)
+    inputs, z = simulated(scalar_model(), 40, missing=0.2)
+    session, found = filter_.session(), run(filter_, None, inputs, z)
+    session.start(filter_keys([0])[0], z[0, 0])
+    for k in range(40):
+        session.step(inputs[0, k], z[0, k + 1])
+        np.testing.assert_array_equal(session.mean, found.means[0, k + 1])
+        np.testing.assert_array_equal(session.cov, found.covs[0, k + 1])
+
+
 def test_what_the_kinds_may_not_be():
     with pytest.raises(ValueError, match="proposal must be one of prior, optimal, but got 'best'"):
         make_filter("pf", scalar_model(), proposal="best")
