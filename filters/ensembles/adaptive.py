@@ -50,18 +50,19 @@ def slopes(model, x, z, v, S):
     """Return g, or each g_i, of members x before the update, by 1/2 tr((w w' - S^-1) dA/dt'), w = S^-1 v."""
     seen, w, ones, t = present(z), divide(v, S), constant(1.0, v), model.kept["factor"]
     A = S - uncorrelated(seen, model.R)
+    # Sums of the rows of M o A, M = w w' - S^-1, for 1/2 tr(M (E A + A E)) of a diagonal E is their sum by E.
     scores = ((outer(w, w) - inverse(factor(S), seen)) * A) @ ones
     if not np.shape(t):
         return dot(scores, ones) / (2.0 * t)
     c, root = abs(correlations(x, expect(model, x, z))), t**0.5
     if hasattr(model.own, "taper"):
         c = c * model.own.taper
-    return ((c / (1.0 + diagonal(root - 1.0) @ c)) @ scores) / (2.0 * root)
+    return ((c / (1.0 + diagonal(root - 1.0) @ c)) @ scores) / (2.0 * root)  # E = dD/dt' where D = I
 
 
 def moved(t, g, deviation):
     """The mode of the normal prior times the likelihood, at least 1."""
-    # A root of u^2 + u/g - deviation^2: the larger one where g is positive, else the smaller one.
+    # A root of u^2 + u/g - deviation^2, the larger one where g is positive, else the smaller; 1 where g is NaN.
     product = 2.0 * g * (deviation * deviation)
     return at_least(t + product / (1.0 + (1.0 + 2.0 * g * product) ** 0.5), 1.0)
 
@@ -75,7 +76,7 @@ def relative_move(h, p):
 
 def moved_with_width(t, p, g, narrowest, widest):
     """The same of an inverse gamma prior, and its width; 1 and the widest where the likelihood is no number."""
-    e = relative_move(t * g, p)
+    e = relative_move(t * g, p)  # what follows compares NaN as false
     d = e / (1.0 + e)
     p = p / (1.0 - 2.0 * d + d * d / p)
     p = choose(exceeds(widest - p, 0.0), p, widest)

@@ -29,7 +29,7 @@ def predict(model, c, x, P, u):
 
 def update(model, c, x, P, z):
     """The measurement z, by a rule."""
-    return extended.update(model.at(c), x, P, z)[:-1]
+    return extended.update(model.at(c), x, P, z)[:-1]  # memberships, not likelihoods, are the weights
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +105,8 @@ class FuzzyKalmanFilter(MixtureFilter):
     @property
     def written_page(self) -> MixturePage:
         """The page of the blending."""
-        afresh, between = self.blending != "output", self.blending != "weights"
+        afresh = self.blending != "output"  # each step begins with the common mean and P
+        between = self.blending != "weights"  # differences between the rules' means count in P
         return self.page._replace(afresh=afresh, between=between, fixed=(("premises", self.premises),))
 
     @cached_property

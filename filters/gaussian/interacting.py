@@ -1,4 +1,7 @@
-"""The interacting multiple model filter, for a plant that switches among several models."""
+"""The interacting multiple model filter, for a plant that switches among several models.
+
+How the filters of the modes are mixed, run and merged is in `filters.gaussian.modes`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What particle filters share: what a weighted sample expects to be measured, and its size."""
+"""What particle filters share: what a weighted sample expects to be measured, and its size.
+
+What a page of a particle filter is, `filters.particles.kernels` says.
+"""
 
 from __future__ import annotations
 
