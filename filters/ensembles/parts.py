@@ -18,10 +18,10 @@ from filters.pages.members import MembersMemory, kept_size, members_kernels, wor
 from filters.pages.page import Page
 from filters.pages.programs import stored
 from filters.pages.stages import Stage
-from thruster_env.numerics.algebra.blocks import triangle_quotient
+from thruster_env.numerics.algebra.blocks import forward_quotient
 from thruster_env.numerics.algebra.matrices import given
 from thruster_env.numerics.algebra.members import mean
-from thruster_env.numerics.algebra.operations import eye, only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
 from thruster_env.numerics.algebra.points import root
 from thruster_env.numerics.algebra.programs import Place
 from thruster_env.numerics.compiled import inlined
@@ -93,10 +93,10 @@ def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage
     """M^-1 (y - mean(y)) of members and M^-1 (z - mean(y)), with M M' = R: channels with independent noise."""
     seen, n, m = present(memory.z), memory.shape.n, memory.shape.m
     y, M = expect(model, memory.x, memory.z), root(uncorrelated(seen, model.R))
-    v, weights = only(seen, wrap(memory.z - mean(y), model.measurement_angles)), triangle_quotient(eye(M), M)
+    v = only(seen, wrap(memory.z - mean(y), model.measurement_angles))
     rows = given(Place("table", n), (m,), member=True, like=memory.x)
     place = memory.read("rows", scratch_place(page, memory.shape), m)
-    return {"update": stored((weights @ (y - mean(y)), weights @ v), (rows, place))}
+    return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, place))}
 
 
 def scratch_place(page: Page, shape: Shape) -> int:

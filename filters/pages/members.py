@@ -178,12 +178,29 @@ def kept_size(page: Page, shape: Shape) -> int:
     return sum(prod(one.shape) for one in page.started(PagedModel(MembersMemory(shape, page))).values())
 
 
+def predictor(works: dict[str, Works], shape: Shape) -> Callable:
+    """Return `predict(memory, u, numbers, size)`: members moved in all substeps, then the end of the step."""
+    places, substeps = memory_places(shape.n, shape.m), number_places(shape.n, shape.m).substeps
+    advance, (settle, _, drawn) = works["advance"].work, works["settle"]
+    step, key_0, key_1 = places.step, places.key_0, places.key_1
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        for _ in range(int(numbers[substeps])):
+            advance(row, u, numbers, table, draws, size)
+        row[step] += 1.0
+        fill_normals(draws, drawn * table.shape[1], row[step], FILTER_PROCESS, row[key_0], row[key_1])
+        settle(row, u, numbers, table, draws, size)
+
+    return predict
+
+
 @lru_cache(maxsize=64)
 def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of an ensemble's page for a model's functions and shape."""
     n, m, works = shape.n, shape.m, works_of(page, functions, shape)
-    begin, advance, settle, moments_of = (works[name].work for name in ("start", "advance", "settle", "summarise"))
-    places, substeps_place = memory_places(n, m), number_places(n, m).substeps
+    begin, moments_of, places = works["start"].work, works["summarise"].work, memory_places(n, m)
     step, key_0, key_1 = places.step, places.key_0, places.key_1
 
     @inlined
@@ -193,18 +210,11 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         begin(row, numbers, numbers, table, draws, size)
 
     @inlined
-    def predict(memory, u, numbers, size):
-        row, table, draws = memory
-        for _ in range(int(numbers[substeps_place])):
-            advance(row, u, numbers, table, draws, size)
-        row[step] += 1.0
-        fill_normals(draws, n * table.shape[1], row[step], FILTER_PROCESS, row[key_0], row[key_1])
-        settle(row, u, numbers, table, draws, size)
-
-    @inlined
     def summarise(memory, size):
         row, table, draws = memory
         moments_of(row, row, row, table, draws, size)
 
     update, rows = _correction(works["update"], shape), max(work.rows for work in works.values())
-    return Kernels(n, m, rows, max(n, m), start, predict, update, summarise, extras=kept_size(page, shape))
+    return Kernels(
+        n, m, rows, max(n, m), start, predictor(works, shape), update, summarise, extras=kept_size(page, shape)
+    )

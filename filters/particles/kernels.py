@@ -23,7 +23,7 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.pages.equations import PagedModel
 from filters.pages.kernels import anything_measured
-from filters.pages.members import MembersMemory, works_of
+from filters.pages.members import MembersMemory, predictor, works_of
 from filters.pages.page import Page
 from filters.particles.resampling import SCRATCH_ROWS, systematic_resampler
 from filters.particles.stages import Layout, stages_of
@@ -32,7 +32,6 @@ from thruster_env.numerics.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
-    FILTER_PROCESS,
     FILTER_PROPOSAL,
     fill_normals,
     uniform_block,
@@ -54,13 +53,11 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     places, source, scratch = memory_places(n, m), number_places(n, m), layout.rows + 1
     step, key_0, key_1, likelihood = places.step, places.key_0, places.key_1, places.log_likelihood
     innovation, cov, r_place, mean_place = places.innovation, places.innovation_cov, source.r, places.mean
-    logarithm, size_place, substeps_place = n, layout.size.at, source.substeps
+    logarithm, size_place = n, layout.size.at
     threshold = page.places(own_place(shape)).get("resampling_threshold", 0)
     move = systematic_resampler(n + 1 if page.foresee else layout.rows, layout.weight.at, scratch)
-    (begin, drawn), (settle, moved), (correct, proposed) = (
-        (works[name].work, works[name].draws) for name in ("start", "settle", "update")
-    )
-    advance, choose, moments = (works[name].work for name in ("advance", "choose", "summarise"))
+    (begin, _, drawn), (correct, _, proposed) = works["start"], works["update"]
+    choose, moments, predict = works["choose"].work, works["summarise"].work, predictor(works, shape)
 
     @inlined
     def draw(memory, count, stream):
@@ -104,15 +101,6 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
             choose_first(memory, numbers, size)
             draw(memory, spread, FILTER_KERNEL)
             renew(row, row, numbers, table, draws, size)
-
-    @inlined
-    def predict(memory, u, numbers, size):
-        row, table, draws = memory
-        for _ in range(int(numbers[substeps_place])):
-            advance(row, u, numbers, table, draws, size)
-        row[step] += 1.0
-        draw(memory, moved, FILTER_PROCESS)
-        settle(row, u, numbers, table, draws, size)
 
     @inlined
     def predict_chosen(memory, u, numbers, size):

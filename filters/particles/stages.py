@@ -41,14 +41,16 @@ class Layout:
         n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
         self.x, self.logarithm = memory.x, given(Place("table", n), (), member=True, like=memory.x)
         self.size, self.kept = Place("rows", first), {}
-        ends = {"table": n + 1, "rows": first + 1}
+        memory.end, rows = first + 1, n + 1
         self.start = with_kept(page.start(model, memory.w))  # type: ignore[misc]
         for name, one in self.start[-1].items():
-            array, member = ("table", True) if name in page.of_each else ("rows", False)
-            place = Place(array, ends[array])
-            self.kept[name] = given(place, one.shape, symmetric=one.symmetric, member=member, like=memory.x)
-            ends[array] += prod(one.shape)
-        self.rows, self.extras, self.weight = ends["table"], ends["rows"] - first, Place("table", ends["table"])
+            if name in page.of_each:
+                place = Place("table", rows)
+                self.kept[name] = given(place, one.shape, symmetric=one.symmetric, member=True, like=memory.x)
+                rows += prod(one.shape)
+            else:
+                self.kept[name] = memory.another(one, symmetric=one.symmetric)
+        self.rows, self.extras, self.weight = rows, memory.end - first, Place("table", rows)
         model.kept = self.kept
 
     def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:

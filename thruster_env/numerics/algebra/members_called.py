@@ -70,7 +70,9 @@ def entry(name: str, shape: tuple[int, ...], member: bool) -> str:
     """Source of number i of a value, in column j if each member has one."""
     if member:
         return f"{name}[{'i' if shape else 0}, j]"
-    return name + ("", "[i]", f"[i // {shape[-1]}][i % {shape[-1]}]" if shape else "")[len(shape)]
+    if len(shape) == 2:
+        return f"{name}[i // {shape[1]}][i % {shape[1]}]"
+    return f"{name}[i]" if shape else name
 
 
 @cache

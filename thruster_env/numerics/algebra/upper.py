@@ -67,17 +67,17 @@ def _measured(ud: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ud, gain = np.array(ud), np.full((n, m), 0.0, dtype=ud.dtype)
     for c in range(m):
         f = [h[c, j] + sum(ud[i, j] * h[c, i] for i in range(j)) for j in range(n)]
-        vstack, k = 1.0, np.full(n, 0.0, dtype=ud.dtype)
+        before, k = 1.0, np.full(n, 0.0, dtype=ud.dtype)
         for j in range(n):
             g = ud[j, j] * f[j]
-            total = vstack + f[j] * g
-            ud[j, j] = ud[j, j] * vstack / total
+            total = before + f[j] * g
+            ud[j, j] = ud[j, j] * before / total
             for i in range(j):
                 was = ud[i, j]
-                ud[i, j] = was - k[i] * f[j] / vstack
+                ud[i, j] = was - k[i] * f[j] / before
                 k[i] = k[i] + was * g
-            k[j], vstack = g, total
-        k = k / vstack
+            k[j], before = g, total
+        k = k / before
         known = h[c] @ gain  # what the channels before say of this one
         gain = gain - k[:, None] * known[None, :]
         gain[:, c] = gain[:, c] + k
