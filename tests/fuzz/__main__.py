@@ -12,33 +12,22 @@ import os
 import traceback
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-ROOMS = (
-    "python_interface",
-    "files",
-    "logs",
-    "commands",
-    "processes",
-    "checkpoints",
-    "streams",
-    "starts",
-    "angles_and_bounds",
-)
-
 
 def attacks() -> dict[str, Callable[[np.random.Generator, float], str]]:
-    """All attacks by name, `room.function`; each takes a generator and seconds and returns what it did."""
+    """All attacks by name, `file.function`; each takes a generator and seconds and returns what it did."""
     found = {}
-    for room in ROOMS:
-        module = importlib.import_module(f"tests.fuzz.{room}")
+    for path in sorted(Path(__file__).parent.glob("[a-z]*.py")):
+        module = importlib.import_module(f"tests.fuzz.{path.stem}")
         for name, value in vars(module).items():
             ours = inspect.isfunction(value) and value.__module__ == module.__name__
             if ours and list(inspect.signature(value).parameters) == ["rng", "seconds"]:
-                found[f"{room}.{name}"] = value
+                found[f"{path.stem}.{name}"] = value
     return found
 
 
