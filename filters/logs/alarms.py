@@ -10,6 +10,7 @@ import numpy as np
 
 from filters.logs.estimate import LogEstimate, estimate_with
 from filters.monitoring.monitor import Alarm, Monitor
+from thruster_env.plants.logs.stamps import date_text, time_text
 from thruster_env.plants.quantities import Quantity
 
 
@@ -94,9 +95,11 @@ def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray
         "stuck": "equal readings",
         "missing": "no readings",
     }.get(one.test, f"a bias of {one.size:+.3g}{unit}")
-    since = "" if one.test == "outlier" else f" since {times[one.since]:.5g} s, found"
-    found = f"{channel.symbol}: {what}{since} at {times[one.step]:.5g} s ({one.test})"
+    dt = float(np.median(np.diff(times)))
+    at = [time_text(times[step], dt, 5) for step in (one.since, one.step, some[-1].step)]
+    since = "" if one.test == "outlier" else f" since {at[0]} s, found"
+    found = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[one.step])} ({one.test})"
     others = list(dict.fromkeys(alarm.test for alarm in some[1:]))
     if not others:
         return found
-    return f"{found}; {len(some) - 1} more until {times[some[-1].step]:.5g} s ({', '.join(others)})"
+    return f"{found}; {len(some) - 1} more until {at[2]} s ({', '.join(others)})"

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thruster_env.numerics.angles import difference
+from thruster_env.plants.logs.stamps import date_text, time_text
 
 if TYPE_CHECKING:
     from thruster_env.plants.logs.log import Log
@@ -249,9 +250,10 @@ def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
 
 def _where(log: Log, first: int, last: int) -> str:
     since, until = (log.start + (row * log.dt if log.stamps is None else log.stamps[row]) for row in (first, last))
+    begin, end = time_text(since, log.dt), time_text(until, log.dt)
     if first == last:
-        return f" in row {first}, at {since:.6g} s"
-    return f" in rows {first} to {last}, {since:.6g} to {until:.6g} s"
+        return f" in row {first}, at {begin} s{date_text(since)}"
+    return f" in rows {first} to {last}, {begin} to {end} s{date_text(since)}"
 
 
 def _name(channel: str) -> str:

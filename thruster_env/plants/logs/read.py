@@ -233,7 +233,7 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     if len(back):
         row = int(back[0]) + 1
         raise ValueError(
-            f"times must increase from row to row, but {own[row]:.10g} s follows {own[row - 1]:.10g} s in "
+            f"times must increase from row to row, but {own[row]:.16g} s follows {own[row - 1]:.16g} s in "
             f"{table.place(row, column.header)}"
         )
     count = (own[-1] - own[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)

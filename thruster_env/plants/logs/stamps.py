@@ -1,13 +1,16 @@
-"""Time stamps that are dates, datetime64 or text of ISO 8601, as seconds since the first one."""
+"""Time stamps: dates, as seconds since the first one, and the digits in which times are written."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
 MISSING = "nan"
+SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
+MOST_DIGITS = 17  # of a float64
 
 
 def since_first(dates: np.ndarray) -> np.ndarray:
@@ -46,3 +49,22 @@ def date_of(text: str) -> datetime | None:
         return datetime.fromisoformat(text)
     except ValueError:
         return None
+
+
+def digits_for(largest: float, step: float, least: int) -> int:
+    """Significant digits in which numbers up to `largest` differ by a tenth of `step`, at least `least`."""
+    if not (0.0 < step < math.inf and 0.0 < largest < math.inf):
+        return least
+    return min(max(least, math.floor(math.log10(largest)) + 2 - math.floor(math.log10(step))), MOST_DIGITS)
+
+
+def time_text(seconds: float, dt: float, least: int = 6) -> str:
+    """A time in as many digits as steps of dt [s] need."""
+    return f"{seconds:.{digits_for(abs(seconds), dt, least)}g}"
+
+
+def date_text(seconds: float) -> str:
+    """The date of a time since 1970, in parentheses behind a blank; empty for any other time."""
+    if not SINCE_1970[0] <= seconds <= SINCE_1970[1]:
+        return ""
+    return f" ({datetime.fromtimestamp(seconds, UTC).isoformat(' ', 'milliseconds').removesuffix('+00:00')} UTC)"

@@ -13,14 +13,17 @@ import numpy as np
 from thruster_env.numerics.checks import as_floats
 from thruster_env.numerics.extras import to_install
 from thruster_env.numerics.files import write_whole
-from thruster_env.plants.logs.columns import plain
+from thruster_env.plants.logs.columns import TIME_NAMES, plain
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.logs.recorders.registry import ENDINGS
+from thruster_env.plants.logs.stamps import digits_for
 from thruster_env.plants.logs.table import SUFFIXES, read_table
-from thruster_env.plants.logs.units import suffix
+from thruster_env.plants.logs.units import parted, suffix
 from thruster_env.plants.quantities import Quantity
 
 EXACT = "exact"  # every digit of a number
+LEAST = 10  # digits
+DIGITS = f"%.{LEAST}g"
 
 
 def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, ...] = SUFFIXES) -> None:
@@ -45,7 +48,7 @@ def check_not_among(path: str | Path) -> None:
 
 
 def write_columns(
-    path: str | Path, columns: Mapping[str, np.ndarray], digits: str = "%.10g", *, again: bool = False
+    path: str | Path, columns: Mapping[str, np.ndarray], digits: str | None = None, *, again: bool = False
 ) -> None:
     """Write columns of equal length whole or not at all, in the form that the file's name ends in.
 
@@ -54,7 +57,8 @@ def write_columns(
     Args:
         path: that ends in .csv, .npz or .parquet.
         columns: numbers (rows,) by header.
-        digits: of numbers in CSV, as `numpy.savetxt` takes them, or EXACT.
+        digits: of numbers in CSV, as `numpy.savetxt` takes them, or EXACT; by default ten, and more in a column
+            whose numbers differ by little: so many that times differ, and others have seven of their range.
         again: whether a file of the same columns is replaced, such as estimates by later ones.
 
     Raises:
@@ -67,7 +71,7 @@ def write_columns(
     write_whole(path, content)
 
 
-def _content(suffix: str, columns: dict[str, Any], digits: str) -> bytes:
+def _content(suffix: str, columns: dict[str, Any], digits: str | None) -> bytes:
     """A file's bytes."""
     stream = io.BytesIO()
     if suffix == ".csv":
@@ -78,7 +82,8 @@ def _content(suffix: str, columns: dict[str, Any], digits: str) -> bytes:
             text.writelines(",".join(map(repr, row)) + "\n" for row in rows)
         else:
             table = np.column_stack(list(columns.values()))
-            np.savetxt(text, table, delimiter=",", fmt=digits)
+            kinds = [_digits(*one) for one in columns.items()] if digits is None else digits
+            np.savetxt(text, table, delimiter=",", fmt=kinds)
         stream.write(text.getvalue().encode())
     elif suffix == ".npz":
         np.savez(stream, **columns)
@@ -86,6 +91,18 @@ def _content(suffix: str, columns: dict[str, Any], digits: str) -> bytes:
         pyarrow = _pyarrow()
         pyarrow.parquet.write_table(pyarrow.table(columns), stream)
     return stream.getvalue()
+
+
+def _digits(name: str, values: np.ndarray) -> str:
+    """The format of a column's numbers, as `write_columns` has it by default."""
+    known = values[np.isfinite(values)]
+    if len(known) < 2:
+        return DIGITS
+    step = 1e-6 * float(np.ptp(known))
+    if parted(name)[0] in TIME_NAMES:
+        apart = abs(np.diff(known))
+        step = 0.1 * float(apart[apart > 0].min(initial=np.inf))
+    return f"%.{digits_for(float(abs(known).max()), step, LEAST)}g"
 
 
 def _check_over(path: Path, content: bytes, names: list[str] | None) -> None:

@@ -113,12 +113,12 @@ def _check(name: str, one: Samples, path: Path) -> None:
     if (np.diff(times) < 0).any():
         row = int(np.argmax(np.diff(times) < 0)) + 1
         raise ValueError(
-            f"times must increase from sample to sample, but {times[row]:.10g} s follows {times[row - 1]:.10g} s "
+            f"times must increase from sample to sample, but {times[row]:.16g} s follows {times[row - 1]:.16g} s "
             f"in {name!r} of {path}"
         )
     if np.isinf(one.values).any():
         row = int(np.argmax(np.isinf(one.values)))
-        where = f"at {times[row]:.10g} s" if len(times) else f"in row {row + 1}"
+        where = f"at {times[row]:.16g} s" if len(times) else f"in row {row + 1}"
         raise ValueError(f"numbers must be finite, but got {one.values[row]} {where} in {name!r} of {path}")
 
 
@@ -139,7 +139,7 @@ def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.nda
     clock = max(within, key=len, default=np.empty(0))
     if len(clock) < 2:
         raise ValueError(
-            f"measurements must continue after all inputs have begun, at {begin:.10g} s, but {path} has "
+            f"measurements must continue after all inputs have begun, at {begin:.16g} s, but {path} has "
             f"{len(clock)} from there on"
         )
     return clock
