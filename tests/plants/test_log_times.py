@@ -63,5 +63,6 @@ def test_an_alarm_says_when_it_was():
     alarm = Alarm(step=123, channel=0, test="cusum", size=0.3, since=100)
     said = episode_sentence([alarm], MODEL.measurements[0], times)
     assert said == (
-        "z_1: a bias of +0.3 rad/s since 1700000001 s, found at 1700000001.23 s (2023-11-14 22:13:21.230 UTC) (cusum)"
+        "z_1: a bias of +0.3 rad/s since 1700000001 s, found at 1700000001.23 s "
+        "(2023-11-14 22:13:21.230 UTC) (cusum)"
     )
