@@ -58,3 +58,21 @@ def assert_normal(sample, cov, mean=0.0):
     assert (np.abs(sample.mean(axis=1) - mean) < 4 * spread / math.sqrt(size)).all()
     standard_error = np.sqrt((np.outer(spread**2, spread**2) + cov**2) / size)
     assert (np.abs(np.cov(sample) - cov) < 4 * standard_error).all()
+
+
+def kalman_filter(model, inputs, measurements):
+    """Means (K + 1, n), covariances and log-likelihoods (K + 1,) by Kalman (1960), of an affine model.
+
+    Channels that are NaN are rows of C and R that are not there.
+    """
+    a, b, offset, c, shift = model.matrices()
+    x, p, found = model.prior_mean, model.prior_cov, []
+    for k, z in enumerate(measurements):
+        if k:
+            x, p = a @ x + b @ inputs[k - 1] + offset, a @ p @ a.T + model.process_noise_cov
+        seen = ~np.isnan(z)
+        v, h = (z - c @ x - shift)[seen], c[seen]
+        x, p, s = kalman_update(x, p, v, h, model.measurement_noise_cov[np.ix_(seen, seen)])
+        level = np.linalg.slogdet(2.0 * math.pi * s)[1]
+        found.append((x, p, -0.5 * (v @ np.linalg.solve(s, v) + level) if len(v) else 0.0))
+    return tuple(np.array(part) for part in zip(*found, strict=True))

@@ -24,7 +24,7 @@ def row_magnitude(n: int, m: int) -> Callable:
     places = memory_places(n, m)
     beyond = 10 * LARGEST
     variances = [places.cov + i * (n + 1) for i in range(n)]
-    source = Source("magnitude", "row", work=places.gain, cov=(n, n))
+    source = Source("magnitude", "row", work=places.gain)
     if source.loops:
         of_all = source.sum(f"abs(row[{i}])" for i in source.range(places.gain))
         of_variances = source.sum(

@@ -3,8 +3,7 @@
     predict: U D U' = [F U, Q^(1/2)] diag(D, I) [F U, Q^(1/2)]',  by Gram and Schmidt's method with these weights
     update:  one channel of R^(-1/2) z after the other, each a scalar whose noise has variance one
 
-It has the digits of the square-root form. Both factors lie in one matrix, D on its diagonal. There are programs of
-it only: the model's functions must be such that can be traced, and its states not more than some twenty.
+It has the digits of the square-root form. Both factors lie in one matrix, D on its diagonal.
 
 Source: Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter V; Thornton (1976),
 "Triangular covariance factorizations for Kalman filtering".

@@ -82,14 +82,22 @@ def test_it_is_filterpy_s_square_root_filter():
 
 
 @pytest.mark.usefixtures("as_python")
-def test_an_unknown_form_and_a_model_without_a_program_are_refused():
+def test_an_unknown_form_is_refused():
     for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter):
         with pytest.raises(ValueError, match="form must be one of covariance, square-root"):
             kind(model=pendulum(), form="cholesky")
     with pytest.raises(ValueError, match="beta of the square-root form must be at least"):
         UnscentedKalmanFilter(model=pendulum(), form="square-root", beta=0.5)
-    with pytest.raises(ValueError, match="is for models that are small and can be traced, but this one is not"):
-        ExtendedKalmanFilter(model=pendulum(transition=swing_if), form="ud").init()
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_model_that_cannot_be_traced_has_the_ud_form_too():
+    model = pendulum(transition=swing_if)
+    inputs, z = simulated(model, 30, missing=0.2)
+    filters_ = ExtendedKalmanFilter(model=model, form="ud"), ExtendedKalmanFilter(model=model)
+    found, expected = (run(one, None, inputs, z) for one in filters_)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9)  # of central differences
 
 
 def test_on_tensors_there_is_no_ud_form():

@@ -14,6 +14,7 @@ from thruster_env.numerics.sources import Source, is_array
 from thruster_env.numerics.triangles import (
     careful_factor,
     cholesky_factor,
+    column_solver,
     factored_inverse,
     forward_solver,
     innovation_likelihood,
@@ -29,6 +30,7 @@ from thruster_env.numerics.triangles import (
 __all__ = [
     "careful_factor",
     "cholesky_factor",
+    "column_solver",
     "factored_inverse",
     "forward_solver",
     "innovation",

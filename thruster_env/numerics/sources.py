@@ -80,7 +80,12 @@ class Source:
             result: shape of the vector or matrix that it returns; empty for others.
             work: how many products it would be written out as.
             shapes: of those arguments that are vectors or matrices.
+
+        Raises:
+            ValueError: if a shape is of no argument.
         """
+        if unknown := set(shapes) - {one.strip() for one in arguments.split(",")}:
+            raise ValueError(f"{name}({arguments}) has no argument {', '.join(sorted(unknown))}")
         self._name, self._arguments, self._result = name, arguments, result
         self.loops = work > LONGEST_TEXT or any(is_array(*shape) for shape in (result, *shapes.values()) if shape)
         self._lines: list[str] = []

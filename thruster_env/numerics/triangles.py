@@ -132,6 +132,19 @@ def forward_solver(size: int) -> Callable:
 
 
 @cache
+def column_solver(size: int, columns: int) -> Callable:
+    """Return `solve(l, b)`: l^-1 b, for l lower triangular and b of shape (size, columns)."""
+    shape = size, columns
+    source = Source("solve", "l, b", result=shape, l=(size, size), b=shape, work=size * size * columns // 2)
+    y = source.local("y", size, columns)
+    for c in source.range(columns):
+        for i in source.range(size):
+            rest = source.less(f"b[{i}][{c}]", (f"l[{i}][{k}] * {y[k, c]}" for k in source.range(i)))
+            source.line(f"{y[i, c]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(y))
+
+
+@cache
 def innovation_likelihood(size: int) -> Callable:
     """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
     shapes = {"v": (size,), "l": (size, size), "z": (size,)}

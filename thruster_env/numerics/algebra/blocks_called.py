@@ -68,6 +68,10 @@ def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tup
     return written_out("pick", "a", *lines, _loops=True, np=np, rows=rows, columns=columns)
 
 
+def _forward_quotient(result: tuple, lower: tuple, v: tuple) -> Callable:
+    return made.forward_solver(*v) if len(v) == 1 else made.column_solver(*v)
+
+
 FUNCTIONS: dict[Operation, Callable] = {
     matrices.add: by_entries("{a} + {b}"),
     matrices.subtract: by_entries("{a} - {b}"),
@@ -95,7 +99,7 @@ FUNCTIONS: dict[Operation, Callable] = {
     blocks.part: lambda result, top, left, rows, columns, a: part_of(rows, columns, a, top, left),
     blocks.pick: _pick,
     blocks.zeros: lambda result, *others: written_out("zeros", "a", "zero()", zero=zeros_of(*result)),
-    blocks.forward_quotient: lambda result, lower, v: made.forward_solver(*v),
+    blocks.forward_quotient: _forward_quotient,
     blocks.triangle_quotient: lambda result, a, lower: made.triangle_divider(*a),
     blocks.factor_of: lambda result, lower: written_out("same", "a", "a"),
 }

@@ -18,6 +18,7 @@ from thruster_env.numerics.algebra import (
     members_called,
     operations,
     points_called,
+    upper_called,
 )
 from thruster_env.numerics.algebra.blocks_called import by_entries
 from thruster_env.numerics.algebra.matrices import Matrix, Operation
@@ -171,4 +172,5 @@ _FUNCTIONS: dict[Operation, Callable] = {
     **blocks_called.FUNCTIONS,
     **members_called.FUNCTIONS,
     **geometric.FUNCTIONS,
+    **upper_called.FUNCTIONS,
 }

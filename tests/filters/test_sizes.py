@@ -1,0 +1,99 @@
+"""Few states with many sensors, and the other way round: every filter, on every path, and Kalman's numbers."""
+
+import numpy as np
+import pytest
+
+from filters import make_filter, run
+from filters.engine.restart import LARGEST, row_magnitude
+from filters.registry import FILTERS
+from tests.models import KEY, random_affine, small
+from tests.oracles import kalman_filter
+from thruster_env.numerics.sources import Source
+
+KEYS = np.array([KEY])
+EXACT = {"kf": {}, "ekf": {}, "iekf": {}, "ukf": {}, "ckf": {}, "mhe": {"loss": "quadratic"}, "schmidt": {}}
+FORMS = [(name, form) for name in ("kf", "ekf") for form in ("square-root", "ud")] + [("kf", "information")]
+SIZES = [(2, 12), (1, 16), (5, 10)]  # of which no matrix of states alone is large
+
+
+def made(name, model):
+    """A filter whose fields suit the size."""
+    if name == "fuzzy":
+        return make_filter(name, model, low=-5.0 * np.ones(model.n), high=5.0 * np.ones(model.n), premises=[0])
+    return make_filter(name, model, **EXACT[name]) if name in EXACT else small(name, model)
+
+
+def drawn(n, m, seed=0):
+    """A model, and inputs and measurements of five steps, one channel or all of them missing in two."""
+    rng = np.random.default_rng((n, m, seed))
+    model, z = random_affine(n, m, seed=seed), rng.normal(size=(1, 5, m)) * 3.0
+    z[0, 1, 0] = z[0, 3] = np.nan
+    return model, rng.normal(size=(1, 4, 2)), z
+
+
+def stepped(filter_, inputs, z):
+    """Mean and covariance after all steps of one belief."""
+    belief = filter_.init(KEY)
+    for k, one in enumerate(z[0]):
+        belief = belief if k == 0 else filter_.predict(belief, inputs[0, k - 1])
+        belief, _ = filter_.update(belief, one)
+    return belief.mean, belief.cov
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.usefixtures("as_python")
+def test_any_number_of_sensors_is_filtered_in_runs_and_by_steps(name):
+    for n, m in SIZES if name in EXACT else SIZES[:1]:
+        model, inputs, z = drawn(n, m)
+        filter_ = made(name, model)
+        found = run(filter_, KEYS, inputs, z)
+        assert np.isfinite(found.means).all() and not found.divergences.any()
+        mean, cov = stepped(filter_, inputs, z)
+        np.testing.assert_allclose(mean, found.means[0, -1], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(cov, found.covs[0, -1], rtol=1e-9, atol=1e-9)
+        if name in EXACT:
+            means, covs, levels = kalman_filter(model, inputs[0], z[0])
+            np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
+            np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-8)
+            np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize(("name", "form"), FORMS)
+@pytest.mark.parametrize(("n", "m"), [(8, 20), (18, 2)])
+@pytest.mark.usefixtures("as_python")
+def test_all_forms_of_models_of_any_size_are_kalman_s(name, form, n, m):
+    model, inputs, z = drawn(n, m)
+    filter_ = make_filter(name, model, form=form)
+    found, (means, covs, levels) = run(filter_, KEYS, inputs, z), kalman_filter(model, inputs[0], z[0])
+    np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "fields", "n", "m"), [("kf", {}, 3, 12), ("ekf", {"form": "ud"}, 8, 20)])
+def test_compiled_code_of_many_sensors_has_these_numbers_too(name, fields, n, m):
+    model, inputs, z = drawn(n, m)
+    filter_ = make_filter(name, model, **fields)
+    found, (means, covs, _) = run(filter_, KEYS, inputs, z), kalman_filter(model, inputs[0], z[0])
+    np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
+    mean, cov = stepped(filter_, inputs, z)
+    np.testing.assert_allclose(mean, means[-1], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(cov, covs[-1], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("m", [1, 12])
+def test_a_negative_variance_is_lost_for_any_number_of_sensors(m):
+    magnitude, row = row_magnitude(2, m), np.ones(200)
+    assert magnitude(row) < LARGEST
+    for place, value in ((2, -1e-9), (5, np.nan), (0, np.inf)):  # of a variance, a variance, a mean
+        lost = row.copy()
+        lost[place] = value
+        assert not magnitude(lost) < LARGEST
+    row[3] = -0.5  # a covariance
+    assert magnitude(row) < LARGEST
+
+
+def test_a_shape_of_no_argument_is_an_error():
+    with pytest.raises(ValueError, match=r"magnitude\(row\) has no argument cov"):
+        Source("magnitude", "row", work=1000, cov=(2, 2))
