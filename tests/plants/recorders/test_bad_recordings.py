@@ -214,7 +214,17 @@ def test_what_unpacks_to_more_than_may_be_read_is_refused(tmp_path, monkeypatch)
     monkeypatch.setattr(topics, "MOST_BYTES", 100)
     refused(tmp_path / "a.ulg", "a ULog must be at most 100 bytes, but got")
     write_bag(tmp_path / "a.bag", bag_topics(20))
-    refused(tmp_path / "a.bag", "the numbers of a bag must be at most 100 bytes")
+    refused(tmp_path / "a.bag", "a chunk of a bag must be at most 100 bytes")
+    write_bag(
+        tmp_path / "b.bag", [("/b", "std_msgs/msg/UInt8MultiArray", [(1 + k, sixty_bytes) for k in range(99)])]
+    )
+    monkeypatch.setattr(topics, "MOST_BYTES", 30_000)
+    refused(tmp_path / "b.bag", "the numbers of a bag must be at most 3e.04 bytes")
+
+
+def sixty_bytes(types, kind):
+    layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    return types["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(60, np.uint8))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from keyword import iskeyword
 from operator import attrgetter
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.plants.logs.recorders.bag_counts import check_counts, check_topics, counts_of, is_ros1
+from thruster_env.plants.logs.recorders.bag_files import Bag, files_of, unpacker
 from thruster_env.plants.logs.recorders.topics import (
     MOST_COLUMNS,
     MOST_FIELDS,
@@ -25,8 +28,6 @@ from thruster_env.plants.logs.recorders.topics import (
 )
 
 KIND = "bag"
-ROS1, MCAP, DB3 = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
-DATABASE = ".db3"
 TICKS = 1e9  # a second
 NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
 NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
@@ -39,6 +40,7 @@ class Leaf(NamedTuple):
 
     path: str  # "pose.position.x"
     is_array: bool
+    why: str = ""  # it is not read
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
@@ -46,42 +48,90 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
 
     Times are [s] since the bag's first message was received; a topic has those of headers if all its messages have
     one that is not 0. Fields are numbers and short arrays, of which each message has as many; a bag has no units.
-    Types come from the bag, or where it has none from the newest release of ROS 2 that the package knows.
+    Types come from the bag, or where it has none from the newest release of ROS 2 that the package knows. If a
+    topic has several, its messages are matched by the names of fields; a field is NaN in messages without it.
 
     Args:
         path: of a .bag, .db3 or .mcap file, or of the folder of a bag of ROS 2.
         wanted: columns whose topics are read; None for all.
 
     Raises:
-        ValueError: if it is no bag.
+        ValueError: if it is no bag, or has not as many messages as it says.
 
     Source: ROS, "Bag File Format 2.0"; Foxglove, "MCAP".
     """
-    room = package("rosbags.rosbag1" if path.suffix.lower() == ".bag" else "rosbags.rosbag2", KIND, path)
-    types = package("rosbags.typesys", KIND, path)
-    found: dict[str, Samples] = {}
-    with reading(KIND, path), bounded("a bag", path), room.Reader(path) as reader:
-        for file in sorted(path.glob(f"*{DATABASE}")) if path.is_dir() else [path]:
-            _check_whole(file)
-        some = [one for one in reader.connections if wants(wanted, one.topic)]
-        kinds = {one.id: Decoder(types, one, path.suffix.lower() == ".bag") for one in some}
-        some = [one for one in some if kinds[one.id].leaves]
-        begin, size = reader.start_time, 0
-        for connection, received, data in reader.messages(some) if some else ():
-            decoder = kinds[connection.id]
-            stamp, row = decoder.read(data)
-            size += 8 * (len(row) + 2)
-            check_bytes(size, "the numbers of a bag", path)
-            found.setdefault(connection.topic, Samples(decoder.leaves)).add(received, stamp, row)
-    for name in sorted(found):
-        yield found[name].topic(name, begin)
+    contents = Contents(path, wanted)
+    with reading(KIND, path), bounded("a bag", path), files_of(path, KIND) as bag:
+        for file in bag.files:
+            contents.add(file, bag.is_packed)
+        contents.check(bag)
+        begin = bag.begin if bag.begin is not None else contents.begin
+    for name in sorted({*contents.samples, *contents.unread}):
+        yield _topic(name, [*contents.samples.get(name, {}).values()], begin, contents.unread.get(name, {}))
+
+
+class Contents:
+    """What is read of a bag, file by file.
+
+    Attributes:
+        samples: the numbers of a topic by the leaves of its messages, by topic.
+        unread: why a field is not read, by topic and field.
+        begin: when the first message was received [ns].
+    """
+
+    def __init__(self, path: Path, wanted: Wanted):
+        """Nothing is read yet."""
+        self.path, self._wanted, self._is_ros1 = path, wanted, is_ros1(path)
+        self._room = package("rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2", KIND, path)
+        self._types = package("rosbags.typesys", KIND, path)
+        self.samples: dict[str, dict[tuple[Leaf, ...], Samples]] = {}
+        self.unread: dict[str, dict[str, str]] = {}
+        self.begin = 0
+        self._size, self._known, self._counts = 0, set[str](), Counter[str]()
+
+    def add(self, file: Path, is_packed: bool) -> None:
+        """Read the messages of a file; ValueError unless it has as many as it says."""
+        stated = counts_of(file)
+        with self._room.Reader(file) as reader:
+            names = {one.id: one.topic for one in reader.connections}
+            if len(names) < len(reader.connections):
+                raise ValueError("it has two connections of one number")
+            decoders = {
+                one.id: Decoder(self._types, one, self._is_ros1)
+                for one in reader.connections
+                if wants(self._wanted, one.topic)
+            }
+            some = [one for one in reader.connections if one.id in decoders and decoders[one.id].leaves]
+            rows = Counter({one.id: 0 for one in some})
+            unpack = unpacker(KIND, self.path).decompress if is_packed else bytes
+            for connection, received, data in reader.messages(some) if some else ():
+                decoder = decoders[connection.id]
+                stamp, row = decoder.read(unpack(data))
+                rows[connection.id] += 1
+                parts = self.samples.setdefault(connection.topic, {})
+                if decoder.leaves not in parts:
+                    parts[decoder.leaves] = Samples(decoder.leaves)
+                self._size += 8 * parts[decoder.leaves].add(received, stamp, row)
+                check_bytes(self._size, "the numbers of a bag", self.path)
+            if reader.message_count:
+                self.begin = min(self.begin or reader.start_time, reader.start_time)
+        check_counts(rows, names, stated, self.path)
+        for number, decoder in decoders.items():
+            self.unread.setdefault(names[number], {}).update(decoder.unread)
+        self._known |= set(names.values())
+        for number, count in rows.items():
+            self._counts[names[number]] += count
+
+    def check(self, bag: Bag) -> None:
+        """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says."""
+        check_topics(self._counts, bag.counts, self._known, self.path)
 
 
 class Decoder:
     """Numbers of the messages of one type."""
 
     def __init__(self, types: Any, connection: Any, is_ros1: bool):
-        """Find the fields that hold numbers; none for a type that is not known."""
+        """Find the fields that hold numbers, and say of others why they are not read."""
         store = types.get_typestore(types.Stores.EMPTY)
         text, kind = connection.msgdef.data, connection.msgtype
         if text:
@@ -91,7 +141,13 @@ class Decoder:
             store.register(defined)
         elif not is_ros1:
             store = types.get_typestore(types.Stores.LATEST)
-        self.leaves = list(_leaves(store.fielddefs, kind)) if kind in store.fielddefs else []
+        every = [*_leaves(store.fielddefs, kind)] if kind in store.fielddefs else []
+        self.leaves = tuple(one for one in every if not one.why)
+        self.unread = {one.path: one.why for one in every if one.why}
+        encoding = "cdr" if is_ros1 else connection.ext.serialization_format
+        if kind not in store.fielddefs or encoding != "cdr":
+            what = f"messages of the type {kind[:80]}, which is not known"
+            self.leaves, self.unread = (), {"": what if encoding == "cdr" else f"messages as {encoding[:80]}"}
         read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         self._message = lambda data: read(data, kind)
         self._fields = attrgetter(*(one.path for one in self.leaves), "__class__") if self.leaves else None
@@ -109,56 +165,75 @@ class Decoder:
 class Samples:
     """The numbers of a topic, as they come."""
 
-    def __init__(self, leaves: list[Leaf]):
+    def __init__(self, leaves: Sequence[Leaf]):
         """Nothing is there yet."""
         self.leaves = leaves
         self.received, self.stamps = array("q"), array("q")
         self.numbers = [array("d") for _ in leaves]
         self.widths: list[int | None] = [None] * len(leaves)  # entries of an array; -1 where they differ
 
-    def add(self, received: int, stamp: int, row: tuple) -> None:
-        """Add a message, received and stamped at some time [ns]."""
-        first = not self.received
+    def add(self, received: int, stamp: int, row: tuple) -> int:
+        """Add a message, received and stamped at some time [ns]; return how many numbers it adds."""
+        first, count = not self.received, 2
         self.received.append(received)
         self.stamps.append(stamp)
         for place, (leaf, value) in enumerate(zip(self.leaves, row, strict=True)):
             if not leaf.is_array:
                 self.numbers[place].append(value)
+                count += 1
             elif first or self.widths[place] == len(value):
                 self.widths[place] = len(value)
                 if len(value) <= MOST_COLUMNS:
                     self.numbers[place].extend(value)
+                    count += len(value)
             else:
                 self.widths[place] = -1
                 del self.numbers[place][:]
+        return count
 
-    def topic(self, name: str, begin: int) -> Topic:
-        """Fields of all messages, in order of their times [s] since the beginning [ns]."""
-        ticks = np.array(self.stamps if all(self.stamps) else self.received, np.int64)
-        order = np.argsort(ticks, kind="stable")
+    def columns(self) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """The numbers of each field (messages,), in the order of messages, and why an array is not read."""
         values: dict[str, np.ndarray] = {}
+        unread: dict[str, str] = {}
         for leaf, numbers, width in zip(self.leaves, self.numbers, self.widths, strict=True):
             if not leaf.is_array:
-                values[leaf.path] = np.array(numbers)[order]
+                values[leaf.path] = np.array(numbers)
             elif width is not None and 0 < width <= MOST_COLUMNS:
-                rows = np.array(numbers).reshape(-1, width)[order]
+                rows = np.array(numbers).reshape(-1, width)
                 values |= {f"{leaf.path}[{entry}]": rows[:, entry] for entry in range(width)}
-        return Topic(name, (ticks[order] - begin) / TICKS, values)
+            elif width:
+                unread[leaf.path] = (
+                    "an array whose length changes" if width < 0 else f"an array of {width} entries"
+                )
+        return values, unread
 
 
-def _check_whole(path: Path) -> None:
-    """Raise ValueError for a database of SQLite that has fewer pages than it says; SQLite reads what is left."""
-    with path.open("rb") as file:
-        head = file.read(100)
-    if head.startswith(DB3) and head[24:28] == head[92:96]:  # the count of pages is that of the last change
-        page = int.from_bytes(head[16:18]) or 1
-        count = int.from_bytes(head[28:32])
-        if path.stat().st_size < count * (page if page > 1 else 65536):
-            raise ValueError(f"{path.name} is cut off")
+def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str, str]) -> Topic:
+    """A topic whose messages are of one type or several, in order of their times [s] since the beginning [ns]."""
+    stamps, received = (np.concatenate([np.empty(0, np.int64), *some]) for some in _ticks(parts))
+    ticks = (stamps if stamps.all() else received).astype(np.int64)
+    order = np.argsort(ticks, kind="stable")
+    values: dict[str, np.ndarray] = {}
+    unread, row = dict(unread), 0
+    for one in parts:
+        columns, others = one.columns()
+        unread |= others
+        for field, numbers in columns.items():
+            values.setdefault(field, np.full(len(ticks), np.nan))[row : row + len(numbers)] = numbers
+        row += len(one.received)
+    return Topic(
+        name, (ticks[order] - begin) / TICKS, {key: one[order] for key, one in values.items()}, unread=unread
+    )
+
+
+def _ticks(parts: Sequence[Samples]) -> Iterator[list[np.ndarray]]:
+    """The stamps of messages, and when they were received [ns]."""
+    yield [np.array(one.stamps, np.int64) for one in parts]
+    yield [np.array(one.received, np.int64) for one in parts]
 
 
 def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Iterator[Leaf]:
-    """Fields of a message of a type that hold numbers, those of messages in it included; not its header."""
+    """Fields of a message of a type that hold numbers or arrays of messages, not those of its header."""
     for name, (node, what) in defined[kind][1]:
         path = before + (f"{name}_" if iskeyword(name) else name)
         if node.name == "BASE" and NUMBER.fullmatch(what[0]):
@@ -167,12 +242,11 @@ def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Itera
             yield from _leaves(defined, what, f"{path}.", depth + 1)
         elif node.name in ("ARRAY", "SEQUENCE"):
             (inner, base), size = what
-            if (
-                inner.name == "BASE"
-                and NUMBER.fullmatch(base[0])
-                and (node.name == "SEQUENCE" or size <= MOST_COLUMNS)
-            ):
-                yield Leaf(path, True)
+            if inner.name == "NAME":
+                yield Leaf(path, True, "an array of messages")
+            elif NUMBER.fullmatch(base[0]):
+                is_long = node.name == "ARRAY" and size > MOST_COLUMNS
+                yield Leaf(path, True, f"an array of {size} entries" if is_long else "")
 
 
 def _check_types(defined: dict) -> None:

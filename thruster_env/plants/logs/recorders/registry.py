@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.plants.logs.recorders import bags, dataflash, hdf5, matlab, ulog
+from thruster_env.plants.logs.recorders import bag_counts, bags, dataflash, hdf5, matlab, ulog
+from thruster_env.plants.logs.recorders.bag_files import METADATA
 from thruster_env.plants.logs.recorders.topics import Reader, Wanted, unreadable
 from thruster_env.plants.logs.table import SUFFIXES
 
-METADATA = "metadata.yaml"  # in the folder of a bag of ROS 2
 BINS = 8  # of the course of a field
 
 
@@ -29,9 +29,9 @@ class Format(NamedTuple):
 FORMATS = (
     Format(ulog.KIND, (".ulg", ".ulog"), ulog.MAGIC, ulog.topics),
     Format(dataflash.KIND, (".bin",), dataflash.MAGIC, dataflash.topics),
-    Format("bag of ROS 1", (".bag",), bags.ROS1, bags.topics),
-    Format("MCAP file", (".mcap",), bags.MCAP, bags.topics),
-    Format("bag of ROS 2", (".db3",), bags.DB3, bags.topics),
+    Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics),
+    Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics),
+    Format("bag of ROS 2", (".db3",), bag_counts.DB3, bags.topics),
     Format(matlab.KIND, (".mat",), matlab.MAGIC, matlab.topics, False),
     Format(hdf5.KIND, (".h5", ".hdf5", ".hdf"), hdf5.MAGIC, hdf5.topics, False),
 )

@@ -28,6 +28,7 @@ class Topic(NamedTuple):
     times: np.ndarray | None  # (samples,) [s]; None where the file has none for it
     values: Mapping[str, np.ndarray]  # (samples,) float64 by field: "output[0]"
     units: Mapping[str, str] = {}  # by field, where the file has them
+    unread: Mapping[str, str] = {}  # why fields are not read; "" for all of the topic
 
     def column(self, field: str) -> str:
         """The name of a field's column: TOPIC.FIELD."""
