@@ -1,4 +1,8 @@
-"""Graphs of numbers, worked out of tensors: an operation of torch for each number, for a whole batch."""
+"""Graphs of numbers, worked out of tensors: an operation of torch for each number, for a whole batch.
+
+autograd multiplies slopes, also those of what a choice leaves out: 0 times the infinite slope of a root at zero is
+NaN. Where an operation has no finite slope, its result is a constant (`slopes` has the same rule).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import torch
 from torch import Tensor
 
 from thruster_env.numerics.algebra.graphs import Number, needed_by
+from thruster_env.numerics.algebra.magnitudes import POSITIVE
 from thruster_env.numerics.algebra.precision import as_single
 
 WORK: dict[str, Callable] = {
@@ -28,6 +33,24 @@ WORK: dict[str, Callable] = {
     "and": operator.and_,
 }
 """Operations of tensors and floats; other ones are torch's functions of tensors, by their names."""
+
+HAS_SLOPE: dict[str, Callable] = {
+    "sqrt": lambda x: x > 0.0,
+    "log": lambda x: x > 0.0,
+    "/": lambda a, b: b != 0.0,
+    "pow": lambda x, e: torch.isfinite(x**e) & ((x != 0.0) | (e >= 1.0)),
+    "arctan2": lambda a, b: (a != 0.0) | (b != 0.0),
+    "exp": lambda x: torch.isfinite(torch.exp(x)),
+    **dict.fromkeys(("sinh", "cosh"), lambda x: torch.isfinite(torch.cosh(x))),
+}
+"""Where an operation has a finite slope, of those that do not have one everywhere."""
+
+
+def _with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor]) -> Tensor:
+    """The result of an operation; a constant where it has no finite slope."""
+    has_slope = HAS_SLOPE[operation](*(a.detach() for a in arguments))
+    moving = function(*(torch.where(has_slope, a, 1.0) for a in arguments))
+    return torch.where(has_slope, moving, function(*(a.detach() for a in arguments)))
 
 
 def order_of(wanted: Sequence[Number]) -> list[Number]:
@@ -57,6 +80,9 @@ def values_of(
             values[one.place] = given[one.arguments[0]]
         elif one.value is not None:
             values[one.place] = one.value if like.dtype == torch.float64 else as_single(one.value)
+        elif one.operation in HAS_SLOPE and one.of[-1 if one.operation == "/" else 0].sign != POSITIVE:
+            function = WORK.get(one.operation) or getattr(torch, one.operation)
+            values[one.place] = _with_finite_slope(one.operation, function, [*map(tensor, arguments)])
         elif one.operation in WORK:
             values[one.place] = WORK[one.operation](*arguments)
         else:

@@ -26,6 +26,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from thruster_env.numerics.algebra.folding import difference, negative, product, quotient, total, worked_out
+from thruster_env.numerics.algebra.magnitudes import overflow_of, sign_of
 
 UNARY = ("sqrt", "exp", "log", "sin", "cos", "tan", "arctan", "tanh", "sinh", "cosh", "floor", "ceil")
 TWO_SIDED = {"+", "*"}  # operations whose arguments may change places
@@ -96,9 +97,10 @@ class Number:
         place: its index in the graph.
         value: what a constant is; None for others.
         member: whether it is one number for each member of an ensemble.
+        may_overflow, sign: what is known of its size, as `magnitudes` says.
     """
 
-    __slots__ = ("graph", "operation", "arguments", "of", "place", "value", "member")
+    __slots__ = ("graph", "operation", "arguments", "of", "place", "value", "member", "may_overflow", "sign")
     sqrt: Callable[[], Number]  # and so on, as UNARY has them
     log: Callable[[], Number]
     floor: Callable[[], Number]
@@ -110,6 +112,7 @@ class Number:
         self.of: tuple[Number, ...] = tuple([a for a in arguments if isinstance(a, Number)])
         self.value = float.fromhex(arguments[0]) if operation == "constant" else None
         self.member: bool = operation not in REDUCTIONS and any([a.member for a in self.of])
+        self.may_overflow, self.sign = overflow_of(operation, self.of), sign_of(operation, self.of, self.value)
 
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"

@@ -8,6 +8,11 @@ is there once:
 
 Forwards, because a filter's parameters are few, and because Fisher's information asks how each innovation
 changes along each of them, which the other direction does not find.
+
+Where a number is finite, so is its slope. A root at zero has none, or an infinite one: it is 0 there, which lies
+between those of both sides, and so the slope of sqrt(v v) v is 0 at v = 0, as that of |v| v is. What fades
+faster than its argument grows, 1/(1 + exp(x)) where exp(x) is infinite, has the slope 0, and not 0 times infinity.
+Choices say this, as their derivatives are choices again: the rule holds for slopes of slopes.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from thruster_env.numerics.algebra.graphs import Number, needed_by, where
+from thruster_env.numerics.algebra.magnitudes import POSITIVE
 
 Slope = Number | None  # None of a number that does not move
 
@@ -54,13 +60,34 @@ def _of_choice(y, condition, a, b, of_condition, da, db):
     return where(condition, 0.0 if da is None else da, 0.0 if db is None else db)
 
 
+def _unless_zero(x, slope: Slope) -> Slope:
+    """A slope, or 0 where x is zero."""
+    return slope if slope is None or x.value or x.sign == POSITIVE else where(x == 0.0, 0.0, slope)
+
+
+def _fading(slope: Slope, x: Number, factor: Callable[[], Number]) -> Slope:
+    """The slope of a function of x times its derivative, which vanishes where x becomes infinite."""
+    found = times(slope, factor)
+    return _unless_zero(factor(), found) if found is not None and x.may_overflow else found
+
+
+def _of_quotient(y, a, b, da, db):
+    return added(times(da, lambda: 1.0 / b), _fading(db, b, lambda: -y / b))
+
+
 def _of_power(y, x, e, dx, de):
-    return added(times(dx, lambda: e * x ** (e - 1.0)), times(de, lambda: y * x.log()))
+    by_base = times(dx, lambda: e * x ** (e - 1.0))
+    if e.value is None:
+        by_base = None if by_base is None else where((x == 0.0) & (e < 1.0), 0.0, by_base)
+    elif e.value < 1.0:
+        by_base = _unless_zero(x, by_base)
+    return added(by_base, _unless_zero(x, times(de, lambda: y * abs(x).log())))
 
 
 def _of_angle(y, a, b, da, db):
     square = a * a + b * b
-    return added(times(da, lambda: b / square), times(db, lambda: -a / square))
+    slope = added(times(da, lambda: b / square), times(db, lambda: -a / square))
+    return _unless_zero(square, slope)
 
 
 def _none(y, *others):
@@ -72,17 +99,17 @@ _RULES: dict[str, Callable] = {
     "+": lambda y, a, b, da, db: added(da, db),
     "-": lambda y, a, b, da, db: added(da, None if db is None else -db),
     "*": lambda y, a, b, da, db: added(times(da, lambda: b), times(db, lambda: a)),
-    "/": lambda y, a, b, da, db: added(times(da, lambda: 1.0 / b), times(db, lambda: -y / b)),
+    "/": _of_quotient,
     "negative": lambda y, x, dx: -dx,
     "abs": lambda y, x, dx: where(x < 0.0, -dx, dx),
-    "sqrt": lambda y, x, dx: 0.5 * dx / y,
-    "exp": lambda y, x, dx: dx * y,
+    "sqrt": lambda y, x, dx: _unless_zero(y, 0.5 * dx / y),
+    "exp": lambda y, x, dx: _fading(dx, x, lambda: y),
     "log": lambda y, x, dx: dx / x,
     "sin": lambda y, x, dx: dx * x.cos(),
     "cos": lambda y, x, dx: -dx * x.sin(),
     "tan": lambda y, x, dx: dx * (1.0 + y * y),
-    "arctan": lambda y, x, dx: dx / (1.0 + x * x),
-    "tanh": lambda y, x, dx: dx * (1.0 - y * y),
+    "arctan": lambda y, x, dx: _fading(dx, x, lambda: 1.0 / (1.0 + x * x)),
+    "tanh": lambda y, x, dx: _fading(dx, x, lambda: 1.0 - y * y),
     "sinh": lambda y, x, dx: dx * x.cosh(),
     "cosh": lambda y, x, dx: dx * x.sinh(),
     "pow": _of_power,
