@@ -42,7 +42,8 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
     `outlier_rate`: a filter for outliers. What a mode lacks of the model's states the others say (unbiased mixing,
     `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
 
-    `Belief.extras` holds the memory of the modes' filters and the probabilities: see `mode_estimates`.
+    Probabilities are kept as logarithms, so that a mode whose probability is below the least float64 comes back if
+    measurements speak for it. `Belief.extras` holds the memory of the modes' filters and these: see `mode_estimates`.
 
     Attributes:
         stay: probability that a step keeps its mode without a draw, within 0 and 1.

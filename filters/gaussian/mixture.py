@@ -43,19 +43,22 @@ def blender(
         source.line(
             " = ".join([*(mean[i] for i in range(size)), *(cov[i, j] for i, j in lower_pairs(size)), "0.0"])
         )
+    has_weight = "if row[weights + k] != 0.0:"  # 0 times the square of a part far away may be NaN
     for _ in source.inside(each[0]):
         source.line(each[1])
-        for i in source.range(size):
-            source.line(f"{mean[i]} += row[weights + k] * row[part + {x + i}]")
+        for _ in source.inside(has_weight):
+            for i in source.range(size):
+                source.line(f"{mean[i]} += row[weights + k] * row[part + {x + i}]")
     for _ in source.inside(each[0]):
         source.line(each[1])
         source.line("w = row[weights + k]")
-        for i in source.range(size if between else 0):
-            source.line(f"{d[i]} = row[part + {x + i}] - {mean[i]}")
-        for i in source.range(size):
-            for j in source.range(i + 1):
-                apart = f" + {d[i]} * {d[j]}" * between
-                source.line(f"{cov[i, j]} += w * (row[part + {p + i * size + j}]{apart})")
+        for _ in source.inside(has_weight):
+            for i in source.range(size if between else 0):
+                source.line(f"{d[i]} = row[part + {x + i}] - {mean[i]}")
+            for i in source.range(size):
+                for j in source.range(i + 1):
+                    apart = f" + {d[i]} * {d[j]}" * between
+                    source.line(f"{cov[i, j]} += w * (row[part + {p + i * size + j}]{apart})")
     for i in source.range(size):
         source.line(f"row[target + {i}] = {mean[i]}")
         for j in source.range(i + 1):
@@ -97,7 +100,10 @@ def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callab
 
 @cache
 def weigher(parts: Parts, level: int) -> Callable:
-    """Return `weigh(row, weights)`: weights after a measurement, by log-likelihoods; the log of their sum."""
+    """Return `weigh(row, weights)`: weights after a measurement, by log-likelihoods; the log of their sum.
+
+    It is for weights that each update begins with, none of which is zero.
+    """
     (_, stride, count), first = parts, parts.first + level
 
     @inlined
@@ -116,8 +122,42 @@ def weigher(parts: Parts, level: int) -> Callable:
     return weigh
 
 
+@cache
+def log_weigher(parts: Parts, level: int) -> Callable:
+    """Return `weigh(row, logs, weights)`: the same of weights that are carried on, by their logarithms.
+
+    These lie from `logs` on; a weight of zero, -inf there, stays zero. A weight that is too small for a float64
+    keeps its logarithm, so that its part comes back as soon as measurements speak for it.
+    """
+    (_, stride, count), first = parts, parts.first + level
+
+    @inlined
+    def weigh(row, logs, weights):
+        top = -math.inf
+        for k in range(count):
+            row[logs + k] += row[first + k * stride]
+            top = max(top, row[logs + k])
+        total = 0.0
+        for k in range(count):
+            row[weights + k] = math.exp(row[logs + k] - top)
+            total += row[weights + k]
+        log_total = top + math.log(total) if total > 0.0 else -math.inf
+        for k in range(count):
+            row[weights + k] /= total
+            row[logs + k] -= log_total
+        return log_total
+
+    return weigh
+
+
+@inlined
+def logarithm(weight):
+    """The logarithm of a weight, -inf of zero."""
+    return math.log(weight) if weight > 0.0 else -math.inf
+
+
 def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (number, n), covariances (number, n, n) and weights of the parts in a belief's extras."""
+    """Means (number, n), covariances (number, n, n) and weights, or their logarithms, of parts in a belief's extras."""
     parts, weights = np.split(extras, [-number])
     means, covs, _ = np.split(parts.reshape(number, -1), [n, n + n * n], axis=1)
     return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()

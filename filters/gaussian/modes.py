@@ -11,7 +11,7 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.engine.restart import restart_if_lost
 from filters.gaussian.absent import Absent, completer
-from filters.gaussian.mixture import Parts, blender, nothing, weigher
+from filters.gaussian.mixture import Parts, blender, log_weigher, logarithm, nothing
 from filters.pages.kernels import anything_measured, nothing_to_summarise
 from filters.pages.programs import stored, works_of
 from thruster_env.numerics.algebra.matrices import given
@@ -19,6 +19,9 @@ from thruster_env.numerics.algebra.programs import Place
 from thruster_env.numerics.compiled import inlined
 from thruster_env.plants.layout import number_places, starts_of
 from thruster_env.plants.shape import Shape
+
+
+LOST = 700.0  # what the log-likelihood of a mode whose filter begins anew is below the least of the others
 
 
 class Mode(NamedTuple):
@@ -35,15 +38,15 @@ def mode_kernels(
     """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
 
     The filter's own numbers are p (K,), Pi (K, K) by columns, and those of each mode. Extras: the memory of each
-    mode's filter, then the probabilities. `mixing(p, mu)` gives for a column of Pi the weights of all modes with
-    which one begins a step, and its probability; without it each filter runs by itself.
+    mode's filter, then the logarithms of the probabilities. `mixing(p, mu)` gives for a column of Pi the weights of
+    all modes with which one begins a step, and its probability; without it each filter runs by itself.
     """
     n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
     at, own = memory_places(n, m), own_place(shape)
     first, stride = at.extras, at.extras + max(one.kernels.extras + one.kernels.scratch for one in modes)
-    parts, probabilities = Parts(first, stride, count), first + count * stride
-    scratch = probabilities + count
-    completing = scratch + count * (2 + belief)  # behind what `_mixer` needs
+    parts, logs = Parts(first, stride, count), first + count * stride
+    probabilities = logs + count  # what follows is scratch
+    completing = probabilities + count * (3 + belief)  # behind what `_mixer` needs
     end = completing + (count + belief) * bool(absent)
     of_states = blender(parts, n, at.mean, at.cov, shape.state_angles)
     of_innovations = blender(parts, m, at.innovation, at.innovation_cov, shape.measurement_angles, wraps=False)
@@ -53,14 +56,19 @@ def mode_kernels(
     model = number_places(n, m)
     priors = [(place + model.prior_mean, place + model.prior_cov) for place in of_modes[:-1]]
     complete = completer(absent, parts, n, of_states, priors, completing)
-    weigh = weigher(parts, level)
+    weigh = log_weigher(parts, level)
 
     @inlined
     def blend(row, weights, numbers, target):
         complete(row, weights, numbers)
         of_states(row, weights, target)
 
-    mix = nothing if mixing is None else _mixer(mixing, parts, belief, probabilities, own + count, blend)
+    mix = nothing if mixing is None else _mixer(mixing, parts, belief, logs, own + count, blend)
+
+    @inlined
+    def recall(row):
+        for j in range(count):
+            row[probabilities + j] = math.exp(row[logs + j])
 
     @inlined
     def start(memory, numbers, size):
@@ -68,7 +76,8 @@ def mode_kernels(
         for i in range(first, end):
             row[i] = 0.0
         for j in range(count):
-            row[probabilities + j] = numbers[own + j]
+            row[logs + j] = logarithm(numbers[own + j])
+        recall(row)
         start_all(memory, numbers, numbers)
         blend(row, probabilities, numbers, 0)
 
@@ -76,6 +85,7 @@ def mode_kernels(
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         mix(memory, u, numbers)
+        recall(row)
         predict_all(memory, u, numbers)
         blend(row, probabilities, numbers, 0)
         row[step] += 1.0
@@ -83,43 +93,59 @@ def mode_kernels(
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
+        recall(row)
         update_all(memory, z, numbers)
         of_innovations(row, probabilities, innovation)
         row[level] = 0.0
         if anything_measured(z):
+            least = math.inf
+            for j in range(count):
+                part = first + j * stride
+                if not row[part + lost] > 0.0:
+                    least = min(least, row[part + level])
             for j in range(count):
                 part = first + j * stride
                 if row[part + lost] > 0.0:  # it has begun anew: it says nothing of this measurement
-                    row[part + lost], row[part + level] = 0.0, -math.inf
-            row[level] = weigh(row, probabilities)
+                    row[part + lost], row[part + level] = 0.0, least - LOST if least < math.inf else -math.inf
+            row[level] = weigh(row, logs, probabilities)
         blend(row, probabilities, numbers, 0)
 
-    kept = scratch - first
+    kept = probabilities - first
     return Kernels(
         n, m, n, 0, start, predict, update, nothing_to_summarise, extras=kept, scratch=end - first - kept
     )
 
 
-def _mixer(
-    mixing: Callable, parts: Parts, belief: int, probabilities: int, transitions: int, blend: Callable
-) -> Callable:
-    """Return `mix(memory, u, numbers)`: the belief with which each filter begins is a mixture of all."""
+def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: int, blend: Callable) -> Callable:
+    """Return `mix(memory, u, numbers)`: the belief with which each filter begins is a mixture of all.
+
+    Of the probabilities mu a column has the ratios to the largest that leads to its mode, which is as good.
+    """
     first, stride, count = parts
-    foreseen, shares, mixed = (probabilities + k * count for k in (1, 2, 3))
-    p, mu = given(Place("numbers", 0), (count,)), given(Place("rows", probabilities), (count,))
+    ratios, foreseen, shares, mixed = (logs + k * count for k in (1, 2, 3, 4))
+    p, mu = given(Place("numbers", 0), (count,)), given(Place("rows", ratios), (count,))
     (share,) = works_of(stored(mixing(p, mu), (Place("rows", shares), Place("given", 0))))
 
     @inlined
     def mix(memory, u, numbers):
         row, _, _ = memory
         for j in range(count):
-            share(row, row[foreseen + j :], numbers[transitions + j * count :])
-            if not row[foreseen + j] > 0.0:  # no mode leads to this one: its filter goes on
+            column, top = transitions + j * count, -math.inf
+            for i in range(count):
+                if numbers[column + i] > 0.0:
+                    top = max(top, row[logs + i])
+            if top > -math.inf:
+                for i in range(count):
+                    row[ratios + i] = math.exp(row[logs + i] - top) if numbers[column + i] > 0.0 else 0.0
+                share(row, row[foreseen + j :], numbers[column:])
+                row[foreseen + j] = top + logarithm(row[foreseen + j])
+            else:  # no mode leads to this one: its filter goes on
+                row[foreseen + j] = -math.inf
                 for i in range(count):
                     row[shares + i] = 1.0 if i == j else 0.0
             blend(row, shares, numbers, mixed + j * belief)
         for j in range(count):
-            row[probabilities + j] = row[foreseen + j]
+            row[logs + j] = row[foreseen + j]
             for i in range(belief):
                 row[first + j * stride + i] = row[mixed + j * belief + i]
 

@@ -162,10 +162,15 @@ class MultipleModelFilter(Filter):
 
     def mode_probabilities(self, belief: Belief) -> np.ndarray:
         """Probabilities mu (K,) of the modes of a belief."""
-        return belief.extras[-len(self.mode_filters) :].copy()
+        return self.mode_estimates(belief)[2]
 
     def mode_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (K, n), covariances (K, n, n) and probabilities (K,) of the modes of a belief."""
+        means, covs, logs = self.mode_moments(belief)
+        return means, covs, np.exp(logs)
+
+    def mode_moments(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same with the logarithms of the probabilities, -inf of zero."""
         return parts_of(belief.extras, len(self.mode_filters), self.model.n)
 
 

@@ -65,10 +65,10 @@ def complete(filter_: MultipleModelFilter, mu, means, covs) -> None:
 
 
 def weights_of(prior: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """The w (B, i, j) of prior weights and log densities; where none is possible each mode follows from itself."""
-    levels = np.where((prior > 0.0) & np.isfinite(levels), levels, -np.inf)
+    """The w (B, i, j) of log prior weights and densities; where none is possible each mode follows from itself."""
+    levels = np.where(np.isfinite(prior) & np.isfinite(levels), prior + levels, -np.inf)
     top = levels.max(axis=1, keepdims=True)
-    raw = prior * np.exp(levels - np.where(np.isfinite(top), top, 0.0))
+    raw = np.exp(levels - np.where(np.isfinite(top), top, 0.0))
     total = raw.sum(axis=1, keepdims=True)
     return np.where(total > 0.0, raw / np.where(total > 0.0, total, 1.0), np.eye(prior.shape[1]))
 
@@ -84,10 +84,10 @@ def merged(weights, means, covs, angles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray, ...]:
-    """Means (B, K + 1, M, n), covariances, probabilities of the modes, and which steps are restarts."""
+    """Means (B, K + 1, M, n), covariances, log probabilities of the modes, and which steps are restarts."""
     (count, times, _), n, modes = z.shape, filter_.model.n, len(filter_.mode_filters)
     means, covs = np.empty((count, times, modes, n)), np.empty((count, times, modes, n, n))
-    mu, divergences = np.empty((count, times, modes)), np.zeros((count, times))
+    logs, divergences = np.empty((count, times, modes)), np.zeros((count, times))
     session = Session(filter_)
     for b in range(count):
         for k in range(times):
@@ -95,6 +95,6 @@ def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray,
                 session.step(inputs[b, k - 1], z[b, k])
             else:
                 session.start(keys[b], z[b, 0])
-            means[b, k], covs[b, k], mu[b, k] = filter_.mode_estimates(session.belief())
+            means[b, k], covs[b, k], logs[b, k] = filter_.mode_moments(session.belief())
             divergences[b, k] = session.divergences
-    return means, covs, mu, np.diff(divergences, axis=1, prepend=divergences[:, :1]) > 0
+    return means, covs, logs, np.diff(divergences, axis=1, prepend=divergences[:, :1]) > 0

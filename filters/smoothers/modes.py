@@ -64,8 +64,10 @@ def smooth_modes(
     relations = [relation_of(one, "a mode of a smoother") for one in filter_.mode_filters]
     kinds = [one for one in filter_.mode_filters if isinstance(one, PageFilter)]
     steps = [passes(one, relation) for one, relation in zip(kinds, relations, strict=True)]
-    means, covs, mu, restarted = filtered(filter_, keys, inputs, measurements)
-    angles, transition = filter_.model.shape.state_angles, filter_.transition_matrix
+    means, covs, logs, restarted = filtered(filter_, keys, inputs, measurements)
+    mu, angles = np.exp(logs), filter_.model.shape.state_angles
+    with np.errstate(divide="ignore"):
+        log_transition = np.log(filter_.transition_matrix)
     count, times, modes, n = means.shape
     absent = [{i for one in filter_.absent_states if j in one.modes for i in one.states} for j in range(modes)]
     own = [[i for i in range(n) if i not in some] for some in absent]
@@ -82,7 +84,7 @@ def smooth_modes(
             ends = np.stack([begun[0], later], axis=1), np.stack([begun[1], later_cov], axis=1), anew
             corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1)
             pair_x[:, i, j], pair_p[:, i, j] = corrected[:, 0], cov[:, 0]
-        w = weights_of(transition * mu[:, k, :, None], levels)
+        w = weights_of(log_transition + logs[:, k, :, None], levels)
         joint = w * found.probabilities[:, k + 1, None, :]  # of modes i at k and j at k + 1
         now = np.where(restarted[:, k + 1, None], mu[:, k], joint.sum(axis=2))
         of_i = joint.sum(axis=2, keepdims=True)

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, KalmanFilter, make_filter, run, smooth, smooth_modes
+from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, make_filter, run, smooth, smooth_modes
 from filters.smoothers.backwards import passes
 from filters.smoothers.mode_steps import merged, told
 from filters.smoothers.relations import relation_of
@@ -211,3 +211,15 @@ def test_later_measurements_help_modes_of_unequal_sizes(given):
     filtered_, smoothed = run(filter_, *data).means, smooth(filter_, *data).means
     before, after = (np.sqrt(np.mean((one - x) ** 2, axis=(0, 1))) for one in (filtered_, smoothed))
     assert (after < 0.75 * before).all(), (before, after)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_mode_that_no_other_leads_to_was_on_all_the_time_however_improbable_it_was():
+    noise = {"process_noise_cov": [1e-4], "measurement_noise_cov": [0.1], "prior_mean": [0.0], "prior_cov": [1e-4]}
+    plain, shifted = (
+        affine_model(a=[[1.0]], b=[[0.0]], c=[[1.0]], measurement_offset=[shift], **noise) for shift in (0.0, 10.0)
+    )
+    z = np.repeat([10.0, 0.0], [5, 12])[None, :, None]
+    filter_ = make_filter("imm", plain, modes=[plain, shifted], transition=[[0.9, 0.1], [0.0, 1.0]])
+    found = smooth_modes(filter_, None, np.zeros((1, 16, 1)), z)
+    np.testing.assert_allclose(found.probabilities[0, :, 0], 1.0, rtol=1e-12)

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from filters import make_filter, run
+from filters import StateSpaceModel, make_filter, run
+from filters.gaussian.mixture import Parts, blender
 from pages.filter_models import followed, half_lost
 from tests.models import pendulum
 from tests.numerics.test_angles import turning
@@ -63,27 +65,33 @@ def merged(weights, means, covs):
 
 
 def naive(filter_, inputs, measurements):
-    """The recursion of the docstring with the modes' own filters; means, covariances, log-likelihoods."""
-    filters, pi, mu, found = filter_.mode_filters, filter_.transition_matrix, filter_.p, []
+    """The recursion of the docstring with the modes' own filters, by logarithms of all probabilities.
+
+    Means, covariances, log-likelihoods, innovations and their covariances, log probabilities.
+    """
+    filters, found = filter_.mode_filters, []
+    with np.errstate(divide="ignore"):
+        pi, mu = np.log(filter_.transition_matrix), np.log(filter_.p)
     beliefs = [one.init() for one in filters]
     for k, z in enumerate(measurements):
         if k:
-            means, covs = np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs])
-            c = mu @ pi
-            mixed = [merged(pi[:, j] * mu / c[j], means, covs) for j in range(len(mu))]
-            beliefs = [
-                one.predict(b._replace(mean=x, cov=p), inputs[k - 1])
-                for one, b, (x, p) in zip(filters, beliefs, mixed, strict=True)
-            ]
-            mu = c
+            if filter_.mixing is not None:
+                means, covs = np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs])
+                both = pi + mu[:, None]
+                mu = logsumexp(both, axis=0)
+                mixed = [
+                    merged(np.exp(both[:, j] - mu[j]), means, covs) if np.isfinite(mu[j]) else (means[j], covs[j])
+                    for j in range(len(mu))
+                ]
+                beliefs = [b._replace(mean=x, cov=p) for b, (x, p) in zip(beliefs, mixed, strict=True)]
+            beliefs = [one.predict(b, inputs[k - 1]) for one, b in zip(filters, beliefs, strict=True)]
         both = [one.update(b, z) for one, b in zip(filters, beliefs, strict=True)]
         beliefs, levels = [b for b, _ in both], np.array([v.log_likelihood for _, v in both])
-        top = levels.max()
-        levels = np.exp(levels - top)
-        expected = merged(mu, np.array([v.value for _, v in both]), np.array([v.cov for _, v in both]))
-        total, mu = mu @ levels, mu * levels / (mu @ levels)
-        mean, cov = merged(mu, np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs]))
-        found.append((mean, cov, np.log(total) + top, *expected))
+        expected = merged(np.exp(mu), np.array([v.value for _, v in both]), np.array([v.cov for _, v in both]))
+        total = logsumexp(mu + levels)
+        mu = mu + levels - total
+        mean, cov = merged(np.exp(mu), np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs]))
+        found.append((mean, cov, total, *expected, mu))
     return [np.array(one) for one in zip(*found, strict=True)]
 
 
@@ -100,7 +108,7 @@ def test_equals_the_recursion_of_the_textbook(name, kinds):
     inputs, measurements = rng.uniform(-20, 20, (1, 30, 1)), rng.normal(5.0, 20.0, (1, 31, 1))
     measurements[0, 7] = np.nan
     found = run(filter_, np.array([[0, 0]]), inputs, measurements)
-    means, covs, levels, innovations, innovation_covs = naive(filter_, inputs[0], measurements[0])
+    means, covs, levels, innovations, innovation_covs, _ = naive(filter_, inputs[0], measurements[0])
     np.testing.assert_allclose(found.means[0], means, rtol=1e-9)
     np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-9, atol=1e-12)
@@ -150,13 +158,83 @@ def switching(models, stay, steps, rng):
     return modes, states, inputs, seen
 
 
+def improbable():
+    """Filters, one of whose modes has no probability or none that a float64 has, and then fits best; positions."""
+    quiet, wild = moving(0.01), moving(4.0)
+    still = moving(0.01, r=0.04)
+    absorbing, one_way = np.array([[0.9, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.2, 0.8]]), np.eye(3)
+    models = {"modes": [quiet, wild, still], "mode_filter": "kf"}
+    outlier = measured(40)
+    outlier[20] += 3000.0
+    jump = measured(40)
+    jump[15:] += 400.0
+    for z in (outlier, jump, 1e3 * measured(40)):
+        yield make_filter("mmae", quiet, **models), z
+        for p in ([0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]):
+            yield make_filter("mmae", quiet, **models, probabilities=p), z
+            yield make_filter("imm", quiet, **models, transition=absorbing, probabilities=p), z
+            yield make_filter("imm", quiet, **models, transition=one_way, probabilities=p), z
+        yield make_filter("imm", quiet, **models, stay=1.0), z
+    yield make_filter("mmae", pendulum()), np.array([[0.5, 0.1], [1e3, 1e3], [0.5, 0.1]])
+    noise = {"process_noise_cov": [1e-4], "measurement_noise_cov": [0.1], "prior_mean": [0.0], "prior_cov": [1e-4]}
+    plain, shifted = (
+        affine_model(a=[[1.0]], b=[[0.0]], c=[[1.0]], measurement_offset=[shift], **noise) for shift in (0.0, 10.0)
+    )
+    models, z = {"modes": [plain, shifted]}, np.repeat([10.0, 0.0, 10.0, 0.0], [5, 10, 12, 20])[:, None]
+    for transition in (np.eye(2), [[0.9, 0.1], [0.0, 1.0]], [[1.0, 0.0], [1e-3, 1.0 - 1e-3]]):
+        yield make_filter("imm", plain, **models, transition=transition), z
+    yield make_filter("mmae", plain, **models), z
+
+
 @pytest.mark.usefixtures("as_python")
-def test_where_no_model_explains_a_measurement_the_belief_restarts():
-    filter_ = make_filter("mmae", pendulum())
-    belief = filter_.init((1, 2))
-    for z in ([0.5, 0.1], [1e3, 1e3], [0.5, 0.1]):
-        belief, _ = filter_.update(filter_.predict(belief, [0.0]), z)
-    assert belief.divergences == 1 and np.isfinite(belief.mean).all()
+def test_a_mode_of_no_probability_fits_best_and_one_that_was_out_comes_back():
+    returned = 0
+    for filter_, z in improbable():
+        inputs = np.zeros((1, len(z) - 1, 1))
+        found = run(filter_, np.array([[0, 0]]), inputs, z[None])
+        means, covs, levels, *_, logs = naive(filter_, inputs[0], z)
+        assert not found.divergences.any()
+        np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(found.covs[0], covs, rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-9)
+        belief = filter_.init()
+        for k, one in enumerate(z):
+            belief, _ = filter_.update(belief if k == 0 else filter_.predict(belief, [0.0]), one)
+            np.testing.assert_allclose(belief.mean, found.means[0, k], rtol=1e-10, atol=1e-10)
+            np.testing.assert_allclose(filter_.mode_probabilities(belief), np.exp(logs[k]), rtol=1e-6, atol=1e-9)
+        was_out = np.minimum.accumulate(np.where(np.isfinite(logs), logs, 0.0)) < -745.0  # exp of it is 0
+        returned += int((was_out & (logs > -3.0)).any())
+    assert returned >= 2
+
+
+def pulled(x, u, c):
+    """A state that decays to 1, and overflows under an input of 1."""
+    return (0.5 * x[0] + 0.5 + (1e200 * u[0]) * (1e200 * u[0]),)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_mode_whose_filter_begins_anew_is_out_but_not_for_good():
+    noise = {"process_noise_cov": [0.01], "measurement_noise_cov": [0.01], "prior_mean": [1.0], "prior_cov": [1.0]}
+    model = affine_model(a=[[0.5]], b=[[0.0]], c=[[1.0]], **noise)
+    other = StateSpaceModel(transition=pulled, observe=lambda x, c: (x[0],), inputs=1, **noise)
+    filter_ = make_filter("mmae", model, modes=[model, other])
+    inputs = np.zeros((400, 1))
+    inputs[5] = 1.0
+    belief, found = filter_.init(), []
+    for u in inputs:
+        belief, _ = filter_.update(filter_.predict(belief, u), [1.0])
+        found.append(filter_.mode_probabilities(belief)[1])
+    assert belief.divergences == 0 and found[4] > 0.99 and found[5] < 1e-200 and found[-1] > 0.99
+
+
+def test_parts_far_away_that_have_no_weight_do_not_count():
+    parts = Parts(8, 6, 2)
+    row = np.zeros(20)
+    row[6:8] = 1.0, 0.0
+    row[8:14], row[14:20] = [1.0, 2.0, 3.0, 0.5, 0.5, 4.0], [1e200, -1e200, 1e308, 0.0, 0.0, 1e308]
+    with np.errstate(all="ignore"):
+        blender(parts, 2, 0, 2, (False, False))(row, 6, 0)
+    np.testing.assert_array_equal(row[:6], [1.0, 2.0, 3.0, 0.5, 0.5, 4.0])
 
 
 @pytest.mark.slow
