@@ -43,7 +43,8 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
     `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
 
     Probabilities are kept as logarithms, so that a mode whose probability is below the least float64 comes back if
-    measurements speak for it. `Belief.extras` holds the memory of the modes' filters and these: see `mode_estimates`.
+    measurements speak for it. `Belief.extras` holds the memory of the modes' filters, then these logarithms: see
+    `mode_estimates`.
 
     Attributes:
         stay: probability that a step keeps its mode without a draw, within 0 and 1.

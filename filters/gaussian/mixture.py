@@ -157,7 +157,7 @@ def logarithm(weight):
 
 
 def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (number, n), covariances (number, n, n) and weights, or their logarithms, of parts in a belief's extras."""
+    """Means (number, n), covariances (number, n, n) and weights, or their logarithms, of a belief's parts."""
     parts, weights = np.split(extras, [-number])
     means, covs, _ = np.split(parts.reshape(number, -1), [n, n + n * n], axis=1)
     return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()

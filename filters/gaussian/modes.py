@@ -20,7 +20,6 @@ from thruster_env.numerics.compiled import inlined
 from thruster_env.plants.layout import number_places, starts_of
 from thruster_env.plants.shape import Shape
 
-
 LOST = 700.0  # what the log-likelihood of a mode whose filter begins anew is below the least of the others
 
 
@@ -38,8 +37,8 @@ def mode_kernels(
     """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
 
     The filter's own numbers are p (K,), Pi (K, K) by columns, and those of each mode. Extras: the memory of each
-    mode's filter, then the logarithms of the probabilities. `mixing(p, mu)` gives for a column of Pi the weights of
-    all modes with which one begins a step, and its probability; without it each filter runs by itself.
+    mode's filter, then the logarithms of the probabilities. `mixing(p, mu)` gives for a column of Pi the weights
+    of all modes with which one begins a step, and its probability; without it each filter runs by itself.
     """
     n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
     at, own = memory_places(n, m), own_place(shape)

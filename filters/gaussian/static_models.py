@@ -20,8 +20,8 @@ class MultipleModelAdaptiveEstimator(MultipleModelFilter):
 
     Without modes these are the model with Q times 0.1, 1 and 10. The log-likelihood is that of the mixture, and so
     are innovation and S; `mode_probabilities` and `mode_estimates` say more. Probabilities are kept as
-    logarithms: a model whose probability has come to nothing comes back if as much evidence speaks for it. All of a
-    run counts, so where the plant switches, take `imm`.
+    logarithms: a model whose probability has come to nothing comes back if as much evidence speaks for it. All of
+    a run counts, so where the plant switches, take `imm`.
 
     Raises:
         ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.
