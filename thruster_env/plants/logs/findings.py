@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped", "doubled"
 STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
+DAMAGED = "damaged"  # the file: of its messages some are not read
 SPOILING = (GAP, STUCK, SATURATED, OUTLIER)  # what moves estimates
 LEVEL = 1e-4
 SHORTEST = 8  # samples: a run of equal ones that is worth a word
@@ -53,6 +54,7 @@ class Recording(NamedTuple):
     farthest: float = 0.0  # [s], of them
     doubled: int = 0  # rows with the stamp of the row before
     dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
+    damage: tuple[str, ...] = ()  # what of the file is not read because it is damaged, in words
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Finding:
     """One thing that was found in a log.
 
     Attributes:
-        kind: "gap", "missing rows", "moved", "dropped", "doubled", "stuck", "saturated" or "outlier".
+        kind: "damaged", "gap", "missing rows", "moved", "dropped", "doubled", "stuck", "saturated" or "outlier".
         channel: such as "measurement:thrust"; empty for all of a row.
         first: row of the log where it begins; 0 if it is everywhere.
         last: row where it ends, included.
@@ -112,7 +114,8 @@ def has_outliers(logs: Sequence[Log]) -> bool:
 
 
 def _of_rows(log: Log) -> list[Finding]:
-    told, last, found = log.recording, log.steps, []
+    told, last = log.recording, log.steps
+    found = [Finding(DAMAGED, "", 0, last, 1, said) for said in told.damage]
     for first, count in told.gaps:
         said = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
         found.append(Finding(GAP, "", first, first + count - 1, count, said))

@@ -146,6 +146,7 @@ def read_log(
     referred = {
         one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
     }
+    recording = _recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file)
     if last < FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {last + 1}")
     return Log(
@@ -161,7 +162,7 @@ def read_log(
         source=source,
         offsets=offsets,
         irregular=of_file.irregular,
-        recording=_recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file),
+        recording=recording._replace(damage=table.damage),
         stamps=stamps,
     )
 

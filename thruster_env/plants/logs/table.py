@@ -36,6 +36,7 @@ class Table:
         lines: of the file in which the rows are, counted from 1.
         line_word: the word for a line.
         clock: rows whose times make the grid, where that are not all (rows,).
+        damage: what of the file is not read because it is damaged, in words.
     """
 
     file: str
@@ -43,6 +44,7 @@ class Table:
     lines: Sequence[int]
     line_word: str = "line"
     clock: np.ndarray | None = None
+    damage: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -88,7 +88,8 @@ class Recorded:
         for name in (found[key].header for key in found if key.startswith(f"{INPUT}:")):
             cells[name][0] = some[name].values[_times(some[name]) <= stamps[0]][-1]
         rows = range(1, len(stamps) + 1)
-        table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", np.isin(stamps, clock))
+        is_clock = np.isin(stamps, clock)
+        table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(some))
         return table, {**found, TIME: Column(STAMP, None)}
 
 
@@ -129,7 +130,13 @@ def _plain(some: Mapping[str, Samples], path: Path) -> Table:
         told = listed(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(f"fields without times of their own must be of equal length, but {path} has {told}")
     rows = range(1, next(iter(lengths.values())) + 1)
-    return Table(str(path), {name: one.values for name, one in some.items()}, rows, "row")
+    cells = {name: one.values for name, one in some.items()}
+    return Table(str(path), cells, rows, "row", damage=_damage(some))
+
+
+def _damage(some: Mapping[str, Samples]) -> tuple[str, ...]:
+    """What of the files of some fields is damaged, each once."""
+    return tuple(dict.fromkeys(one.damage for one in some.values() if one.damage))
 
 
 def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.ndarray:

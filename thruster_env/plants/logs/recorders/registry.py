@@ -44,6 +44,7 @@ class Samples(NamedTuple):
     times: np.ndarray | None  # (samples,) [s]; None where the file has none for it
     values: np.ndarray  # (samples,)
     unit: str  # empty where the file has none
+    damage: str = ""  # what of the file is not read because it is damaged, in words
 
 
 class Field(NamedTuple):
@@ -58,6 +59,14 @@ class Field(NamedTuple):
     least: float
     greatest: float
     course: tuple[float, ...]  # means of at most BINS parts, NaN for one without numbers
+
+
+class Contents(NamedTuple):
+    """What is in a recorder's file."""
+
+    fields: list[Field]  # that hold numbers, in order of topics
+    unread: dict[str, str]  # why others are not read, by name
+    damage: tuple[str, ...]  # what of the file is damaged, in words
 
 
 def format_of(path: str | Path) -> Format | None:
@@ -86,8 +95,8 @@ def format_of(path: str | Path) -> Format | None:
     return begun
 
 
-def fields(path: str | Path) -> list[Field]:
-    """All fields of a recorder's file that hold numbers, in order of topics.
+def contents(path: str | Path) -> Contents:
+    """All fields of a recorder's file that hold numbers, and what of it is not read.
 
     Args:
         path: of the file.
@@ -95,11 +104,20 @@ def fields(path: str | Path) -> list[Field]:
     Raises:
         ValueError: if it is no recorder's file, or is damaged; the message is one line.
     """
-    return [
-        _field(topic.column(name), topic.name, topic.times, values, topic.units.get(name, ""))
-        for topic in _known(path).topics(Path(path), None)
-        for name, values in topic.values.items()
-    ]
+    found, unread, damage = list[Field](), dict[str, str](), dict[str, None]()
+    for topic in _known(path).topics(Path(path), None):
+        found += [
+            _field(topic.column(name), topic.name, topic.times, values, topic.units.get(name, ""))
+            for name, values in topic.values.items()
+        ]
+        unread |= {topic.column(name) if name else topic.name: why for name, why in topic.unread.items()}
+        damage |= {topic.damage: None} if topic.damage else {}
+    return Contents(found, unread, tuple(damage))
+
+
+def fields(path: str | Path) -> list[Field]:
+    """All fields of a recorder's file that hold numbers, in order of topics; raises as `contents`."""
+    return contents(path).fields
 
 
 def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
@@ -110,11 +128,11 @@ def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
         names: of columns, TOPIC.FIELD.
 
     Raises:
-        ValueError: as `fields`.
+        ValueError: as `contents`.
     """
     wanted: Wanted = None if names is None else frozenset(names)
     return {
-        topic.column(name): Samples(topic.times, values, topic.units.get(name, ""))
+        topic.column(name): Samples(topic.times, values, topic.units.get(name, ""), topic.damage)
         for topic in _known(path).topics(Path(path), wanted)
         for name, values in topic.values.items()
         if wanted is None or topic.column(name) in wanted

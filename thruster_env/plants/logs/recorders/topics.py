@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
@@ -29,10 +29,44 @@ class Topic(NamedTuple):
     values: Mapping[str, np.ndarray]  # (samples,) float64 by field: "output[0]"
     units: Mapping[str, str] = {}  # by field, where the file has them
     unread: Mapping[str, str] = {}  # why fields are not read; "" for all of the topic
+    damage: str = ""  # what of the file is not read because it is damaged, in words
 
     def column(self, field: str) -> str:
         """The name of a field's column: TOPIC.FIELD."""
         return f"{self.name}.{field}" if self.name else field
+
+
+def joined(parts: Sequence[Topic], order: Sequence[np.ndarray] | None = None) -> Topic:
+    """A topic of which a file has several definitions, matched by the names of fields; NaN in rows without one.
+
+    Args:
+        parts: of the same name, all with times.
+        order: of each part, what its rows are sorted by (samples,); None for the times.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    times = np.concatenate([np.empty(0) if one.times is None else one.times for one in parts])
+    rows = np.argsort(times if order is None else np.concatenate(order), kind="stable")
+    values: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    unread, place = dict(parts[0].unread), 0
+    for one in parts:
+        end = place + len(np.empty(0) if one.times is None else one.times)
+        unread |= one.unread
+        for field, numbers in one.values.items():
+            values.setdefault(field, np.full(len(times), np.nan))[place:end] = numbers
+            unit = one.units.get(field, "")
+            if units.setdefault(field, unit) != unit:
+                unread[field] = f"in {units[field] or 'no unit'} and in {unit or 'no unit'}"
+        place = end
+    return Topic(
+        parts[0].name,
+        times[rows],
+        {field: numbers[rows] for field, numbers in values.items() if field not in unread},
+        {field: unit for field, unit in units.items() if unit},
+        unread,
+        " ".join(dict.fromkeys(one.damage for one in parts if one.damage)),
+    )
 
 
 Reader = Callable[[Path, Wanted], Iterator[Topic]]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thruster_env.plants.logs.recorders.topics import (
     MOST_FIELDS,
+    Refused,
     Topic,
     Wanted,
     check_bytes,
+    joined,
     package,
     reading,
     silent,
@@ -22,6 +26,9 @@ KIND = "ULog"
 MAGIC = b"ULog\x01\x12\x35"
 STAMP = "timestamp"
 TICKS = 1e6  # a second
+START = 16  # bytes before the first message
+FORMAT, SUBSCRIPTION = b"FA"
+KINDS = b"ABCDFILMOPQRS"  # of messages
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
@@ -44,16 +51,61 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     with reading(KIND, path), silent():
         with path.open("rb") as file:
             _check_formats(core.ULog(file, parse_header_only=True).message_formats)
+        end = _check_definitions(path.read_bytes(), path)
         with path.open("rb") as file:
-            found = core.ULog(file, names).data_list
+            log = core.ULog(file, names)
+            found = log.data_list
         if not found and wanted is None:
             raise ValueError("it holds no data")
+    damage = _damage(end, path.stat().st_size, log.file_corruption)
     while found:
-        data = found.pop(0)
-        name = f"{data.name}#{data.multi_id}" if data.multi_id else data.name
-        if STAMP in data.data and wants(wanted, name):
-            kinds = {one.field_name: one.type_str for one in data.field_data}
-            yield Topic(name, data.data[STAMP] / TICKS, _numbers(data.data, kinds))
+        parts = [found.pop(0)]
+        while found and (found[0].name, found[0].multi_id) == (parts[0].name, parts[0].multi_id):
+            parts.append(found.pop(0))
+        name = f"{parts[0].name}#{parts[0].multi_id}" if parts[0].multi_id else parts[0].name
+        if wants(wanted, name):
+            topics = [_topic(name, data, damage) for data in parts if STAMP in data.data]
+            yield from [joined(topics)] if topics else []
+
+
+def _topic(name: str, data: Any, damage: str) -> Topic:
+    kinds = {one.field_name: one.type_str for one in data.field_data}
+    return Topic(name, data.data[STAMP] / TICKS, _numbers(data.data, kinds), damage=damage)
+
+
+def _check_definitions(content: bytes, path: Path) -> int:
+    """Where the messages of a ULog end that follow one another without damage [bytes].
+
+    Raises:
+        Refused: for a format that is defined twice, or a number that stands for two topics: the package keeps the
+            last one, and drops what belongs to the first.
+    """
+    place, formats, subscribed = START, dict[bytes, bytes](), set[int]()
+    while place + 3 <= len(content):
+        count, kind = struct.unpack_from("<HB", content, place)
+        if place + 3 + count > len(content) or kind not in KINDS:
+            break
+        if kind == FORMAT:
+            name, _, text = content[place + 3 : place + 3 + count].partition(b":")
+            if formats.setdefault(name, text) != text:
+                what = name[:80].decode("ascii", "replace")
+                raise Refused(f"a ULog must define a format once, but {path} defines {what!r} twice")
+        elif kind == SUBSCRIPTION and count > 3:
+            number = int.from_bytes(content[place + 4 : place + 6], "little")
+            if number in subscribed:
+                what = content[place + 6 : place + 3 + count][:80].decode("ascii", "replace")
+                rule = "a ULog must give each subscription its own number"
+                raise Refused(f"{rule}, but {path} gives {number} again, to {what!r}")
+            subscribed.add(number)
+        place += 3 + count
+    return place
+
+
+def _damage(end: int, size: int, is_corrupt: bool) -> str:
+    """What of a file is damaged, in words."""
+    if is_corrupt:
+        return f"the log is damaged from byte {end} on, and some messages there are not read"
+    return f"the log is cut off: its last {size - end} bytes are no whole message" if end < size else ""
 
 
 def _numbers(data: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
