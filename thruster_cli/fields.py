@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
 from rich.console import RenderableType
 
+from thruster_env.numerics.checks import listed
 from thruster_env.numerics.text_tables import plain_text, table
-from thruster_env.plants.logs.recorders.registry import ENDINGS, METADATA, Field, fields, format_of
+from thruster_env.plants.logs.columns import find_columns, quantities_of
+from thruster_env.plants.logs.recorders.registry import ENDINGS, METADATA, Contents, Field, contents, format_of
+from thruster_env.plants.logs.table import SUFFIXES, read_table
+from thruster_env.plants.replay import ANY_DT
+from tuning.problems.plant_packages import logs_package
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDE = 400  # characters of a line that goes into a file or another program: no name is folded there
@@ -31,17 +36,48 @@ def is_listed(log: Path, only: str | None, is_asked: bool) -> bool:
     if only is not None and form is None:
         rule = f"--only must go with a recorder's file, {', '.join(ENDINGS)} or a folder with {METADATA}"
         raise ValueError(f"{rule}, but got {log}")
-    return form is not None and (only is not None or not (is_asked or log.with_suffix(".toml").is_file()))
+    if only is None and (is_asked or log.with_suffix(".toml").is_file()):
+        return False
+    return form is not None or _is_foreign(log)
 
 
-def found_in(log: Path, only: str | None) -> list[Field]:
-    """The fields of a recorder's file whose names contain a text, in any case; ValueError if there are none."""
-    every = fields(log)
-    some = [one for one in every if only is None or only.casefold() in one.name.casefold()]
+def _is_foreign(log: Path) -> bool:
+    """Whether a log is a table that has no column of a thruster's."""
+    if log.suffix.lower() not in SUFFIXES or not log.is_file():
+        return False
+    table, room = read_table(log), logs_package()
+    for one in quantities_of(room.Preset(room.DEFAULT_PRESET, None, ANY_DT).state_space_model()):
+        try:
+            found = find_columns([one], table.names, {}, {}, table.file)
+        except ValueError:  # a missing one
+            continue
+        if one.key in found:
+            return False
+    return True
+
+
+def found_in(log: Path, only: str | None) -> Contents:
+    """What is in a file, fields whose names contain a text in any case; ValueError if there are none."""
+    every = contents(log)
+    some = [one for one in every.fields if only is None or only.casefold() in one.name.casefold()]
     if not some:
         what = "some field of numbers" if only is None else f"a field whose name contains {only!r}"
-        raise ValueError(f"a log must have {what}, but {log} has none among {len(every)} fields")
-    return some
+        others = f"; not read are {_listed(every.unread)}" if every.unread else ""
+        raise ValueError(f"a log must have {what}, but {log} has none among {len(every.fields)} fields{others}")
+    unread = {
+        name: why for name, why in every.unread.items() if only is None or only.casefold() in name.casefold()
+    }
+    return Contents(some, unread, every.damage)
+
+
+def remarks(some: Contents) -> list[str]:
+    """What of a file is damaged or not read, in sentences."""
+    said = [f"{one[:1].upper()}{one[1:]}." for one in some.damage]
+    return [*said, f"Not read: {_listed(some.unread)}."] if some.unread else said
+
+
+def _listed(unread: Mapping[str, str]) -> str:
+    return listed(f"{name} ({why})" for name, why in unread.items())
 
 
 def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableType:
@@ -49,18 +85,19 @@ def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableT
     columns = ["field", "samples", "rate\n[Hz]", "longest\ngap [s]", "unit", "least", "greatest", "course"]
     rows = _by_topics(some) if is_terminal else [[one.name, *_counts(one), *_values(one)] for one in some]
     form = format_of(log)
-    title = f"{log}: {form.kind if form else 'log'}, {len(some)} fields"
+    title = f"{log}: {form.kind if form else 'table'}, {len(some)} {'fields' if form else 'columns'}"
     caption = "To read it as a log: --column NAME=FIELD for each input and measurement"
     shown = table(title, columns, rows, caption=caption)
     return shown if is_terminal else plain_text([shown], WIDE)
 
 
-def as_json(log: Path, some: Sequence[Field]) -> dict:
+def as_json(log: Path, some: Contents) -> dict:
     """The same as data."""
     form = format_of(log)
     names = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "unit", "least", "greatest", "course")
-    listed = [dict(zip(names, one, strict=True)) for one in some]
-    return {"log": str(log), "format": form.kind if form else "", "fields": listed}
+    rows = [dict(zip(names, one, strict=True)) for one in some.fields]
+    found = {"log": str(log), "format": form.kind if form else "table", "fields": rows}
+    return {**found, "not_read": some.unread, "damage": list(some.damage)}
 
 
 def _by_topics(some: Sequence[Field]) -> list[list[str]]:

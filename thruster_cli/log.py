@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
-from thruster_cli.fields import as_json, as_table, found_in, is_listed
+from thruster_cli.fields import as_json, as_table, found_in, is_listed, remarks
 from thruster_cli.log_options import ReadingOptions, with_groups
 from thruster_cli.options import (
     A_LOG,
@@ -51,7 +51,8 @@ def command(
     Other commands that read logs print the same before their results. docs/logs.md has the rules.
 
     For a recorder's file (PX4's .ulg, ArduPilot's .bin, ROS bags, MATLAB, HDF5) it lists topics and fields, unless
-    options say how to read it. docs/recorders.md has the formats.
+    options say how to read it; so it does for a table without any column of a thruster's. docs/recorders.md has
+    the formats.
 
     Example: thruster log run.csv --plot run.png
 
@@ -62,10 +63,10 @@ def command(
     if is_listed(log, only, any((*reading.named().values(), plot))):
         check_targets((), json, read=(log,))
         some = found_in(log, only)
-        shown = as_table(log, some, console.is_terminal)
-        emit([shown] if console.is_terminal else [], as_json(log, some), json)
+        shown, said = as_table(log, some.fields, console.is_terminal), remarks(some)
+        emit([shown, *said] if console.is_terminal else [], as_json(log, some), json)
         if isinstance(shown, str) and json != "-":
-            typer.echo(shown)
+            typer.echo("\n".join([shown, *said]))
         return
     if plot is not None:
         check_picture(plot, "--plot")

@@ -41,13 +41,15 @@ def topics_of(
         if size is not None and size[1] == 1 and _is_time(name):
             vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
     known: dict[str, np.ndarray] = {}
+    if wanted is None:
+        refused = {name: why for name, one in found.items() if (why := _why_not(one))}
+        yield from [Topic("", None, {}, unread=refused)] if refused else []
     for name, one in found.items():
         if wanted is not None and not any(each == name or each.startswith(f"{name}[") for each in wanted):
             continue
-        if isinstance(one, str) or one.dtype.kind not in NUMERIC:
+        if why := _why_not(one):
             if wanted is not None:
-                what = one if isinstance(one, str) else f"of {one.dtype}"
-                raise Refused(f"a field must be an array of numbers, but {name!r} is {what} ({path})")
+                raise Refused(f"a field must be an array of numbers, but {name!r} is {why} ({path})")
             continue
         if sizes[name] is None:
             continue
@@ -69,6 +71,13 @@ def topics_of(
         yield Topic(
             group, known[clock] if clock is not None else None, fields, dict.fromkeys(fields, said) if said else {}
         )
+
+
+def _why_not(one: Any) -> str:
+    """Why an array is not read, empty if it may be."""
+    if isinstance(one, str):
+        return one
+    return "" if one.dtype.kind in NUMERIC else f"of {one.dtype}"
 
 
 def _size(one: Any) -> tuple[int, int] | None:

@@ -8,10 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thruster_env.plants.logs.columns import TIME, find_columns
 from thruster_env.plants.logs.recorders import bag_counts, bags, dataflash, hdf5, matlab, ulog
 from thruster_env.plants.logs.recorders.bag_files import METADATA
 from thruster_env.plants.logs.recorders.topics import Reader, Wanted, unreadable
-from thruster_env.plants.logs.table import SUFFIXES
+from thruster_env.plants.logs.table import SUFFIXES, Table, read_table
+from thruster_env.plants.logs.units import converted, parted
 
 BINS = 8  # of the course of a field
 
@@ -96,14 +98,16 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def contents(path: str | Path) -> Contents:
-    """All fields of a recorder's file that hold numbers, and what of it is not read.
+    """All fields of a recorder's file or a table that hold numbers, and what of it is not read.
 
     Args:
         path: of the file.
 
     Raises:
-        ValueError: if it is no recorder's file, or is damaged; the message is one line.
+        ValueError: if it is no recorder's file and no table, or is damaged; the message is one line.
     """
+    if Path(path).suffix.lower() in SUFFIXES:
+        return _of_table(read_table(path))
     found, unread, damage = list[Field](), dict[str, str](), dict[str, None]()
     for topic in _known(path).topics(Path(path), None):
         found += [
@@ -115,8 +119,32 @@ def contents(path: str | Path) -> Contents:
     return Contents(found, unread, tuple(damage))
 
 
+def _of_table(table: Table) -> Contents:
+    """The columns of a table, with the rate of its times, where it has some."""
+    clock, times = find_columns([], table.names, {}, {}, table.file).get(TIME), None
+    if clock is not None:
+        try:
+            dates = table.dates(clock.header)
+            where = f"column {clock.header!r} of {table.file}"
+            times = converted(table.numbers(clock.header), clock.unit, "s", where) if dates is None else dates
+        except ValueError:  # the column is listed, or why it is not
+            times = None
+    found, unread = list[Field](), dict[str, str]()
+    for name in table.names:
+        try:
+            values = table.numbers(name)
+        except ValueError as error:
+            unread[name] = "dates" if clock and name == clock.header and times is not None else str(error)
+        else:
+            there = ~np.isnan(values) & (True if times is None else ~np.isnan(times))
+            own = times[there] if times is not None else None
+            found.append(_field(name, "", own, values[there], parted(name)[1] or ""))
+    return Contents(found, unread, ())
+
+
 def fields(path: str | Path) -> list[Field]:
     """All fields of a recorder's file that hold numbers, in order of topics; raises as `contents`."""
+    _known(path)
     return contents(path).fields
 
 
