@@ -26,6 +26,7 @@ class Sensitivity(NamedTuple):
     gradients: np.ndarray  # (B, p)
     information: np.ndarray  # (B, p, p), Fisher's, as if the innovations had the covariances S
     block_gradients: np.ndarray  # (B, blocks, p), of the parts of each trajectory
+    block_values: np.ndarray  # (B, blocks)
 
 
 def sensitivity(
@@ -54,7 +55,7 @@ def sensitivity(
         slopes: how the model changes along each parameter.
         degrees: degrees of freedom of a Student-t density with the covariance S in place of the normal one, which
             outliers move less; above 2. The filter stays as it is.
-        blocks: number of equal parts of each trajectory, whose gradients are returned separately.
+        blocks: number of equal parts of each trajectory, whose values and gradients are returned separately.
         predicted: (m,) which channels the filter only predicts, after it has seen the others, and is never updated
             with: such as a load cell that is there for the identification only. Their prediction errors enter as
             innovations do. As nothing corrects them, they are correlated in time, and the information is
@@ -92,4 +93,4 @@ def sensitivity(
         own_slopes=own_slopes,
     )
     total = out.sum(axis=1)
-    return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:])
+    return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:], out[:, :, 0])

@@ -22,7 +22,7 @@ def code_text(function: Callable) -> str:
 def values_read(function: Callable) -> list[tuple[str, Any]]:
     """Names and values of all numbers, texts, tuples and arrays that a plain function reads, sorted by name."""
     code, cells = function.__code__, function.__closure__ or ()
-    names = _names(code)
+    names = names_read(code)
     found = dict(zip(code.co_freevars, (cell.cell_contents for cell in cells), strict=True))
     return sorted(
         {**_values_in(found, code.co_freevars, ""), **_values_in(function.__globals__, names, "")}.items()
@@ -35,14 +35,15 @@ def _values_in(scope: dict, names, prefix: str, above: tuple = ()) -> dict[str, 
         value = scope.get(name)
         if isinstance(value, types.ModuleType) and value not in above:
             found |= _values_in(vars(value), names, f"{prefix}{name}.", (*above, value))
-        elif value is not None and _is_plain(value):
+        elif value is not None and is_plain(value):
             found[prefix + name] = value
     return found
 
 
-def _is_plain(value: Any) -> bool:
+def is_plain(value: Any) -> bool:
+    """Whether a value is a number, a text, an array of these, a tuple of such, or None."""
     if isinstance(value, tuple):
-        return all(map(_is_plain, value))
+        return all(map(is_plain, value))
     plain = bool | int | float | complex | str | bytes | np.generic
     return (
         value is None or isinstance(value, plain) or (isinstance(value, np.ndarray) and not value.dtype.hasobject)
@@ -55,7 +56,8 @@ def _plain(value: Any) -> str:
     return f"({' '.join(map(_plain, value))})" if isinstance(value, tuple) else repr(value)
 
 
-def _names(code: types.CodeType) -> list[str]:
+def names_read(code: types.CodeType) -> list[str]:
+    """Names of globals and attributes in a function's code and in that of functions within it, sorted."""
     return sorted({name for one in _codes(code) for name in one.co_names})
 
 

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, wraps
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from functools import lru_cache, wraps
 
+from thruster_env.numerics.equal_functions import first_equal
+from thruster_env.numerics.recipes import Made, as_function, as_made, remember
 from thruster_env.numerics.written import made_here
 
-_MADE: WeakKeyDictionary[Callable, Made] = WeakKeyDictionary()
+__all__ = ["Made", "as_function", "as_made", "makes_functions"]
 
-
-class Made(NamedTuple):
-    """How to make a function: maker(*arguments), or an entry of the tuple or dictionary that this returns."""
-
-    maker: Callable
-    arguments: tuple
-    key: Any = None
+MOST = 512  # results that are kept for a maker, beyond those that something else holds
 
 
 def makes_functions(maker: Callable) -> Callable:
-    """Decorate what returns a function, or a tuple or dictionary of functions, as `functools.cache` does."""
+    """Decorate what returns a function, or a tuple or dictionary of functions.
 
-    @cache
-    @wraps(maker)
-    def make(*arguments):
+    Of equal arguments there is one result, as with `functools.cache`; of functions among them that are equal
+    (`first_equal`), too. What was returned long ago and nobody holds is forgotten.
+    """
+
+    @lru_cache(maxsize=MOST)
+    def of_first(*arguments):
         result = maker(*arguments)
         if isinstance(result, dict):
             entries = result
@@ -34,24 +31,13 @@ def makes_functions(maker: Callable) -> Callable:
         for key, function in entries.items():
             nested = "<locals>" in getattr(function, "__qualname__", "")  # others are found by their names
             if made_here(function) or (nested and all(function is not one for one in arguments)):
-                _MADE.setdefault(function, Made(make, arguments, key))
-        return result
+                remember(function, Made(make, arguments, key))
+        if isinstance(result, dict):
+            return {key: first_equal(function) for key, function in result.items()}
+        return first_equal(result)
+
+    @wraps(maker)
+    def make(*arguments):
+        return of_first(*map(first_equal, arguments))
 
     return make
-
-
-def as_made(value: Any) -> Any:
-    """What pickle can hold in place of a function that was written out; other values as they are."""
-    try:
-        made = _MADE.get(value)
-    except TypeError:  # nothing that a weak reference or a hash can be had of
-        return value
-    return value if made is None else made._replace(arguments=tuple(map(as_made, made.arguments)))
-
-
-def as_function(value: Any) -> Any:
-    """The function that `as_made` stands for; other values as they are."""
-    if not isinstance(value, Made):
-        return value
-    result = value.maker(*map(as_function, value.arguments))
-    return result if value.key is None else result[value.key]

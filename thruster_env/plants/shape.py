@@ -8,6 +8,7 @@ from typing import NamedTuple
 from thruster_env.numerics import matrices
 from thruster_env.numerics.angles import kept
 from thruster_env.numerics.derivatives import jacobian
+from thruster_env.numerics.equal_functions import first_equal
 
 MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
 
@@ -45,7 +46,7 @@ def innovation_of(shape: Shape, first: int = 0) -> Callable:
 
 def constants_form(constants: tuple) -> type | int:
     """The description of a model's constants in a `Shape`."""
-    return type(constants) if hasattr(constants, "_fields") else len(constants)
+    return first_equal(type(constants)) if hasattr(constants, "_fields") else len(constants)
 
 
 def constants_are_array(form: type | int) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from thruster_env.numerics.checks import at_least, covariance, covariance_root, one_of, vector
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.derivatives import by_complex_step, complex_step
+from thruster_env.numerics.equal_functions import first_equal
 from thruster_env.numerics.pickling import as_function, as_made
 from thruster_env.numerics.results import array_valued
 from thruster_env.numerics.sources import is_array
@@ -178,9 +179,9 @@ class StateSpaceModel:
     @property
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
-        n, m, slopes = self.n, self.m, (self.transition_jacobian, self.observe_jacobian)
-        f = array_valued(inlined(self.transition), "x, u, c", n)
-        h = array_valued(inlined(self.observe), "x, c", m)
+        n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
+        f = array_valued(inlined(first_equal(self.transition)), "x, u, c", n)
+        h = array_valued(inlined(first_equal(self.observe)), "x, c", m)
         by_state = slopes[0] and array_valued(slopes[0], "x, u, c", n, n)
         return Functions(f, by_state, h, slopes[1] and array_valued(slopes[1], "x, c", m, n))
 

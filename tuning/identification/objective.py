@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ class Evaluation(NamedTuple):
     gradient: np.ndarray  # (p,)
     information: np.ndarray  # (p, p), Fisher; differences of the gradient for parameters without sensitivities
     scores: np.ndarray  # (runs or blocks of them, p), gradients of parts that are nearly independent
-    run_values: np.ndarray  # (runs,)
+    part_values: np.ndarray  # (runs or blocks of them,), log-likelihoods of the same parts
 
 
 class Objective:
@@ -142,16 +143,19 @@ class Objective:
         scores = np.zeros((len(here.scores), p))
         gradient[smooth], scores[:, smooth] = here.gradient, here.scores
         information[np.ix_(smooth, smooth)] = here.information
-        for j in self.rough:
-            sides = [self._smooth_part(at + s * LARGE_STEP * np.eye(p)[j], smooth) for s in (1.0, -1.0)]
-            above, below = sides
+        steps = LARGE_STEP * np.eye(p)
+        sides = {j: [self._smooth_part(at + sign * steps[j], smooth) for sign in (1.0, -1.0)] for j in self.rough}
+        for j, (above, below) in sides.items():
             gradient[j] = (above.value - below.value) / (2 * LARGE_STEP)
-            of_runs = (above.run_values - below.run_values) / (2 * LARGE_STEP)
-            scores[:, j] = np.repeat(of_runs / self.blocks, self.blocks)
+            scores[:, j] = (above.part_values - below.part_values) / (2 * LARGE_STEP)
             row = (below.gradient - above.gradient) / (2 * LARGE_STEP)
             information[j, smooth] = information[smooth, j] = row
             curvature = (2 * here.value - above.value - below.value) / LARGE_STEP**2
             information[j, j] = max(curvature, 1e-3 * abs(curvature), 1e-6)
+        for j, i in combinations(self.rough, 2):  # both move together: f(+, +) + f(-, -) has their mixed slope
+            both = sum(self.value(at + sign * (steps[j] + steps[i])) for sign in (1.0, -1.0))
+            apart = sum(side.value for k in (j, i) for side in sides[k])
+            information[j, i] = information[i, j] = (apart - both - 2 * here.value) / (2 * LARGE_STEP**2)
         return here._replace(gradient=gradient, information=information, scores=scores)
 
     def _smooth_part(self, at: np.ndarray, places: Sequence[int]) -> Evaluation:
@@ -172,17 +176,19 @@ class Objective:
             predicted=self.unseen,
             starts=starts,
         )
-        scores = np.concatenate(found.block_gradients)
-        information = found.information.sum(axis=0)
-        values = found.values
-        if kept < 1.0:
-            values = values + 0.5 * math.log(kept) * _counted(runs, starts).sum(axis=1)
-        if self._noise_factors_of is not None:  # densities of the samples, not of their averages
-            counts = _counted(runs, starts)
-            values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
-        value = float(values.sum())
+        scores, counts = np.concatenate(found.block_gradients), self._counted(runs)
+
+        def of_samples(values, counts):  # densities of all samples, not of those within the gate or of averages
+            if kept < 1.0:
+                values = values + 0.5 * math.log(kept) * counts.sum(axis=-1)
+            if self._noise_factors_of is not None:
+                values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
+            return values
+
+        value = float(of_samples(found.values, counts.sum(axis=1)).sum())
         value = value if math.isfinite(value) else -math.inf
-        return Evaluation(value, scores.sum(axis=0), information, scores, values)
+        part_values = of_samples(found.block_values, counts).ravel()
+        return Evaluation(value, scores.sum(axis=0), found.information.sum(axis=0), scores, part_values)
 
     def moves_prior(self, at: np.ndarray) -> bool:
         """Whether some free parameter moves the prior of the first state, which is then what it says."""
@@ -192,6 +198,16 @@ class Objective:
             np.abs(a.prior_mean - b.prior_mean).sum() + np.abs(a.prior_cov - b.prior_cov).sum() for a, b in rough
         ]
         return bool(found.prior_mean.any() or found.prior_cov.any() or np.any(apart))
+
+    def _counted(self, runs: Data) -> np.ndarray:
+        """Number of samples of each run, block and channel that count, (B, blocks, m)."""
+        count, rows, channels = runs.measurements.shape
+        there = ~np.isnan(runs.measurements)
+        if self.starts is not None:
+            there &= (np.arange(rows) >= self.starts.counted_from[:, None])[..., None]
+        found = np.zeros((count, self.blocks, channels), dtype=np.int64)
+        np.add.at(found, (slice(None), np.arange(rows) * self.blocks // rows), there)
+        return found
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]
@@ -203,14 +219,6 @@ class Objective:
         """Models one step above and below."""
         above, below = self.coordinates.neighbours(at, place, STEP)
         return self.model_at(above), self.model_at(below)
-
-
-def _counted(runs: Data, starts: Starts | None) -> np.ndarray:
-    """Number of samples of each run and channel that count, (B, m)."""
-    there = ~np.isnan(runs.measurements)
-    if starts is not None:
-        there &= (np.arange(there.shape[1]) >= starts.counted_from[:, None])[..., None]
-    return there.sum(axis=1)
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
