@@ -1,10 +1,15 @@
 """Identification of models whose functions are written within a factory: the numbers of functions of a module."""
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.plants.steps import in_any_steps
 from tuning.identification import identify
 from tuning.identification.objective import Objective
 from tuning.problems.coordinates import Coordinates
@@ -71,6 +76,106 @@ def in_closure(gain=2.0, rate=1.0, r=0.04):
     return StateSpaceModel(transition=move, observe=observe, measurement_noise_cov=[r], **REST)
 
 
+def with_jacobians(gain=2.0, rate=1.0, r=0.04):
+    model, step = in_closure(gain, rate, r), DT
+    slopes = {"observe_jacobian": lambda x, c: ((1.0,),)}
+    return model.replace(transition_jacobian=lambda x, u, c: ((1.0 - step * rate,),), **slopes)
+
+
+def complex_steps(gain=2.0, rate=1.0, r=0.04):
+    return in_closure(gain, rate, r).replace(analytic=True)
+
+
+class Plant:
+    def __init__(self, gain, rate):
+        self.gain, self.rate = gain, rate
+
+    def move(self, x, u, c):
+        return (x[0] + DT * (self.gain * u[0] - self.rate * x[0]),)
+
+
+def of_an_object(gain=2.0, rate=1.0, r=0.04):
+    plant = Plant(gain, rate)
+    return in_closure(r=r).replace(transition=lambda x, u, c: plant.move(x, u, c))
+
+
+def of_a_method(gain=2.0, rate=1.0, r=0.04):
+    return in_closure(r=r).replace(transition=Plant(gain, rate).move)
+
+
+def of_a_partial(gain=2.0, rate=1.0, r=0.04):
+    def move(given, x, u, c):
+        return (x[0] + DT * (given[0] * u[0] - given[1] * x[0]),)
+
+    return in_closure(r=r).replace(transition=partial(move, (gain, rate)))
+
+
+def of_an_array(gain=2.0, rate=1.0, r=0.04):
+    matrix = np.array([[1.0 - DT * rate, DT * gain]])
+
+    def move(x, u, c):
+        return (matrix[0, 0] * x[0] + matrix[0, 1] * u[0],)
+
+    return in_closure(r=r).replace(transition=move)
+
+
+class Constants(NamedTuple):
+    substep: float
+
+
+def continuous(rates, constants, r):
+    arguments = {name: value for name, value in REST.items() if name != "process_noise_cov"}
+    return ContinuousModel(
+        rates=rates,
+        observe=observe,
+        densities=[1e-3],
+        constants=constants,
+        arguments={**arguments, "measurement_noise_cov": [r]},
+    ).at(DT)
+
+
+def in_continuous_time(gain=2.0, rate=1.0, r=0.04):
+    def rates(x, u, c):
+        return (gain * u[0] - rate * x[0],)
+
+    arguments = {name: value for name, value in REST.items() if name != "process_noise_cov"}
+    arguments |= {"measurement_noise_cov": [r]}
+    made = ContinuousModel(
+        rates=rates, observe=observe, densities=[1e-3], constants=Constants(DT), arguments=arguments
+    )
+    return made.at(DT)
+
+
+def of_constants_in_continuous_time(gain=2.0, rate=1.0, r=0.04):
+    def rates(x, u, c):
+        return (c.gain * u[0] - c.rate * x[0],)
+
+    arguments = {name: value for name, value in REST.items() if name != "process_noise_cov"}
+    arguments |= {"measurement_noise_cov": [r]}
+    constants = Given(DT, gain, rate)
+    made = ContinuousModel(
+        rates=rates, observe=observe, densities=[1e-3], constants=constants, arguments=arguments
+    )
+    return made.at(DT)
+
+
+class Given(NamedTuple):
+    substep: float
+    gain: float
+    rate: float
+
+
+def that_decides(gain=2.0, rate=1.0, r=0.04):
+    """It cannot be traced: each value of a parameter is another function, along which there are differences."""
+
+    def move(x, u, c):
+        if x[0] > 1e9:
+            return (0.0,)
+        return (x[0] + DT * (gain * u[0] - rate * x[0]),)
+
+    return StateSpaceModel(transition=move, observe=observe, measurement_noise_cov=[r], **REST)
+
+
 def recorded(runs=2, steps=60):
     rng = np.random.default_rng(0)
     inputs, measured = rng.normal(size=(runs, steps, 1)), np.zeros((runs, steps + 1, 1))
@@ -91,25 +196,63 @@ def test_the_log_likelihood_and_its_derivatives_are_those_of_functions_of_a_modu
         np.testing.assert_array_equal(a, b)
 
 
-def test_scores_and_information_of_parameters_in_a_closure_are_those_of_constants(as_python):
-    """By differences: each block of a run has a score of its own, and two such parameters are correlated."""
+CAPTURED = [in_closure, with_jacobians, complex_steps, of_an_object, of_a_method, of_a_partial, of_an_array]
+PAIRS = [*((of_module, one) for one in CAPTURED), (of_constants_in_continuous_time, in_continuous_time)]
+
+
+@pytest.mark.parametrize(("expected", "make"), PAIRS)
+def test_parameters_in_a_closure_have_the_derivatives_of_constants(as_python, expected, make):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    one, other = (Objective(data, made, coordinates) for made in (of_module, in_closure))
+    one, other = (Objective(data, made, coordinates) for made in (expected, make))
+    assert other.rough == ()
+    at = coordinates.of([1.8, 0.9, 0.05])
+    for a, b in zip(one(at), other(at), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-6, atol=1e-6 * np.abs(a).max())
+
+
+def test_parameters_in_a_closure_are_constants_of_steps_of_any_length_too(as_python):
+    coordinates = Coordinates(FREE)
+    data = recorded(steps=30)
+    ratios = np.random.default_rng(1).uniform(0.2, 1.8, (2, 30, 1))
+    data = data._replace(inputs=np.concatenate([data.inputs, ratios], axis=2))
+    makes = of_constants_in_continuous_time, in_continuous_time
+    one, other = (Objective(data, lambda make=make, **v: in_any_steps(make(**v)), coordinates) for make in makes)
+    assert other.rough == ()
+    at = coordinates.of([1.8, 0.9, 0.05])
+    for a, b in zip(one(at), other(at), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-6, atol=1e-6 * np.abs(a).max())
+
+
+def test_a_number_in_a_function_that_differs_elsewhere_only_is_refused(as_python):
+    def make(gain=2.0, rate=1.0, r=0.04):
+        other = 2.0 if abs(gain - 7.77) < 1e-3 else 1.0
+        return in_closure(r=r).replace(transition=lambda x, u, c: (other * x[0] - rate * x[0] + gain * u[0],))
+
+    coordinates = Coordinates(FREE)
+    objective = Objective(recorded(steps=30), make, coordinates)
+    with pytest.raises(ValueError, match="transition must differ .* pass the parameters to it as constants"):
+        objective(coordinates.of([7.77, 1.0, 0.04]))
+
+
+def test_blocks_have_scores_of_their_own_along_parameters_without_derivatives(as_python):
+    data, coordinates = recorded(steps=30), Coordinates(FREE)
+    one, other = (Objective(data, made, coordinates) for made in (of_module, that_decides))
+    assert other.rough == (0, 1)
     at = coordinates.of([2.0, 1.0, 0.04])
     expected, found = one(at), other(at)
-    assert found.value == pytest.approx(expected.value, rel=1e-12)
+    assert found.value == pytest.approx(expected.value, rel=1e-9)
     assert found.scores.shape == (20, 3) == expected.scores.shape
     np.testing.assert_allclose(found.scores, expected.scores, atol=2e-3 * abs(expected.scores).max())
     np.testing.assert_allclose(found.part_values, expected.part_values, rtol=1e-9)
     assert found.part_values.sum() == pytest.approx(found.value)
 
 
-def test_the_curvature_of_two_parameters_in_a_closure_is_that_of_the_log_likelihood(as_python):
+def test_two_parameters_without_derivatives_are_correlated_as_the_log_likelihood_says(as_python):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    objective, at = Objective(data, in_closure, coordinates), coordinates.of([2.0, 1.0, 0.04])
+    objective, at = Objective(data, that_decides, coordinates), coordinates.of([2.0, 1.0, 0.04])
     smooth, step = Objective(data, of_module, coordinates), 1e-3 * np.eye(3)
-    of_gradients = [(smooth(at - one).gradient - smooth(at + one).gradient) / 2e-3 for one in step]
-    np.testing.assert_allclose(objective(at).information[:2, :2], np.array(of_gradients)[:2, :2], rtol=2e-2)
+    of_gradients = np.array([(smooth(at - one).gradient - smooth(at + one).gradient) / 2e-3 for one in step])
+    np.testing.assert_allclose(objective(at).information[:2, :2], of_gradients[:2, :2], rtol=2e-2)
 
 
 @pytest.mark.slow

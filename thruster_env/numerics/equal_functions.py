@@ -119,11 +119,12 @@ def _is_written_within(value: Any) -> bool:
     if isinstance(value, types.MethodType | functools.partial):
         return True
     if isinstance(value, types.FunctionType):
-        return not _has_by_name(value)
-    return isinstance(value, type) and issubclass(value, tuple) and not _has_by_name(value)
+        return not has_by_name(value)
+    return isinstance(value, type) and issubclass(value, tuple) and not has_by_name(value)
 
 
-def _has_by_name(value: Any) -> bool:
+def has_by_name(value: Any) -> bool:
+    """Whether a function or class is what its module has under its name."""
     name, here = value.__qualname__, sys.modules.get(value.__module__ or "")
     if here is None or "<" in name:
         return False
@@ -191,7 +192,7 @@ class _Keys:
         if isinstance(recipe, Made):
             return "made", *self._of_all((recipe.maker, recipe.arguments, recipe.key))
         if isinstance(value, types.FunctionType):
-            return _Same(value) if _has_by_name(value) else self._of_function(value)
+            return _Same(value) if has_by_name(value) else self._of_function(value)
         if isinstance(value, types.MethodType):
             return "method", *self._of_all((value.__func__, value.__self__))
         if isinstance(value, functools.partial):
@@ -249,7 +250,7 @@ class _Keys:
         return code.co_filename, code.co_name, code.co_code, sizes, names, code.co_exceptiontable, constants
 
     def _of_class(self, value: type) -> Hashable:
-        if _has_by_name(value) or not issubclass(value, tuple):
+        if has_by_name(value) or not issubclass(value, tuple):
             return _Same(value)
         own = {name: one for name, one in vars(value).items() if name not in OF_EVERY_TUPLE}
         own = {name: one for name, one in own.items() if name not in getattr(value, "_fields", ())}
@@ -261,13 +262,13 @@ class _Keys:
         kind = type(value)
         if isinstance(value, property):
             return "property", *self._of_all((value.fget, value.fset, value.fdel))
-        if isinstance(value, types.SimpleNamespace) or _is_of_a_user(kind):
+        if isinstance(value, types.SimpleNamespace) or is_of_a_user(kind):
             self.has_parts = True
             return self.of(kind), *self._of_all(vars(value)), *self._of_all(vars(value).values())
         return _Same(value)
 
 
-def _is_of_a_user(kind: type) -> bool:
+def is_of_a_user(kind: type) -> bool:
     """Whether objects of a class hold nothing but attributes, and the class is not one of Python's library."""
     bases = [base for base in kind.__mro__ if base is not object]
     known = kind.__module__.partition(".")[0] in sys.stdlib_module_names - {"__main__"}

@@ -18,6 +18,7 @@ from filters.starts import Starts
 from thruster_env.numerics.checks import one_of, short_repr
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
+from tuning.identification.captured import CapturedConstants
 from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of
 from tuning.problems.coordinates import Coordinates
@@ -80,11 +81,16 @@ class Objective:
         self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data)
         self.evaluations, self.starts, self.gate = 0, starts, gate
         self.predicted = tuple(predicted)
+        self._captured: CapturedConstants | None = None
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
         pairs = [self._pair(at, j) for j in range(len(at))]
         same = [same_functions(*pair) for pair in pairs]
+        if not all(same):
+            self._captured = CapturedConstants.of(self._models_about(at))
+            pairs = [self._pair(at, j) for j in range(len(at))]
+            same = [same_functions(*pair) for pair in pairs]
         self.rough = tuple(j for j, name in enumerate(coordinates.names) if name in self._of_data or not same[j])
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
@@ -102,14 +108,32 @@ class Objective:
 
     def model_at(self, at: np.ndarray) -> StateSpaceModel:
         """The model at coordinates, as the filter runs on it."""
-        values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
-        model = make_filter(self.filter, self._model(**values)).kernel_model
+        given = self._given_model(at)
+        model = given if self._captured is None else self._captured.with_constants(given)
+        model = make_filter(self.filter, model).kernel_model
         if self._noise_factors_of is not None:
             roots = np.sqrt(self._noise_factors(at, model))
             model = model.replace(measurement_noise_cov=model.measurement_noise_cov * np.outer(roots, roots))
         if self.simulation:
             model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
         return model
+
+    def _given_model(self, at: np.ndarray) -> StateSpaceModel:
+        values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
+        return self._model(**values)
+
+    def _models_about(self, at: np.ndarray) -> list[StateSpaceModel]:
+        """Models in which all parameters differ: near a point, and elsewhere within the ranges."""
+        low, high = self.coordinates.low, self.coordinates.high
+        points = [point for j in range(len(at)) for point in self.coordinates.neighbours(at, j, STEP)]
+        shares = np.mod(np.arange(1, 4)[:, None] * (np.sqrt(2.0) + np.arange(len(at))) / np.sqrt(5.0), 1.0)
+        models = list(map(self._given_model, points))
+        for share in shares:
+            try:
+                models.append(self._given_model(low + share * (high - low)))
+            except Exception:  # a user's function need not have a model there
+                continue
+        return models
 
     def data_at(self, at: np.ndarray) -> Data:
         """The runs at coordinates."""
