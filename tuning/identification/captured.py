@@ -66,7 +66,7 @@ class CapturedConstants(NamedTuple):
         places: dict[str, set[int]] = {name: set() for name in FUNCTIONS}
         for model in models[1:]:
             for name, function in _functions_of(model).items():
-                numbers = _numbers_beside(functions[name], function)
+                numbers = _pairs_of_numbers(functions[name], function)
                 if numbers is None:
                     return None
                 places[name] |= {i for i, (a, b) in enumerate(numbers) if a != b}
@@ -91,7 +91,7 @@ class CapturedConstants(NamedTuple):
         form, count = type(model.constants) if hasattr(model.constants, "_fields") else None, len(model.constants)
         constants, changes = list(model.constants), {}
         for name, function in _functions_of(model).items():
-            first, numbers = self.functions[name], _numbers_beside(self.functions[name], function)
+            first, numbers = self.functions[name], _pairs_of_numbers(self.functions[name], function)
             moving = self.places[name]
             if numbers is None or any(a != b for i, (a, b) in enumerate(numbers) if i not in moving):
                 raise ValueError(
@@ -119,7 +119,7 @@ def _functions_of(model: StateSpaceModel) -> dict[str, Callable | None]:
     return {name: None if one is not None and by_complex_step(one) else one for name, one in found.items()}
 
 
-def _numbers_beside(one: Callable | None, other: Callable | None) -> list[tuple[float, float]] | None:
+def _pairs_of_numbers(one: Callable | None, other: Callable | None) -> list[tuple[float, float]] | None:
     """The numbers of two functions, in pairs; None if these differ in more."""
     if one is None or other is None:
         return [] if one is other else None
