@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from errno import EACCES, EISDIR, ENOENT
 from os import PathLike
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
 from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.extras import to_install
+from thruster_env.plants.logs.recorders.topics import Refused, bounded, check_bytes
 from thruster_env.plants.logs.stamps import MISSING as MISSING_TEXT
 from thruster_env.plants.logs.stamps import seconds_of, since_first
 
@@ -69,6 +73,8 @@ class Table:
             texts = _texts(cells)
             try:
                 found = np.array(texts, dtype=np.float64)
+                if not _is_written("".join(texts)):
+                    raise ValueError
             except ValueError:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
@@ -111,9 +117,9 @@ def _texts(cells: Sequence | np.ndarray) -> list[str]:
 def read_table(path: str | Path) -> Table:
     """The table in a file that ends in .csv, .parquet or .npz.
 
-    A CSV file is UTF-8 and begins with a line of names; commas, semicolons or tabs part the cells. An empty cell,
-    "nan", "NA" or "null" is a missing number. A column without a name, such as an index that pandas writes,
-    is left out. Parquet needs the package pyarrow.
+    A CSV file is UTF-8 and begins with a line of names; commas, semicolons, tabs or else spaces part the cells. An
+    empty cell, "nan", "NA" or "null" is a missing number. A column without a name, such as an index that pandas
+    writes, is left out. Parquet needs the package pyarrow.
 
     Args:
         path: of the file.
@@ -136,6 +142,7 @@ def read_table(path: str | Path) -> Table:
 
 
 def _read_csv(path: Path) -> Table:
+    check_bytes(path.stat().st_size, "a CSV file", path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -147,13 +154,17 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
     first = text.lstrip().splitlines()[0]
     delimiter = max(DELIMITERS, key=first.count)
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
-    try:
-        numbered = [
-            (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
-        ]
-    except csv.Error as error:
-        raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
+    if delimiter not in first and len(first.split()) > 1:
+        numbered = [(line, row.split()) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
+        numbered[0] = (numbered[0][0], first.removeprefix("#").split())
+    else:
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+        try:
+            numbered = [
+                (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
+            ]
+        except csv.Error as error:
+            raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
     (line, header), *rows = numbered
     header[0] = header[0].removeprefix("#").strip()  # headers are comments to some programs
     _check_header(header, line, path)
@@ -185,30 +196,61 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
 
 def _read_parquet(path: Path) -> Table:
     try:
-        from pyarrow import ArrowException, parquet
+        from pyarrow import parquet
     except ImportError:
         raise ValueError(
             f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')}), "
             f"but got {path}"
         ) from None
-    try:
+    with _damaged("a Parquet file must be one, but {path} is not", path), bounded("a Parquet file", path):
+        for file in sorted(path.rglob("*.parquet")) if path.is_dir() else [path]:
+            of_file = parquet.read_metadata(file)
+            groups = [of_file.row_group(place) for place in range(of_file.num_row_groups)]
+            parts = [group.column(place) for group in groups for place in range(group.num_columns)]
+            check_bytes(8 * of_file.num_rows * of_file.num_columns, "what a Parquet file holds", path)
+            check_bytes(sum(one.total_uncompressed_size for one in parts), "what a Parquet file holds", path)
         table = parquet.read_table(path)
-    except ArrowException as error:
-        raise ValueError(
-            f"a Parquet file must be one, but {path} is not: {' '.join(str(error).split())}"
-        ) from None
+        cells = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
     _check_header(table.column_names, 1, path)
-    cells = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
     return _of_arrays(path, cells)
 
 
 def _read_npz(path: Path) -> Table:
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            cells = {name: content[name] for name in content.files}
-    except (ValueError, EOFError, KeyError, AttributeError, BadZipFile):
-        raise ValueError(f"an npz file must hold arrays of numbers by name, but {path} does not") from None
+    with _damaged("an npz file must hold arrays of numbers by name, but {path} does not", path):
+        cells = dict(_arrays(path))
     return _of_arrays(path, cells)
+
+
+def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and arrays of an npz file, whose sizes are read before what is in them."""
+    total = 0
+    with ZipFile(path) as archive:
+        for one in archive.infolist():
+            with archive.open(one) as member:
+                version = np.lib.format.read_magic(member)
+                read_header = np.lib.format.read_array_header_1_0
+                read_header = np.lib.format.read_array_header_2_0 if version == (2, 0) else read_header
+                shape, _, dtype = read_header(member)
+                total += math.prod(shape) * max(dtype.itemsize, 8)
+                check_bytes(total, "what an npz file holds", path)
+                if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > one.file_size:
+                    raise ValueError(f"{one.filename!r} ends within its array")
+            with archive.open(one) as member:
+                yield one.filename.removesuffix(".npy"), np.lib.format.read_array(member, allow_pickle=False)
+
+
+@contextmanager
+def _damaged(rule: str, path: Path) -> Iterator[None]:
+    """Make one line of whatever is raised for bytes that are not as they should be, but not for a missing file."""
+    try:
+        yield
+    except Refused:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.strerror and error.errno in (ENOENT, EACCES, EISDIR):
+            raise
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{rule.format(path=path)}: {why}") from None
 
 
 def table_of(given: Any, name: str) -> Table:
@@ -260,4 +302,9 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return True
+    return _is_written(text)
+
+
+def _is_written(text: str) -> bool:
+    """Whether a text that Python takes for a number is one in other languages: no "1_0", and digits of ASCII."""
+    return "_" not in text and text.isascii()
