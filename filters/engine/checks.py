@@ -7,10 +7,9 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from filters.engine.belief import Belief, LostBelief
-from thruster_env.numerics.checks import as_floats, at_least, covariance, short_repr
+from thruster_env.numerics.checks import ROUNDING, as_floats, at_least, covariance, short_repr
 
 FEW = 4  # states, up to which a belief is looked at in Python
-ROUNDING = 1e-9  # of a covariance's largest variance: what filters leave of a negative one is below that
 
 
 def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
@@ -59,12 +58,13 @@ def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray
     return array
 
 
-def check_belief(belief: Belief) -> None:
-    """Raise ValueError unless a belief's numbers are finite and its covariance is one.
+def check_belief(belief: Belief, prior_variances: np.ndarray) -> None:
+    """Raise ValueError unless a belief's numbers are finite and its covariance is one, within rounding.
 
-    A `LostBelief`, which declares that it is not finite, is accepted.
+    What filters leave of a covariance that is impossible is a part of its variances, or of the prior's (n,), which
+    they began with. A `LostBelief`, which declares that it is not finite, is accepted.
     """
-    if _is_surely_one(belief):
+    if _is_surely_one(belief, prior_variances):
         return
     at_least("step of a belief", belief.step, 0)
     at_least("divergences of a belief", belief.divergences, 0)
@@ -78,14 +78,14 @@ def check_belief(belief: Belief) -> None:
     for name in ("members", "extras"):
         if np.isnan(as_floats(getattr(belief, name))).any():
             raise ValueError(f"{name} of a belief must not be NaN, but got {short_repr(getattr(belief, name))}")
-    covariance("cov of a belief", belief.cov, len(belief.mean), rounding=ROUNDING)
+    covariance("cov of a belief", belief.cov, len(belief.mean), variances=prior_variances)
 
 
-def _is_surely_one(belief: Belief) -> bool:
+def _is_surely_one(belief: Belief, prior_variances: np.ndarray) -> bool:
     """Whether a belief passes all checks, by a quick look; if not, the thorough one says what is amiss.
 
-    P + r v I = L L' with L real, where v is the largest variance and r the tolerance, so that no eigenvalue of P
-    is below -r v.
+    P + r V = L L' with L real, where V has the variances or the prior's, and r is the tolerance: so no eigenvalue
+    of V^(-1/2) P V^(-1/2) is below -r.
     """
     mean, cov, members, extras = belief.mean, belief.cov, belief.members, belief.extras
     if not all(type(one) is np.ndarray and one.dtype == np.float64 for one in (mean, cov, members, extras)):
@@ -98,15 +98,15 @@ def _is_surely_one(belief: Belief) -> bool:
             return False
     if extras.size and np.isnan(extras).any():
         return False
-    return _few(mean.tolist(), cov.tolist()) if n <= FEW else _many(mean, cov)
+    if n > FEW:
+        return _many(mean, cov, prior_variances)
+    return _few(mean.tolist(), cov.tolist(), prior_variances.tolist())
 
 
-def _few(mean: list[float], cov: list[list[float]]) -> bool:
+def _few(mean: list[float], cov: list[list[float]], prior_variances: list[float]) -> bool:
     """`_many` for a few states, for which NumPy's calls take longer than their arithmetic."""
-    largest = max(cov[i][i] for i in range(len(mean)))
-    if not isfinite(sum(mean)) or not isfinite(largest):
+    if not isfinite(sum(mean)):
         return False
-    shift = ROUNDING * largest
     root: list[list[float]] = []
     for i, row in enumerate(cov):
         new: list[float] = []
@@ -117,7 +117,9 @@ def _few(mean: list[float], cov: list[list[float]]) -> bool:
             for k in range(j):
                 rest -= new[k] * root[j][k]
             new.append(rest / root[j][j])
-        pivot = row[i] + shift
+        pivot = row[i] + ROUNDING * max(row[i], prior_variances[i])
+        if pivot == 0.0 and not any(row):  # of what is known exactly
+            pivot = 1.0
         for one in new:
             pivot -= one * one
         if not (row[i] >= 0.0 and 0.0 < pivot < inf):
@@ -127,13 +129,13 @@ def _few(mean: list[float], cov: list[list[float]]) -> bool:
     return True
 
 
-def _many(mean: np.ndarray, cov: np.ndarray) -> bool:
+def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> bool:
     """Whether a mean is finite and a covariance symmetric and positive semidefinite, by its Cholesky factor."""
     variances = cov.diagonal()
     if not np.abs(mean).sum() + np.abs(cov).sum() < np.inf or not (cov == cov.T).all() or variances.min() < 0:
         return False
-    shifted = cov.copy()
-    shifted.ravel()[:: len(mean) + 1] += ROUNDING * variances.max()
+    shifted, known = cov.copy(), ~cov.any(axis=1)  # what is known exactly has a variance of 0 and no covariance
+    shifted.ravel()[:: len(mean) + 1] += np.where(known, 1.0, ROUNDING * np.maximum(variances, prior_variances))
     try:
         np.linalg.cholesky(shifted)
     except np.linalg.LinAlgError:

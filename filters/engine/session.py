@@ -72,6 +72,7 @@ class Session:
         values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
         self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
         self._scalar = len(self._u) == m == 1
+        self._prior_variances = model.prior_cov.diagonal()
         self._first_values, self._is_direct = values.copy(), False
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
         self.source: tuple = ()  # what the numbers follow from, where the session is kept
@@ -247,7 +248,7 @@ class Session:
             if given != shape:
                 whose = f"a belief that the filter {self._name!r} can take"
                 raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
-        check_belief(belief)
+        check_belief(belief, self._prior_variances)
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
             self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from filters.estimators.estimator import Output
-from thruster_env.numerics.checks import as_floats, short_repr
+from thruster_env.numerics.checks import as_floats, correlation_flaws, short_repr
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
 CALLED = {
@@ -16,7 +16,7 @@ CALLED = {
     "innovation": "innovation",
     "innovation_cov": "covariance of the innovation",
 }
-ROUNDING = 1e-6  # of a covariance, as part of its largest entry: single precision leaves less
+ROUNDING = 1e-4  # of correlations: single precision leaves less
 
 
 class Checks:
@@ -83,11 +83,9 @@ class Checks:
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
         """The covariances (..., d, d), made exactly symmetric."""
-        turned = covs.swapaxes(-1, -2)
-        largest = np.abs(covs).max(axis=(-1, -2))
-        wrong = np.abs(covs - turned).max(axis=(-1, -2)) > ROUNDING * largest
-        covs = 0.5 * (covs + turned)
-        wrong |= np.linalg.eigvalsh(covs)[..., 0] < -ROUNDING * largest
+        least, asymmetry = correlation_flaws(covs)
+        wrong = (least < -ROUNDING) | (asymmetry > ROUNDING)
+        covs = 0.5 * (covs + covs.swapaxes(-1, -2))
         if wrong.any():
             place = _first(wrong, leading)
             raise ValueError(

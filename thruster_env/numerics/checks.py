@@ -12,6 +12,11 @@ import numpy as np
 
 FEW, MANY = 4, 8  # choices that a message names of more than so many
 MOST_LISTED, LONG = 24, 80  # names that a message has, and characters of each
+ROUNDING, SINGULAR, ASYMMETRY = (
+    1e-9,
+    1e-14,
+    1e-5,
+)  # of correlations: least eigenvalues, and entries beside the diagonal
 
 
 def short_repr(value) -> str:
@@ -170,12 +175,14 @@ def covariance(
     size: int,
     *,
     positive_definite: bool = False,
-    rounding: float = 1e-12,
+    variances: np.ndarray | None = None,
     largest: float = np.inf,
 ) -> np.ndarray:
     """Return a covariance, shape (size, size), from a matrix, `size` variances or one variance if size is 1.
 
-    Raises ValueError unless it is symmetric and positive semidefinite (or definite, where that is asked).
+    Raises ValueError unless it is symmetric and positive semidefinite (or definite, where that is asked), by its
+    correlations: no unit matters. Rounding is a part of its variances, or of `variances` (size,) that are larger:
+    those from which it was computed.
     """
     rule = f"{name} must be {size} variances or a symmetric {size} x {size} matrix"
     try:
@@ -184,19 +191,37 @@ def covariance(
         raise ValueError(f"{rule}, but got {short_repr(value)}") from None
     if array.shape == (size,):
         array = np.diag(array)
-    symmetric = array.shape == (size, size) and ((array == array.T).all() or np.allclose(array, array.T))
-    if not symmetric or not np.isfinite(array).all():
+    if array.shape != (size, size) or not np.isfinite(array).all():
+        raise ValueError(f"{rule} of finite numbers, but got {short_repr(value)}")
+    least, asymmetry = correlation_flaws(array, variances)
+    if asymmetry > ASYMMETRY:
         raise ValueError(f"{rule} of finite numbers, but got {short_repr(value)}")
     if np.abs(array).max() > largest:
         raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {short_repr(value)}")
-    eigenvalues = np.linalg.eigvalsh(array)
-    if eigenvalues[0] < -rounding * max(1e-300, abs(eigenvalues[-1])) or np.diag(array).min() < 0:
-        raise ValueError(
-            f"{name} must be positive semidefinite (no negative variance), but got {short_repr(value)}"
-        )
-    if positive_definite and eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
+    if least < -ROUNDING:
+        rule = "positive semidefinite (no negative variance, no covariance beyond what its variances allow)"
+        raise ValueError(f"{name} must be {rule}, but got {short_repr(value)}")
+    if positive_definite and least <= SINGULAR:
         raise ValueError(f"{name} must be positive definite, but got {short_repr(value)}")
     return (array + array.T) / 2
+
+
+def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Least eigenvalues (...) of the correlations of covariances (..., d, d), and how asymmetric these are.
+
+    Neither depends on units. A least eigenvalue is -inf where a variance is negative, or zero beside a covariance
+    that is not. Covariances are divided by `variances` (..., d) in place of their own where those are larger.
+    """
+    own = np.diagonal(covs, axis1=-2, axis2=-1)
+    units = np.sqrt(np.maximum(own, 0.0 if variances is None else variances))
+    known = units > 0.0
+    divisors = np.where(known, units, 1.0)
+    scaled = covs / divisors[..., None] / divisors[..., None, :]
+    turned = np.swapaxes(scaled, -1, -2)
+    least = np.linalg.eigvalsh(0.5 * (scaled + turned))[..., 0]
+    alone = ~(known[..., None] & known[..., None, :]) & (covs != 0.0)
+    impossible = alone.any(axis=(-1, -2)) | ((own < 0.0).any(axis=-1) if variances is None else False)
+    return np.where(impossible, -np.inf, least), np.abs(scaled - turned).max(axis=(-1, -2))
 
 
 def correlations(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

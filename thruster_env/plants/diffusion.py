@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from thruster_env.numerics.checks import as_floats, covariance, positive, short_repr
+from thruster_env.numerics.checks import ROUNDING, as_floats, correlations, covariance, positive, short_repr
 
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
@@ -59,8 +59,10 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
     Raises:
         ValueError: if S is no covariance: no white noise on such rates gives this Q.
     """
-    n = len(as_floats(slope))
-    q, (rows, columns) = covariance("process_noise_cov", process_noise_cov, n), np.triu_indices(n)
+    slope = as_floats(slope)
+    n = len(slope)
+    q, units = correlations(covariance("process_noise_cov", process_noise_cov, n))
+    slope, (rows, columns) = slope / units[:, None] * units, np.triu_indices(n)
     of_units = np.empty((len(rows), len(rows)))
     for place, (i, j) in enumerate(zip(rows, columns, strict=True)):
         unit = np.zeros((n, n))
@@ -68,10 +70,14 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
         of_units[:, place] = noise_of_densities(unit, slope, dt)[rows, columns]
     s = np.zeros((n, n))
     s[rows, columns] = s[columns, rows] = np.linalg.solve(of_units, q[rows, columns])
+    given = short_repr(as_floats(process_noise_cov).tolist())
     try:
-        return covariance("densities", s, n)
+        s = covariance("densities", s, n, variances=np.diag(q) / dt)
+        without = np.diag(s) <= ROUNDING * np.diag(q) / dt  # all their noise is that of others, but for rounding
+        s[without], s[:, without] = 0.0, 0.0
+        return s * units[:, None] * units
     except ValueError:
         raise ValueError(
             "process_noise_cov must be that of white noise in continuous time (a state driven by others has part "
-            f"of their noise within a step), but got {short_repr(q.tolist())} for a step of {dt:g} s"
+            f"of their noise within a step), but got {given} for a step of {dt:g} s"
         ) from None

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.numerics.angles import difference
+from thruster_env.numerics.checks import correlation_flaws
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.numerics.tuples import vector_reader, vector_writer
 from thruster_env.plants.layout import constants_reader, number_places
@@ -116,10 +117,7 @@ def _correlation(pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 def _is_regular(cov: np.ndarray) -> bool:
     """Whether a covariance is positive definite, by its correlations."""
-    deviations = np.sqrt(np.diag(cov))
-    if not (np.isfinite(cov).all() and (deviations > 0).all()):
-        return False
-    return float(np.linalg.eigvalsh(cov / np.outer(deviations, deviations)).min()) > LEAST_EIGENVALUE
+    return bool(np.isfinite(cov).all() and correlation_flaws(cov)[0] > LEAST_EIGENVALUE)
 
 
 @cache
