@@ -21,6 +21,7 @@ from thruster_env.plants.state_space import StateSpaceModel
 if TYPE_CHECKING:
     from filters.live import Live
 
+Q, R = "Q", "R"
 SPARE, SPARE_IN_PYTHON = "_spare", "_spare_in_python"  # attributes: sessions that are not in use
 
 
@@ -33,17 +34,12 @@ class Filter:
     """
 
     name: ClassVar[str]
-    varying_noise: ClassVar[bool] = True  # whether Q and R may differ from step to step
+    varying_noise: ClassVar[bool] = True  # whether both Q and R may differ from step to step: see `fixed_noise`
     has_covariance: ClassVar[bool] = True  # if not, covariances and log-likelihoods are zero and say nothing
     one_model: ClassVar[bool] = True  # if not, it has others beside `model`, with their own sample times and Q
     any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.plants.steps`
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
-
-    @property
-    def runs_again(self) -> bool:
-        """Whether an update runs earlier steps again, with the model's constants of now."""
-        return False
 
     def kernels(self) -> Kernels:
         """The plain functions of this filter type for the shape of its model."""
@@ -93,7 +89,6 @@ class Filter:
         session = self._borrowed()
         session.load(belief)
         if process_noise_cov is not None:
-            self.check_noise(process_noise_cov)
             session.set_noise(process_noise_cov=process_noise_cov)
         session.run("predict", u=u)
         found = session.belief()
@@ -110,7 +105,6 @@ class Filter:
         session = self._borrowed()
         session.load(belief)
         if measurement_noise_cov is not None:
-            self.check_noise(measurement_noise_cov)
             session.set_noise(measurement_noise_cov=measurement_noise_cov)
         session.run("update", z=z)
         found = session.belief(), session.innovation_copy()
@@ -155,12 +149,19 @@ class Filter:
         """The fields, without memory that is kept for the next call."""
         return {name: value for name, value in vars(self).items() if name not in (SPARE, SPARE_IN_PYTHON)}
 
-    def check_noise(self, given) -> None:
-        """Raise ValueError for a covariance of one step, if the filter cannot take one."""
-        if given is not None and not self.varying_noise:
-            raise ValueError(
-                f"Q and R of the filter {self.name!r} cannot vary from step to step, but got one that does"
-            )
+    @property
+    def fixed_noise(self) -> tuple[str, ...]:
+        """Which of Q and R this filter reads when it is made or started only: these must not vary."""
+        return () if self.varying_noise else (Q, R)
+
+    def check_noise(self, process_noise_cov=None, measurement_noise_cov=None) -> None:
+        """Raise ValueError for covariances of one step or of several that the filter cannot take."""
+        for name, value in ((Q, process_noise_cov), (R, measurement_noise_cov)):
+            if value is not None and name in self.fixed_noise:
+                raise ValueError(
+                    f"{' and '.join(self.fixed_noise)} of the filter {self.name!r} cannot vary from step to step, "
+                    f"but got another {name}: make the filter for a model with it"
+                )
 
     def session(self, gate: float | None = None) -> Running:
         """A session: this filter running in place on one belief, which is faster than `predict` and `update`.

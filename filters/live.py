@@ -10,22 +10,23 @@ import numpy as np
 
 from filters.engine.belief import Belief
 from filters.engine.session import Session
-from filters.monitoring.monitor import Health, Monitor, monitor_of, watch_of
+from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
 from thruster_env.numerics.checks import as_floats, finite, one_of, positive, short_repr
+from thruster_env.plants.stamps import closeness, count_steps, resolution_of
 
 if TYPE_CHECKING:
     from filters.filter import Filter
 
-ROUNDING = 1e-9  # of the model's sample time: two stamps that are no further apart are one
-
 
 class Event(NamedTuple):
-    """Something that was done, and the belief before it."""
+    """Something that was done, and the belief and the monitor before it."""
 
     begin: float
     end: float  # a prediction from `begin` to here; the same for an update
     given: np.ndarray  # u (p,) of a prediction, z (m,) of an update
     before: Belief
+    length: float  # of the step before it
+    tests: tuple  # what the monitor remembered
 
     @property
     def is_prediction(self) -> bool:
@@ -42,8 +43,8 @@ class Live:
         live.update(12.314, "thrust", 3.2)
 
     The sample time has to be one of the model's constants, by the name `dt`, or `substep` for a part of it. A
-    longer step is divided into equal ones that are at most as long. Q of a step of length dt is that of the model
-    for its own sample time, times the ratio of the two, unless `noise` says otherwise.
+    longer step is divided into equal ones that are at most as long, up to a million. Q of a step of length dt is
+    that of the model for its own sample time, times the ratio of the two, unless `noise` says otherwise.
 
     Args:
         filter_: any filter of such a model.
@@ -51,13 +52,17 @@ class Live:
         late: samples that are so late [s] are put in order: the filter goes back, takes them, and repeats what
             came after. The estimate is that of the right order.
         skip_missing: whether a NaN is left out; else it is refused.
-        monitor: tests on the innovations, as wrappers take them.
+        monitor: tests on the innovations, as wrappers take them. It sees all samples in the order in which they
+            were measured: where a late one comes in, it goes back as well.
+        resolution: of the stamps [s]; float64's where that is coarser, as of seconds since 1970. Two stamps that
+            are no further apart are one, and a step that is longer than the sample time by no more is one step.
 
     Attributes:
         time: of the belief [s].
         mean, cov: views on its mean (n,) and covariance (n, n).
         innovation, innovation_cov: of the last update.
-        health: what the monitor said at the last update; None without one.
+        health: what the monitor said at the last update, with the alarms that a late sample brought about at later
+            ones; None without a monitor.
 
     Raises:
         ValueError: for a model without such a constant, or a wrong argument.
@@ -71,22 +76,44 @@ class Live:
         late: float = 0.0,
         skip_missing: bool = True,
         monitor: Monitor | Mapping | float | None = None,
+        resolution: float = 0.0,
     ):
         """Find the sample time; `start` comes next."""
         self._session = Session(filter_)
         self._step = self._session.sample_time
         self._late = positive("late", late, zero_allowed=True)
+        self._resolution = positive("resolution", resolution, zero_allowed=True)
         self._noise, self._skips = noise, skip_missing
         self._watch = watch_of(monitor_of(monitor), filter_)
         model = filter_.model
         self._channels = {one.symbol: i for i, one in enumerate(model.measurements)}
         self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
         self._events: list[Event] = []
+        self._raised: list[tuple[Alarm, ...]] = []  # by the monitor at each event
         self._held = np.zeros(0)  # the input that acts
+        self._length = self._step  # of the last step
         self.time = math.nan
         self.health: Health | None = None
-        self.mean, self.cov = self._session.mean, self._session.cov
-        self.innovation, self.innovation_cov = self._session.innovation, self._session.innovation_cov
+
+    @property
+    def mean(self) -> np.ndarray:
+        """View of the mean (n,)."""
+        return self._session.mean
+
+    @property
+    def cov(self) -> np.ndarray:
+        """View of the covariance (n, n)."""
+        return self._session.cov
+
+    @property
+    def innovation(self) -> np.ndarray:
+        """View of the innovation (m,) of the last update."""
+        return self._session.innovation
+
+    @property
+    def innovation_cov(self) -> np.ndarray:
+        """View of its covariance (m, m)."""
+        return self._session.innovation_cov
 
     @property
     def divergences(self) -> int:
@@ -101,8 +128,9 @@ class Live:
         """Begin with the prior at a time [s], updated with a measurement z (m,) if there is one."""
         time = finite("time", time)
         given = self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
+        self._set_length(self._step)
         self._session.start(key, given)
-        self._events, self.time, self._held = [], time, np.zeros(0)
+        self._events, self._raised, self.time, self._held = [], [], time, np.zeros(0)
         if self._watch is not None:
             self._watch.restart()
             self.health = self._watch.step(self.innovation, self.innovation_cov, given)
@@ -114,12 +142,13 @@ class Live:
         """
         self._has_begun()
         time = finite("time", time)
-        if time < self.time - ROUNDING * self._step:
+        near = self._near(time)
+        if time < self.time - near:
             raise ValueError(f"time must not step back behind {self.time:.9g} s, but got {time:.9g}")
         given = as_floats(() if u is None else u).reshape(-1)
         if given.shape != (self._inputs,) or not np.isfinite(given).all():
             raise ValueError(f"u must be {self._inputs} finite numbers, but got {short_repr(u)}")
-        if time > self.time + ROUNDING * self._step:
+        if time > self.time + near:
             self._predict(time, given)
 
     def update(self, time: float, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> None:
@@ -138,23 +167,28 @@ class Live:
         """
         self._has_begun()
         time, given = finite("time", time), self._measured(sensor, z)
-        if time > self.time + ROUNDING * self._step:
+        near = self._near(time)
+        if time > self.time + near:
             self._predict(time, self._held)
-        if time >= self.time - ROUNDING * self._step:
-            self._update(given)
-        elif time < self.time - self._late - ROUNDING * self._step:
+        if time >= self.time - near:
+            alarms = self._update(given)
+        elif time < self.time - self._late - near:
             raise ValueError(
                 f"a sample must be at most late = {self._late:g} s late, but one of {time:.9g} s came at "
                 f"{self.time:.9g} s"
             )
         else:
-            self._insert(time, given)
-        if self._watch is not None:
-            self.health = self._watch.step(self.innovation, self.innovation_cov, given)
+            alarms = self._insert(time, given, near)
+        if self.health is not None:
+            self.health = Health(self.health.ok, alarms)
 
     def _has_begun(self) -> None:
         if math.isnan(self.time):
             raise ValueError("start(time) must come before predict_to and update")
+
+    def _near(self, time: float) -> float:
+        """How far two stamps may be apart to be one [s]."""
+        return closeness(self._step, resolution_of(max(abs(time), abs(self.time)), self._resolution))
 
     def _measured(self, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> np.ndarray:
         values = as_floats(z).reshape(-1)
@@ -179,10 +213,11 @@ class Live:
             raise ValueError(
                 f"predict_to(time, u) must give the input before a sample at {time:.9g} s, a later time"
             )
-        self._remember(time, u)
-        count = max(1, math.ceil((time - self.time) / self._step - 1e-6))
+        exact = resolution_of(max(abs(time), abs(self.time)), self._resolution)
+        count = count_steps(time - self.time, self._step, exact)
         length = (time - self.time) / count
-        session.set_dt(length)
+        self._remember(time, u)
+        self._set_length(length)
         if self._noise is None:
             session.scale_process_noise(length / self._step)
         else:
@@ -191,33 +226,54 @@ class Live:
             session.run("predict", u=u)
         self.time, self._held = time, u
 
-    def _update(self, z: np.ndarray) -> None:
+    def _set_length(self, length: float) -> None:
+        self._length = length
+        self._session.set_dt(length)
+
+    def _update(self, z: np.ndarray) -> tuple[Alarm, ...]:
+        """Update with z (m,); return the alarms of the monitor."""
         self._remember(self.time, z)
         self._session.run("update", z=z)
+        if self._watch is None:
+            return ()
+        self.health = self._watch.step(self.innovation, self.innovation_cov, z)
+        if self._raised:
+            self._raised[-1] = self.health.alarms
+        return self.health.alarms
 
     def _remember(self, end: float, given: np.ndarray) -> None:
         """Keep what is about to be done as long as a late sample may come before it."""
         if self._late > 0.0:
-            self._events.append(Event(self.time, end, given, self._session.belief()))
-            oldest = end - self._late
+            tests = () if self._watch is None else self._watch.memory()
+            self._events.append(Event(self.time, end, given, self._session.belief(), self._length, tests))
+            self._raised.append(())
+            oldest = end - self._late - self._near(end)
             while self._events[0].end < oldest:
-                del self._events[0]
+                del self._events[0], self._raised[0]
 
-    def _insert(self, time: float, z: np.ndarray) -> None:
-        """Go back to a time, take what was measured there, and do again what came after it."""
-        near = ROUNDING * self._step
+    def _insert(self, time: float, z: np.ndarray, near: float) -> tuple[Alarm, ...]:
+        """Go back to a time, take what was measured there, and do again what came after it.
+
+        Returns the alarms that there were not before.
+        """
         place = next((i for i, one in enumerate(self._events) if one.end > time + near), None)
         if place is None or self._events[place].begin > time + near:
             raise ValueError(f"a sample must not be earlier than the start, but got one at {time:.9g} s")
         again, self._events = self._events[place:], self._events[:place]
+        raised, self._raised = self._raised[place:], self._raised[:place]
         first = again[0]
         self._session.load(first.before)
+        self._set_length(first.length)
         self.time = first.begin
+        if self._watch is not None:
+            self._watch.recall(first.tests)
         if time > first.begin + near:
             self._predict(time, first.given)
-        self._update(z)
-        for one in again:
+        alarms = self._update(z)
+        for one, before in zip(again, raised, strict=True):
             if one.is_prediction:
                 self._predict(one.end, one.given)
-            else:
-                self._update(one.given)
+                continue
+            known = {(alarm.test, alarm.channel) for alarm in before}
+            alarms += tuple(new for new in self._update(one.given) if (new.test, new.channel) not in known)
+        return alarms

@@ -24,7 +24,8 @@ def start(model):
 
 def settle(model, x, P):
     """The end of a step."""
-    return x, sym(P + model.kept["Q"]), {"predicted": constant(1.0, model.own.forgetting_factor)}
+    Q = model.kept["Q"] if model.own.learns_q else model.Q
+    return x, sym(P + Q), {"Q": Q, "predicted": constant(1.0, model.own.forgetting_factor)}
 
 
 def update(model, x, P, z):
@@ -74,7 +75,7 @@ class SageHusaFilter(PageFilter):
 
     name: ClassVar[str] = "sage-husa"
     page: ClassVar[Page] = Page(advance, settle, update, start=start)
-    varying_noise: ClassVar[bool] = False
+    varying_noise: ClassVar[bool] = False  # R, and Q if it is learnt, are in the belief
     any_step: ClassVar[bool] = False  # it estimates the Q of a step
     forgetting_factor: float = 0.995
     process_forgetting_factor: float = 1.0
@@ -85,9 +86,19 @@ class SageHusaFilter(PageFilter):
             object.__setattr__(self, name, part_that_is_kept(name, getattr(self, name)))
 
     @property
+    def learns_q(self) -> bool:
+        """Whether it estimates Q, too."""
+        return self.process_forgetting_factor < 1.0
+
+    @property
+    def fixed_noise(self) -> tuple[str, ...]:
+        """What it estimates."""
+        return ("Q", "R") if self.learns_q else ("R",)
+
+    @property
     def written_page(self) -> Page:
         """The page, with or without what learns Q."""
-        return super().written_page._replace(fixed=(("learns_q", self.process_forgetting_factor < 1.0),))
+        return super().written_page._replace(fixed=(("learns_q", self.learns_q),))
 
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate of R (m, m) in a belief."""

@@ -73,7 +73,7 @@ class VariationalBayesFilter(PageFilter):
     name: ClassVar[str] = "vb"
     page: ClassVar[Page] = Page(advance, settle, update, start=start)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
-    varying_noise: ClassVar[bool] = False
+    varying_noise: ClassVar[bool] = False  # R is in the belief, whose start is the model's
     forgetting_factor: float = 0.99
     prior_weight: float = 10.0
     iterations: int = 3
@@ -84,6 +84,11 @@ class VariationalBayesFilter(PageFilter):
         object.__setattr__(self, "forgetting_factor", factor)
         object.__setattr__(self, "prior_weight", positive("prior_weight", self.prior_weight))
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
+
+    @property
+    def fixed_noise(self) -> tuple[str, ...]:
+        """R, which it estimates."""
+        return ("R",)
 
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate V/nu of R (m, m) in a belief."""

@@ -27,7 +27,7 @@ typedef struct {{
 """
 MEMBERS = """\
     {name}_channel channel[{m}]; /* what tests say of each channel */
-    int healthy;            /* whether no test has raised an alarm within the last {memory} updates */
+    int healthy;            /* no alarm within the last {memory} updates, and no channel stuck or missing */
     unsigned long tested;   /* updates since the tests began */
     unsigned long alarmed;  /* at which one, from 1 on, there was the last alarm; 0 for none */
 """
@@ -132,6 +132,11 @@ static void test_update({name} *filter, const {real} *z)
     }}
     filter->tested++;
     filter->healthy = filter->alarmed == 0 || filter->tested - filter->alarmed >= {memory};
+    for (int i = 0; i < {m}; i++) {{
+        if (filter->channel[i].equal >= {stuck} || filter->channel[i].gone >= {missing}) {{
+            filter->healthy = 0;
+        }}
+    }}
 }}
 
 void {name}_test_anew({name} *filter)
@@ -151,7 +156,8 @@ README = """
 ## Alarms
 
 `{name}_update` ends with tests of the innovations, those of `filters.monitoring` in Python. `filter.healthy` is 1
-if there was no alarm within the last {memory} updates. `filter.channel[i].alarms` is a sum of
+if there was no alarm within the last {memory} updates and no channel is stuck or missing.
+`filter.channel[i].alarms` is a sum of
 
 | | test | what it finds | at |
 |--:|---|---|---|

@@ -71,8 +71,6 @@ def run(
     Raises:
         ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
     """
-    filter_.check_noise(process_noise_covs)
-    filter_.check_noise(measurement_noise_covs)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     n, (count, times, m) = filter_.kernel_model.n, z.shape
     out = Estimates(
@@ -83,10 +81,7 @@ def run(
         np.empty((count, times)),
         np.empty(count),
     )
-    noise = (
-        _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
-        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
-    )
+    noise = noise_rows(filter_, times, process_noise_covs, measurement_noise_covs)
     if isinstance(filter_, ForeignFilter):
         filter_.fill(keys, inputs, z, tuple(out))
         return out
@@ -154,6 +149,21 @@ def _floats(name: str, value) -> np.ndarray:
         return as_floats(value)
     except ValueError:
         raise ValueError(f"{name} must be an array of numbers, but got {short_repr(value)}") from None
+
+
+def noise_rows(
+    filter_: Filter, times: int, process_noise_covs, measurement_noise_covs
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (Q, its root) of each step and (R, its root) of each measurement; no rows where the model's act.
+
+    Raises ValueError for what is no covariance, other shapes, and what the filter cannot take.
+    """
+    filter_.check_noise(process_noise_covs, measurement_noise_covs)
+    model = filter_.kernel_model
+    return (
+        _noise_rows("process_noise_covs", process_noise_covs, times - 1, model.n),
+        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, model.m),
+    )
 
 
 def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:

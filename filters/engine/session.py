@@ -94,6 +94,8 @@ class Session:
         self._go_on(divergences, arrays)
 
     def _go_on(self, divergences: int, arrays: tuple) -> None:
+        if not np.array_equal(self._numbers, arrays[-1]):
+            self._remember_noise()
         for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             own[...] = kept
         self.divergences = divergences
@@ -105,6 +107,11 @@ class Session:
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """What the kernels read now, with all that was set: a view, laid out as `Filter.numbers`."""
+        return self._numbers
 
     def clear(self) -> None:
         """Make the memory as it was when it was new."""
@@ -121,7 +128,12 @@ class Session:
         self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
 
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
-        """Replace the model's Q or R, with its root."""
+        """Use another Q or R from here on: what a filter of a model with these would do with the belief.
+
+        Raises ValueError for a matrix that is no covariance, and for what the filter cannot take:
+        `Filter.fixed_noise`.
+        """
+        self._filter.check_noise(process_noise_cov, measurement_noise_cov)
         n, m, at = len(self.mean), len(self.innovation), self._noise_places
         self._remember_noise()
         if process_noise_cov is not None:
@@ -136,14 +148,9 @@ class Session:
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
-        Raises ValueError for a model without such a constant, a filter of several models, one that runs earlier
-        steps again, if dt is not that of those, or another number.
+        Raises ValueError for a model without such a constant, a filter of several models, or another number.
         """
         place, parts = self._dt_place
-        if self._filter.runs_again and not same_dt(positive("dt", dt), self.sample_time):
-            raise ValueError(
-                f"dt of {self._name!r} with a window must stay {self.sample_time:g} s, but got {dt:g}"
-            )
         self._numbers[place] = positive("dt", dt) / parts
 
     @property
@@ -174,8 +181,14 @@ class Session:
         raise ValueError(f"a number of {self._name!r} must be one of {', '.join(names)}, but got {name!r}")
 
     def scale_process_noise(self, factor: float) -> None:
-        """Use Q of the model times a factor above zero from here on; ValueError for a filter of several models."""
+        """Use Q of the model times a factor above zero from here on.
+
+        Raises ValueError for a filter of several models, or of one Q if the factor is not 1 to rounding.
+        """
         self._check_one_model("scale_process_noise")
+        if "Q" in self._filter.fixed_noise and same_dt(factor, 1.0):
+            return
+        self._filter.check_noise(process_noise_cov=factor)
         n, at = len(self.mean), self._noise_places.q
         self._remember_noise()
         scales = self._q_scales

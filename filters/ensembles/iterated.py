@@ -54,13 +54,13 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     since, and y_j = h(x_Lj) follows by x_kj = f(x_(k-1)j, u_k) + w_kj, run again in each iteration. So the slopes
     are those of f, too. Where f and h are linear the estimates are those without a window.
     `Belief.members` then is (n (L + 2), N): the members now, those at the window's start given all measurements
-    since, and w_1 ... w_L; `Belief.extras` holds how many steps the window has so far, and their inputs.
+    since, and w_1 ... w_L; `Belief.extras` holds how many steps the window has so far, with the input and the
+    model's constants of each.
 
     Attributes:
         iterations: evaluations of h by all members in an update, 1 to 20; with a window, each with its steps of f.
         window: steps L that an update estimates again, 0 to 1000; 0 leaves the motion as predicted. With a window
-            inflation and relaxation act on x_0 and the noise, there is no adaptive_inflation, and the sample time
-            stays.
+            inflation and relaxation act on x_0 and the noise, and there is no adaptive_inflation.
             The others are those of `EnsembleFilter`.
 
     Raises:
@@ -92,11 +92,6 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     @property
     def by_parts(self) -> bool:
         """Whether an update runs the motion again, too, and is more than the page."""
-        return bool(self.window)
-
-    @property
-    def runs_again(self) -> bool:
-        """Whether an update runs earlier steps again: with a window."""
         return bool(self.window)
 
     def kernels(self) -> Kernels:

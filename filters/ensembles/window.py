@@ -4,8 +4,8 @@
     motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... L, so that y_j = h(x_Lj) is a function of all these
     update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_L)
 
-Each iteration runs the motion again from where the window then starts. The next step moves x_0 by the first step
-of the window, drops that, and adds noise of its own.
+Each iteration runs the motion again from where the window then starts; each step keeps the model's constants, such
+as dt. The next step moves x_0 by the first step of the window, drops that, and adds noise of its own.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ class WindowPlaces(NamedTuple):
     pull: int  # m rows
     scratch: int  # of programs
     steps: int  # how many steps the window has so far
-    inputs: int  # of these steps
+    inputs: int  # of these steps, and behind each its constants
+    numbers: int  # those of a step, scratch
     innovation: int  # v of an iteration, scratch
     innovation_cov: int  # S of an iteration
 
@@ -65,8 +66,8 @@ def window_places(shape: Shape, length: int) -> WindowPlaces:
     """Places for a window of `length` steps."""
     n, m, rows = shape.n, shape.m, shape.n * (length + 1)
     moved, first = n + rows, memory_places(n, m).extras
-    slopes, v = moved + rows, first + 1 + length * shape.inputs
-    return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v, v + m)
+    slopes, v = moved + rows, first + 1 + length * (shape.inputs + shape.constants)
+    return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v + m + m * m, v, v + m)
 
 
 @cache
@@ -139,14 +140,16 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
     own = page.places(own_place(shape))
     inflation, relaxation, rows = own["inflation"], own["relaxation"], n * (length + 1)
-    window, moved, slopes, pulls, _, steps, inputs, _, _ = at
+    window, moved, slopes, pulls, _, steps, inputs, then_place, _, _ = at
+    constants, constants_place = shape.constants, number_places(n, m).constants
+    count, size_of_step = own_place(shape) + page.own_size, p + shape.constants
 
     @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PRIOR, row[key_0], row[key_1])
         begin(row, numbers, numbers, table, draws, size)
-        for k in range(1 + length * p):
+        for k in range(1 + length * size_of_step):
             row[steps + k] = 0.0
         copy_rows(table, 0, window, n)
         for i in range(window + n, window + rows):
@@ -157,13 +160,18 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     def move(memory, source, k, numbers, size):
         """The members by step k of the window, whose start is in rows source ..., its noise behind."""
         row, table, draws = memory
-        width, u = table.shape[1], row[inputs + k * p : inputs + (k + 1) * p]
+        first, then, width = inputs + k * size_of_step, row[then_place : then_place + count], table.shape[1]
+        u = row[first : first + p]
+        for i in range(count):
+            then[i] = numbers[i]
+        for i in range(constants):
+            then[constants_place + i] = row[first + p + i]
         for i in range(n):
             for j in range(width):
                 draws[i * width + j] = table[source + (k + 1) * n + i, j]
         for _ in range(int(numbers[substeps])):
-            advance(row, u, numbers, table, draws, size)
-        settle(row, u, numbers, table, draws, size)
+            advance(row, u, then, table, draws, size)
+        settle(row, u, then, table, draws, size)
 
     @inlined
     def run_window(memory, source, numbers, size):
@@ -178,8 +186,8 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         """Leave out the first step of the window."""
         row, table, _ = memory
         copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
-        for k in range((length - 1) * p):
-            row[inputs + k] = row[inputs + p + k]
+        for k in range((length - 1) * size_of_step):
+            row[inputs + k] = row[inputs + size_of_step + k]
         row[steps] -= 1.0
 
     @inlined
@@ -187,8 +195,11 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         """A step more, whose noise is in rows moved ...; then inflation."""
         row, table, _ = memory
         k = int(row[steps])
+        first = inputs + k * size_of_step
         for i in range(p):
-            row[inputs + k * p + i] = u[i]
+            row[first + i] = u[i]
+        for i in range(constants):
+            row[first + p + i] = numbers[constants_place + i]
         copy_rows(table, moved, window + (k + 1) * n, n)
         row[steps] += 1.0
         if numbers[inflation] != 1.0:
@@ -241,5 +252,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         moments_of(row, row, row, table, draws, size)
 
     used = max(at.scratch, *(work.rows for work in works.values()))
-    sizes = 1 + length * p, rows, m + m * m  # of what is kept of the row and of the table, and scratch
+    scratch = m + m * m + count
+    sizes = 1 + length * size_of_step, rows, scratch  # of what is kept of the row and of the table, and scratch
     return Kernels(n, m, used, max(n, m), start, predict, update, summarise, *sizes)

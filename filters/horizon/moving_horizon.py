@@ -44,7 +44,11 @@ class MovingHorizonFilter(Filter):
     vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
     R itself. A step that costs more than it gains is halved.
 
-    `Belief.extras` holds the number of steps, m, P, and of each step u, x, z and multipliers; `window` reads x.
+    Each step of the window keeps its own length, Q and R. A second measurement at the same time is one more step,
+    to which nothing moves; it counts among the L.
+
+    `Belief.extras` holds the number of steps, m, P, and of each step u, x, z, multipliers, Q, R and the model's
+    constants; `window` reads x.
 
     Attributes:
         horizon: L, 1 to 200; with 1 it is an iterated extended filter.
@@ -62,7 +66,6 @@ class MovingHorizonFilter(Filter):
     """
 
     name: ClassVar[str] = "mhe"
-    varying_noise: ClassVar[bool] = False  # a window has one Q and one R
     horizon: int = 10
     iterations: int = 3
     loss: str = HUBER

@@ -1,4 +1,8 @@
-"""Kernels of moving-horizon estimation: passes of a smoother over a window, until its states settle."""
+"""Kernels of moving-horizon estimation: passes of a smoother over a window, until its states settle.
+
+Each step of a window keeps the Q, R and constants that acted then. Of two measurements at the same time the second
+has a step of its own, to which nothing moves.
+"""
 
 from __future__ import annotations
 
@@ -34,17 +38,21 @@ def horizon_kernels(
 ) -> Kernels:
     """Kernels for model functions and sizes, with room for so many steps and one more.
 
-    Extras are the number of steps, arrival mean and P, and the steps.
+    Extras are the number of steps, arrival mean and P, and the steps. In scratch lie the numbers of a step, then
+    what is computed of each.
     """
     n, m, inputs = shape.n, shape.m, shape.inputs
     places, kept, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
     end, width, square = kept.end, at.end, n * n
     arrival = places.extras + 1
     steps = arrival + n + square
-    scratch = steps + (room + 1) * end
+    numbers_place = steps + (room + 1) * end
     mean, cov, number = places.mean, places.cov, places.extras
     sigma_place, horizon_place, iterations_place = (own_place(shape) + k for k in (1, 2, 3))
-    substeps = number_places(n, m).substeps
+    numbers_end, constants = iterations_place + 1, shape.constants
+    scratch, at_numbers = numbers_place + numbers_end, number_places(n, m)
+    q_place, r_place, constants_place = at_numbers.q, at_numbers.r, at_numbers.constants
+    substeps = at_numbers.substeps
     works = window_works(functions, shape, loss)
     tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
     clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set = limits(
@@ -55,9 +63,31 @@ def horizon_kernels(
     has_bounds = bool(bounds) or limited
     more = MOST_PASSES if has_bounds else 0
 
+    @inlined
+    def copy(target, at, source, first, size):
+        for i in range(size):
+            target[at + i] = source[first + i]
+
+    @inlined
+    def keep_sight(row, numbers, step):
+        """Keep what a measurement depends on besides the state."""
+        first = steps + step * end
+        copy(row, first + kept.R, numbers, r_place, m * m)
+        copy(row, first + kept.seen_by, numbers, constants_place, constants)
+
+    @inlined
+    def keep_motion(row, numbers, step):
+        """Keep what the motion to the next step depends on besides state and input."""
+        first = steps + step * end
+        copy(row, first + kept.Q, numbers, q_place, square)
+        copy(row, first + kept.moved_by, numbers, constants_place, constants)
+        row[first + kept.substeps] = numbers[substeps]
+
     @not_inlined
     def forwards(row, numbers, count, free):
         """The pass forwards over the first steps, components at bounds held or free; returns the cost of X."""
+        then = row[numbers_place : numbers_place + numbers_end]
+        copy(then, 0, numbers, 0, numbers_end)
         for i in range(n):
             row[scratch + at.d + i] = row[arrival + i]
         for i in range(square):
@@ -69,18 +99,22 @@ def horizon_kernels(
             given = row[steps + j * end : steps + (j + 2) * end]
             for i in range(m):
                 rows[at.z + i] = given[kept.z + i] if given[kept.z + i] < math.inf else math.nan
-            correct(rows, given, numbers)
+            copy(then, r_place, given, kept.R, m * m)
+            copy(then, constants_place, given, kept.seen_by, constants)
+            correct(rows, given, then)
             cost += rows[at.seen_cost]
             if not free:
                 hold_state(rows, given)
             if j < count - 1:
-                linearise(rows, given, numbers)
-                for _ in range(int(numbers[substeps])):
-                    substep(rows, given, numbers)
-                disturb(rows, given, numbers)
+                copy(then, q_place, given, kept.Q, square)
+                copy(then, constants_place, given, kept.moved_by, constants)
+                linearise(rows, given, then)
+                for _ in range(int(given[kept.substeps])):
+                    substep(rows, given, then)
+                disturb(rows, given, then)
                 if not free:
                     hold_disturbance(rows, given, numbers[sigma_place])
-                move(rows, given, numbers)
+                move(rows, given, then)
                 cost += rows[at.moved_cost]
         return cost
 
@@ -122,7 +156,7 @@ def horizon_kernels(
                 given[kept.x + i] = rows[at.found + i]
 
     @inlined
-    def begin_step(row, count):
+    def begin_step(row, numbers, count):
         """A step without a measurement, behind the others; its state is the belief's mean."""
         clip(row, mean)
         first = steps + count * end
@@ -133,6 +167,7 @@ def horizon_kernels(
         for i in range(m):
             row[first + kept.z + i] = math.inf
         row[first + kept.fresh] = 1.0
+        keep_sight(row, numbers, count)
         row[number] = count + 1.0
 
     @inlined
@@ -151,27 +186,42 @@ def horizon_kernels(
         row[number] = count - 1.0
 
     @inlined
+    def add_step(row, numbers, count):
+        """One step more, and as many as the horizon has at most."""
+        begin_step(row, numbers, count)
+        if count == int(numbers[horizon_place]):
+            leave_first(row, numbers, count + 1)
+
+    @inlined
+    def repeat_step(row, numbers, count):
+        """A step at the same time as the last one, for another measurement."""
+        last = steps + (count - 1) * end
+        keep_motion(row, numbers, count - 1)
+        for i in range(square):
+            row[last + kept.Q + i] = 0.0
+        row[last + kept.substeps] = 0.0
+        add_step(row, numbers, count)
+
+    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         begin(memory, numbers, size)
-        for i in range(number, scratch):
+        for i in range(number, numbers_place):
             row[i] = 0.0
         for i in range(n):
             row[arrival + i] = row[mean + i]
         for i in range(square):
             row[arrival + n + i] = row[cov + i]
-        begin_step(row, 0)
+        begin_step(row, numbers, 0)
 
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         count = int(row[number])
-        for i in range(inputs):
-            row[steps + (count - 1) * end + kept.u + i] = u[i]
+        copy(row, steps + (count - 1) * end + kept.u, u, 0, inputs)
+        keep_motion(row, numbers, count - 1)
         predict_belief(memory, u, numbers, size)
-        begin_step(row, count)
-        if count == int(numbers[horizon_place]):
-            leave_first(row, numbers, count + 1)
+        add_step(row, numbers, count)
 
     @inlined
     def settle(row, numbers, count):
@@ -195,11 +245,19 @@ def horizon_kernels(
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
+        tell(row, z, numbers)
+        if anything_measured(z):
+            last = steps + (int(row[number]) - 1) * end + kept.z
+            for i in range(m):
+                if row[last + i] < math.inf:
+                    repeat_step(row, numbers, int(row[number]))
+                    break
         count = int(row[number])
         newest = steps + (count - 1) * end
-        tell(row, z, numbers)
-        for i in range(m):
-            row[newest + kept.z + i] = z[i] if z[i] == z[i] else math.inf
+        if anything_measured(z):
+            keep_sight(row, numbers, count - 1)
+            for i in range(m):
+                row[newest + kept.z + i] = z[i] if z[i] == z[i] else math.inf
         if has_bounds or anything_measured(z):
             settle(row, numbers, count)
             for i in range(n):
@@ -209,6 +267,6 @@ def horizon_kernels(
 
     return Kernels(
         *(n, m, n, 0, start, predict, update, nothing_to_summarise),
-        extras=scratch - number,
-        scratch=(room + 1) * width,
+        extras=numbers_place - number,
+        scratch=numbers_end + (room + 1) * width,
     )

@@ -63,6 +63,11 @@ class Kept(NamedTuple):
     adjoint: int  # (n,), l before the update
     fresh: int  # 1 until it was once a part of a pass
     held: int  # (2 n,), which bounds hold the state and the disturbance after it: -1, 0 or 1
+    R: int  # (m, m), of z
+    seen_by: int  # (c,), the model's constants at z
+    Q: int  # (n, n), from this step to the next one
+    moved_by: int  # (c,), constants of that motion
+    substeps: int  # of it; none to a second measurement at the same time
     end: int
 
 
@@ -96,7 +101,8 @@ class Scratch(NamedTuple):
 def kept_places(shape: Shape) -> Kept:
     """Places of what a belief holds of a step, for some sizes."""
     n = shape.n
-    return Kept(*starts_of(shape.inputs, n, shape.m, n, 1, 2 * n))
+    square, constants = n * n, shape.constants
+    return Kept(*starts_of(shape.inputs, n, shape.m, n, 1, 2 * n, shape.m**2, constants, square, constants, 1))
 
 
 @cache

@@ -31,7 +31,8 @@ def by_the_clock(
     """
     if isinstance(filter_, ForeignFilter):
         raise ValueError(f"a log on its own stamps must be for a filter of ours, but got {filter_.name!r}")
-    live, times, z = Live(filter_, noise=noise), log.times.tolist(), log.measurements
+    live = Live(filter_, noise=noise, resolution=log.resolution)
+    times, z = log.times.tolist(), log.measurements
     live.start(0.0, z[0], key)
     rows = [live.told()]
     for k, u in enumerate(log.inputs, 1):

@@ -48,7 +48,7 @@ class Alarm(NamedTuple):
 class Health(NamedTuple):
     """What the tests say at a step."""
 
-    ok: bool  # whether no test has raised an alarm within the last `Monitor.memory` steps
+    ok: bool  # no alarm was raised within the last `Monitor.memory` steps, and no channel is stuck or missing
     alarms: tuple[Alarm, ...]  # raised at this step
 
 
@@ -74,7 +74,7 @@ class Monitor:
         block: steps of a block.
         stuck: equal readings in a row that raise an alarm.
         missing: missing readings in a row that raise an alarm.
-        memory: steps for which an alarm counts.
+        memory: steps for which an alarm counts; a channel that is stuck or missing counts until it is neither.
 
     Raises:
         ValueError: if an attribute is out of its range.
@@ -205,10 +205,20 @@ class Watch:
         self._last: int | None = None  # step of the last alarm
         self.latest: list[Alarm | None] = [None] * len(self._state)
 
+    def memory(self) -> tuple:
+        """What the tests remember, for `recall`."""
+        return self._state.copy(), self._k, self._last, tuple(self.latest)
+
+    def recall(self, memory: tuple) -> None:
+        """Continue from what the tests remembered."""
+        self._state[:], self._k, self._last, latest = memory
+        self.latest = list(latest)
+
     def step(self, innovation: np.ndarray, cov: np.ndarray, z: np.ndarray) -> Health:
         """Take the innovation (m,), its covariance (m, m) and the measurement (m,), NaN where there was none."""
         raised, since, sizes = self._out
-        _compiled()[0](self._state, float(self._k), innovation, cov, z, self._limits, raised, since, sizes)
+        tests = self._state, float(self._k), innovation, cov, z, self._limits, raised, since, sizes
+        dead = _compiled()[0](*tests)
         alarms: tuple[Alarm, ...] = ()
         if raised.any():
             alarms = tuple(
@@ -218,6 +228,6 @@ class Watch:
             self._last = self._k
             for one in alarms:
                 self.latest[one.channel] = one
-        ok = self._last is None or self._k - self._last >= self.monitor.memory
+        ok = not dead and (self._last is None or self._k - self._last >= self.monitor.memory)
         self._k += 1
         return Health(ok, alarms)

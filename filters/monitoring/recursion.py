@@ -25,6 +25,9 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
         since: set where it does: the step at which it began, (6, m).
         sizes: set where it does: biases and outliers in the measurement's unit, ratios of variances, else numbers
             of steps, (6, m).
+
+    Returns:
+        Whether a channel is dead: stuck or missing, at this step as since its alarm.
     """
     m, window = innovation.shape[0], state.shape[1] - RING
     reference, cusum, glr, low, high, block = limits[0], limits[1], limits[2], limits[3], limits[4], limits[5]
@@ -83,6 +86,10 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
         squared, present = squared_innovation(innovation, cov, z)
         if squared >= limits[7 + present]:
             raised[OUTLIER, worst], since[OUTLIER, worst], sizes[OUTLIER, worst] = True, k, innovation[worst]
+    dead = False
+    for i in range(m):
+        dead = dead or state[i, EQUAL] >= stuck or state[i, GONE] >= missing
+    return dead
 
 
 def squared_innovation(innovation, cov, z):

@@ -26,7 +26,12 @@ Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and whi
 
 
 def smooth_backwards(
-    filter_: PageFilter, relation: Relation, estimates: Estimates, inputs: np.ndarray, lag: int
+    filter_: PageFilter,
+    relation: Relation,
+    estimates: Estimates,
+    inputs: np.ndarray,
+    lag: int,
+    process_noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (B, K + 1, n) and covariances given `lag` later measurements, from a filter's estimates.
 
@@ -39,6 +44,7 @@ def smooth_backwards(
         estimates: of the filter, from `filters.run`.
         inputs: (B, K, p).
         lag: number of later measurements, 0 ... K.
+        process_noise: rows (Q, its root) of each step, of `filters.engine.batch.noise_rows`; none for the model's.
     """
     model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
     # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
@@ -46,15 +52,26 @@ def smooth_backwards(
     means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
     given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
-    return passes(filter_, relation)(given, inputs, lag)
+    numbers = filter_.numbers[None]
+    if len(process_noise):
+        numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_places(model.n, model.m).q
+        numbers[:, q : q + process_noise.shape[1]] = process_noise
+    return passes(filter_, relation)(given, inputs, lag, numbers)
 
 
-def passes(filter_: PageFilter, relation: Relation) -> Callable[[Given, np.ndarray, int], tuple]:
-    """Return the function of what a filter estimated, inputs and a lag that makes the smoother's passes."""
-    functions, shape, numbers = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers
+def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
+    """Return the function that makes the smoother's passes.
+
+    It takes what a filter estimated, the inputs, the lag, and the numbers that the filter read: (1, count) of all
+    steps or (K, count) of each; those of the filter if None.
+    """
+    functions, shape, of_filter = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers[None]
     run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
 
-    def smoothed(given: Given, inputs: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    def smoothed(
+        given: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        numbers = of_filter if numbers is None else numbers
         means, covs = np.empty_like(given[0]), np.empty_like(given[1])
         work = partial(run_part, given, inputs, numbers, lag, means, covs)
         work(0, 1) if len(means) == 1 else spread(work, len(means))
@@ -108,15 +125,19 @@ def _smoother(
         filtered, covs, restarted = given
         steps = inputs.shape[1]
         u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)
+        now = np.zeros(numbers.shape[1])  # each thread its own: slices of arrays that threads share cost counts
         for b in range(first, last):
             for k in range(steps):
+                if k < numbers.shape[0]:
+                    for i in range(now.shape[0]):
+                        now[i] = numbers[k, i]
                 for i in range(u.shape[0]):
                     u[i] = inputs[b, k, i]
                 put(row, mean_place, filtered, covs, b, k)
-                first_step(row, u, numbers)
-                for _ in range(int(numbers[substeps])):
-                    substep(row, u, numbers)
-                connect(row, u, numbers)
+                first_step(row, u, now)
+                for _ in range(int(now[substeps])):
+                    substep(row, u, now)
+                connect(row, u, now)
                 total = 0.0
                 for i in range(belief):
                     total += abs(row[link_place + i])
@@ -132,7 +153,7 @@ def _smoother(
                         for i in range(n):
                             row[mean_place + i] = filtered[b, k, i]
                         copy(row, link_place, links, k * width, width)
-                        correct(row, u, numbers)
+                        correct(row, u, now)
                         copy(row, later_place, row, mean_place, belief)
                     if end == steps or k == end - lag:
                         for i in range(n):

@@ -19,11 +19,17 @@ from filters.pages.members import analysis_of
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.numerics.threads import spread
 from thruster_env.numerics.tuples import joiner, vector_part, written_out
+from thruster_env.plants.layout import number_places
 from thruster_env.plants.state_space import StateSpaceModel
 
 
 def smooth_ensembles(
-    filter_: EnsembleFilter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int
+    filter_: EnsembleFilter,
+    keys: np.ndarray,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    lag: int,
+    noise: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (B, K + 1, n) and covariances of an ensemble filter's members given `lag` later measurements.
 
@@ -32,6 +38,8 @@ def smooth_ensembles(
     analysis that they would get as part of one long state: with perturbed measurements x_lj += cov(x_l, y) S^-1 (z
     - v_j - y_j). Relaxation is for the members of now only, and steps before a restart from the prior are left as
     they are.
+
+    Noise is that of `filters.engine.batch.noise_rows`.
 
     Raises ValueError for a filter with rotations, which would part the members of different steps, with a radius,
     as localisation moves each state by other weights, or with a window of its own.
@@ -53,7 +61,8 @@ def smooth_ensembles(
         now, pair = new_memory(kernels, size), new_memory(pair_kernels, size)
         history = np.zeros((times * n, now[1].shape[1]))
         numbers = filter_.numbers, paired.numbers
-        smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last)
+        data = keys, inputs, measurements, *noise
+        smooth(now, pair, history, size, data, numbers, lag, means, covs, first, last)
 
     spread(part, count)
     return means, covs
@@ -93,6 +102,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
     mean, cov, summarise = places.mean, places.cov, kernels.summarise
+    q_place, r_place, pair_r_place = number_places(n, m).q, number_places(n, m).r, number_places(2 * n, m).r
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined
@@ -101,8 +111,9 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
             for j in range(target.shape[1]):
                 target[at + i, j] = source[first + i, j]
 
-    def smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last):
+    def smooth(now, pair, history, size, data, numbers, lag, means, covs, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
+        keys, inputs, measurements, qs, rs = data
         row, table, _ = now
         pair_row, pair_table, _ = pair
         own_parameters, pair_numbers = numbers
@@ -119,9 +130,15 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                 if k > 0:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k - 1, i]
+                    if qs.shape[0] > 0:
+                        for i in range(qs.shape[1]):
+                            own_parameters[q_place + i] = qs[k - 1, i]
                     predict(now, u, own_parameters, size)
                 else:
                     start(now, own_parameters, size)
+                if rs.shape[0] > 0:
+                    for i in range(rs.shape[1]):
+                        own_parameters[r_place + i] = pair_numbers[pair_r_place + i] = rs[k, i]
                 copy(forecast, 0, table, 0)
                 update(now, z, own_parameters, size)
                 restart(now, own_parameters, size)

@@ -21,7 +21,7 @@ class WithSmoother:
     After step k this is x_{max(k - lag, 0)} given the measurements up to k: in the first steps that of the start.
     The last lag + 1 estimates of the filter are kept, and each step makes one pass of the smoother of Rauch, Tung
     and Striebel over them. So it is what `filters.smooth` gives with the same lag, and costs some `lag` times a
-    step of the filter.
+    step of the filter. Steps keep the dt and Q that a session was set to.
 
     Source: Anderson, Moore (1979), Optimal Filtering, chapter 7, for the fixed lag.
     """
@@ -39,6 +39,7 @@ class WithSmoother:
         self._means, self._covs = np.zeros((count, lag + 1, n)), np.zeros((count, lag + 1, n, n))
         self._restarted = np.zeros((count, lag + 1), dtype=bool)
         self._inputs, self._age = np.zeros((count, lag, model.inputs)), np.zeros(count, dtype=int)
+        self._numbers = self._first_numbers(lag)
         self._divergences = np.zeros(count)
         self._passes: Callable | None = None
 
@@ -65,6 +66,7 @@ class WithSmoother:
         self._means[which], self._covs[which] = mean[which, None], cov[which, None]
         self._inputs[which], self._restarted[which], self._age[which] = 0.0, False, 0
         self._divergences[which] = divergences[which]
+        self._numbers = self._first_numbers(self._lag)
 
     def step(self, u, z, idle: np.ndarray | None = None) -> None:
         """Predict with u and update with z; NaN marks a missing channel."""
@@ -75,6 +77,9 @@ class WithSmoother:
             if kept.shape[1]:
                 kept[:, :-1] = kept[:, 1:]
                 kept[:, -1] = new
+        if isinstance(self._runs, Session) and len(self._numbers):
+            self._numbers[:-1] = self._numbers[1:]
+            self._numbers[-1] = self._runs.numbers
         self._divergences, self._age = divergences, np.minimum(self._age + 1, self._lag)
 
     def smoothed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,8 +88,12 @@ class WithSmoother:
             self._passes = passes(self._filter, self._relation)
         given = self._means, self._covs, self._restarted
         oldest = np.arange(len(self._age)), self._lag - self._age
-        means, covs = (part[oldest] for part in self._passes(given, self._inputs, self._lag))
+        means, covs = (part[oldest] for part in self._passes(given, self._inputs, self._lag, self._numbers))
         return (means[0], covs[0]) if isinstance(self._runs, Session) else (means, covs)
+
+    def _first_numbers(self, lag: int) -> np.ndarray:
+        """The filter's numbers: of a session, which may set others, for each step."""
+        return np.repeat(self._filter.numbers[None], lag if isinstance(self._runs, Session) else 1, axis=0)
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means, covariances and numbers of restarts, with a row for each copy."""

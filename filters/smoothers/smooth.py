@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import run, trajectories
+from filters.engine.batch import noise_rows, run, trajectories
 from filters.engine.bounded import constrained
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
@@ -38,6 +38,9 @@ def smooth(
     inputs: np.ndarray | None = None,
     measurements: np.ndarray | None = None,
     lag: int | None = None,
+    *,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
 ) -> Smoothed:
     """Filter trajectories forwards and correct the estimates by later measurements.
 
@@ -64,6 +67,8 @@ def smooth(
         inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
         lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's, as `filters.run` takes it.
+        measurement_noise_covs: R of every measurement, (K + 1, m, m), likewise.
 
     Returns:
         `Smoothed`, which does not depend on the number of cores.
@@ -78,8 +83,9 @@ def smooth(
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     steps = inputs.shape[1]
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
+    noise = noise_rows(filter_, steps + 1, process_noise_covs, measurement_noise_covs)
     if isinstance(filter_, EnsembleFilter):
-        return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag))
+        return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag, noise))
     if isinstance(filter_, MultipleModelFilter):
         if lag < steps:
             raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
@@ -90,5 +96,7 @@ def smooth(
         filter_ = dataclasses.replace(filter_, model=filter_.model.replace(bounds=()))
     relation = relation_of(filter_, "a smoother", ", imm, mmae or an ensemble Kalman filter")
     assert isinstance(filter_, PageFilter)
-    free = smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag)
+    covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
+    estimates = run(filter_, keys, inputs, measurements, **covs)
+    free = smooth_backwards(filter_, relation, estimates, inputs, lag, noise[0])
     return Smoothed(*(constrained(*free, bounds, by) if bounds else free))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import inv, sqrtm
 
-from filters import StateSpaceModel, make_filter, run, thruster_model
+from filters import StateSpaceModel, make_filter, run
 from filters.c.source import c_filter
 from filters.ensembles.recording import record_members
 from filters.smoothers.ensemble import smooth_ensembles
@@ -237,10 +237,6 @@ def test_what_a_window_does_not_allow_is_refused():
     nothing = np.zeros((1, 1, 2)), np.zeros((1, 2, 2))
     with pytest.raises(ValueError, match="one gain for all states, but got 'ienkf' with a window of 2"):
         smooth_ensembles(filter_, np.array([KEY]), *nothing, 1)
-    session = make_filter("ienkf", thruster_model(), window=2).session()
-    session.set_dt(session.sample_time * (1.0 + 1e-12))
-    with pytest.raises(ValueError, match="dt of 'ienkf' with a window must stay .* s, but got 0.02"):
-        session.set_dt(0.02)
     with pytest.raises(ValueError, match="window of a filter with adaptive_inflation 0.1 must be 0, but got 2"):
         make_filter("ienkf", plane_model(), window=2, adaptive_inflation=0.1)
     with pytest.raises(ValueError, match="window must be a whole number of at least 0, but got -1"):

@@ -23,10 +23,10 @@ from thruster_env.plants.logs.findings import Recording
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.shape import Shape
+from thruster_env.plants.stamps import count_steps
 from thruster_env.plants.state_space import StateSpaceModel
 
 RATIO = Quantity("length of a step over dt", "step_ratio")
-ROUNDING = 1e-6  # of a step: so much longer than dt it is still one
 
 
 class AnyStepModel(StateSpaceModel):
@@ -106,7 +106,7 @@ def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
     is no measurement between them.
     """
     lengths = np.diff(log.times)
-    counts = np.maximum(1, np.ceil(lengths / log.dt - ROUNDING)).astype(int)
+    counts = np.array([count_steps(one, log.dt, log.resolution) for one in lengths.tolist()], dtype=int)
     ratios = np.repeat(lengths / counts / log.dt, counts)
     measurements = np.full((len(ratios) + 1, log.measurements.shape[1]), np.nan)
     measurements[np.concatenate([[0], np.cumsum(counts)])] = log.measurements

@@ -35,7 +35,7 @@ def careful(s):
     Where a pivot is zero but for rounding d is infinite, so that dividing gives zero there. For a numerator in the
     range of S that is a solution: components known exactly have no share in a gain.
     """
-    return pivoted(s, lambda d, variance: where(d > NEGLIGIBLE * variance, d, math.inf))
+    return pivoted(s, lambda d, variance: d > NEGLIGIBLE * variance, math.inf)
 
 
 @operation(lambda a: (a[0], a[0]))

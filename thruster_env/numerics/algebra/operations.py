@@ -103,16 +103,20 @@ def uncorrelated(seen, r):
 @operation(same)
 def factor(s):
     """Unit lower triangular L, and d, with L diag(d) L' = s; NaN where s is not positive definite."""
-    return pivoted(s, lambda d, variance: where(d > 0.0, d, math.nan))
+    return pivoted(s, lambda d, variance: d > 0.0, math.nan)
 
 
-def pivoted(s, pivot):
-    """The factor with d = pivot(d, s_ii): Cholesky's method, with a diagonal of one's own."""
+def pivoted(s, counts, otherwise):
+    """The factor by Cholesky's method, with another d, NaN or infinite, where counts(d, s_ii) is false."""
     lower, d = np.array(np.eye(len(s)), dtype=s.dtype), np.array(np.diag(s))
+    used = np.array(d)  # zero in place of infinity, by which its column of L, zero, is not to be multiplied
     for j in range(len(s)):
-        d[j] = pivot(d[j] - sum(lower[j, k] * lower[j, k] * d[k] for k in range(j)), s[j, j])
+        pivot = d[j] - sum(lower[j, k] * lower[j, k] * used[k] for k in range(j))
+        is_number = counts(pivot, s[j, j])
+        d[j] = where(is_number, pivot, otherwise)
+        used[j] = where(is_number, pivot, 0.0) if otherwise == math.inf else d[j]
         for i in range(j + 1, len(s)):
-            lower[i, j] = (s[i, j] - sum(lower[i, k] * lower[j, k] * d[k] for k in range(j))) / d[j]
+            lower[i, j] = (s[i, j] - sum(lower[i, k] * lower[j, k] * used[k] for k in range(j))) / d[j]
     return lower, d
 
 

@@ -14,6 +14,7 @@ from thruster_env.plants.logs.columns import INPUT, MEASUREMENT, STATE
 from thruster_env.plants.logs.findings import Finding, Recording, found_in
 from thruster_env.plants.logs.grid import Series, held, sampled
 from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.stamps import resolution_of
 from thruster_env.plants.state_space import StateSpaceModel
 
 FEWEST_STEPS = 2
@@ -99,6 +100,11 @@ class Log:
     def times(self) -> np.ndarray:
         """Times of the rows [s], (K + 1,), 0 at row 0."""
         return self.dt * np.arange(self.steps + 1) if self.stamps is None else self.stamps
+
+    @property
+    def resolution(self) -> float:
+        """How exact the stamps of the file are [s], as float64 has them."""
+        return resolution_of(abs(self.start) + float(self.times[-1]))
 
     @property
     def pieces(self) -> tuple[tuple[int, int], ...]:

@@ -11,11 +11,17 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from thruster_env.plants.logs.grid import CLOSE, Series
+from thruster_env.plants.logs.grid import Series
+from thruster_env.plants.stamps import closeness, resolution_of
 
 
 def at_own_stamps(
-    series: Mapping[str, Series], inputs: Collection[str], offsets: Mapping[str, float], dt: float, end: float
+    series: Mapping[str, Series],
+    inputs: Collection[str],
+    offsets: Mapping[str, float],
+    dt: float,
+    end: float,
+    start: float = 0.0,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The times (K + 1,) [s] of a log's rows, and each channel at them: inputs (K,), others (K + 1,) with NaN.
 
@@ -23,10 +29,11 @@ def at_own_stamps(
         series: samples by channel, at times since the first stamp.
         inputs: channels that are inputs.
         offsets: clock offsets by channel [s].
-        dt: sample time [s]: stamps that are within a billionth of it are one.
+        dt: sample time [s]: stamps that are within a billionth of it, or their rounding, are one.
         end: the last stamp [s].
+        start: the first stamp [s], as the file has it.
     """
-    near = CLOSE * dt
+    near = closeness(dt, resolution_of(abs(start) + end))
     own = {key: one.times - offsets.get(key, 0.0) for key, one in series.items()}
     stamps = np.sort(np.concatenate([np.zeros(1), *own.values()]))
     stamps = stamps[(stamps >= -near) & (stamps <= end + near)]

@@ -136,7 +136,7 @@ def read_log(
     stamps, last = None, of_file.rows - 1
     if not grid:
         driving = [one.key for one in wanted if one.kind == INPUT]
-        stamps, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]))
+        stamps, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]), start)
         last = len(stamps) - 1
 
     def those(kind: str, rows: int) -> np.ndarray:
