@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,14 @@ import numpy as np
 from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
+from filters.pages.page_filter import PageFilter
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.numerics.algebra.densities import tail_of
 from thruster_env.numerics.angles import wrapped_where
 from thruster_env.numerics.threads import spread
 from thruster_env.plants.state_space import StateSpaceModel
+
+STEP = 1e-6  # of parameters, of which 1 is a sensible change
 
 
 class ModelSlopes(NamedTuple):
@@ -78,6 +82,7 @@ def derivatives(
     by `own_slopes`, (p, their count). Of what is not wanted there is nothing: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
+    given_model = model
     model, page, own_parameters = differentiable(model, used)
     if model.functions != functions:  # those of an affine approximation, with constants of its own
         if wanted.constants:
@@ -91,6 +96,8 @@ def derivatives(
         raise ValueError(
             f"own_slopes must have the shape {(parameters, len(own_parameters))}, but got {own_slopes.shape}"
         )
+    if isinstance(used, PageFilter) and used.follows_from:
+        own_slopes = own_slopes + _following(used, given_model, slopes)
     wanted = wanted._replace(own=bool(own_slopes.any()))
     recursion = recursion_of(model.functions, model.shape, wanted, page)
     begun = as_the_prior_says(model, count) if starts is None else starts
@@ -122,6 +129,18 @@ def derivatives(
 
     spread(some, -(-count // at_once))
     return out, information
+
+
+def _following(used: PageFilter, model: StateSpaceModel, slopes: ModelSlopes) -> np.ndarray:
+    """How own parameters move (p, their count) that follow from numbers of the model, by central differences."""
+    found = np.zeros((len(slopes.constants), len(used.own_parameters)))
+    for name in {name for names in used.follows_from.values() for name in names}:
+        for row, slope in zip(found, getattr(slopes, name), strict=True):
+            if slope.any():
+                ends = (getattr(model, name) + side * STEP * slope for side in (1.0, -1.0))
+                ahead, behind = (replace(used, model=model.replace(**{name: end})).own_parameters for end in ends)
+                row += np.subtract(ahead, behind) / (2.0 * STEP)
+    return found
 
 
 def same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:

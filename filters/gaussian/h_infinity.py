@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -63,3 +64,8 @@ class HInfinityFilter(PageFilter):
         scale = np.sqrt(np.diag(self.model.prior_cov)) if self.scale is None else self.scale
         weights = np.divide(1.0, scale, out=np.zeros(self.model.n), where=scale > 0.0)
         return {"theta": self.theta, "weights": np.diag(weights)}
+
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """W, from the prior's deviations unless there is a scale."""
+        return {"weights": ("prior_cov",)} if self.scale is None else {}

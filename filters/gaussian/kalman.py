@@ -23,6 +23,8 @@ MOST_POINTS = 200  # of a schedule; programs are written out for them
 class AffineFilter(PageFilter):
     """Base of filters that run on an affine model, or on the affine approximation of a model about one point."""
 
+    any_step: ClassVar[bool] = False  # A and B of a model are those of one sample time
+
     def __post_init__(self):
         """Raise ValueError if a nonlinear model comes without an operating point."""
         point = self.model.operating_state, self.model.operating_input
@@ -35,7 +37,7 @@ class AffineFilter(PageFilter):
 
     @cached_property
     def kernel_model(self) -> AffineModel:
-        """The affine model that the filter runs on."""
+        """The affine model that the filter runs on, of one sample time."""
         return linearize(self.model, self.model.operating_state, self.model.operating_input)
 
 
@@ -99,6 +101,11 @@ class KalmanFilter(AffineFilter):
             raise ValueError(f"the inputs of operating points must increase, but got {inputs}")
         models = [linearize(self.model, state, control) for state, control in points]
         return {"inputs": np.array(inputs), "models": np.array([model.constants for model in models])}
+
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """The models of a schedule, from the model's constants."""
+        return {"models": ("constants",)} if self.parameters else {}
 
     @property
     def written_page(self) -> Page:

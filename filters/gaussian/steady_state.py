@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -84,3 +85,8 @@ class SteadyStateKalmanFilter(AffineFilter):
     def parameters(self) -> dict[str, np.ndarray]:
         """The gain."""
         return {"gain": self.gain}
+
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """The gain, from all but the prior."""
+        return {"gain": ("process_noise_cov", "measurement_noise_cov", "constants")}

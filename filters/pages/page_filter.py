@@ -40,6 +40,11 @@ class FilterWithPage(Filter):
         """Numbers and arrays that the page finds in `model.own`: fields, unless a filter says otherwise."""
         return {name: getattr(self, name) for name in self._fields() if name not in self.unrolled}
 
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """Parameters that are worked out of numbers of the model when the filter is made, and these numbers."""
+        return {}
+
     def _fields(self) -> Iterator[str]:
         return (field.name for field in dataclasses.fields(self) if field.name not in ("model", "form"))
 

@@ -258,6 +258,7 @@ class TensorFilter:
 
     def _known(self) -> dict[Place, Tensor]:
         """Tensors of the numbers that pages read."""
+        self._check_what_follows()
         memory, like = self._stages.memory, self.prior_mean
         own = {
             one: torch.as_tensor(value, dtype=like.dtype, device=like.device)
@@ -273,6 +274,16 @@ class TensorFilter:
         covs[memory.R_root] = self.measurement_noise_cov
         numbers |= {one: root(cov) for one, cov in covs.items() if one in self._stages.reads}
         return {one.operation: value for one, value in (own | numbers).items()}
+
+    def _check_what_follows(self) -> None:
+        """Raise ValueError for other numbers, or derivatives, that the filter's parameters do not follow."""
+        for parameter, names in with_page(self.filter, "a filter on tensors").follows_from.items():
+            for name in () if parameter in self._changed else names:
+                if not _is(getattr(self, name), getattr(self._model, name)):
+                    raise ValueError(
+                        f"{name} of {self.filter.name!r} on tensors must be the model's, without a gradient, as "
+                        f"{parameter} was worked out from it: make the filter for another model"
+                    )
 
     def _tensor(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
         """A value as a tensor (..., *shape) of the filter's dtype and on its device."""

@@ -147,11 +147,12 @@ def test_alarms_are_those_of_python_step_by_step(name, make, tmp_path):
 def test_every_test_raises_alarms_in_c(tmp_path):
     filter_ = made("ekf", wide_model())
     inputs, z = faulty(filter_.model)
-    alarms, _ = told_by_c(filter_, inputs, z, tmp_path)
+    alarms, healthy = told_by_c(filter_, inputs, z, tmp_path)
     assert {one[1] for one in alarms} == set(range(6))
     at = [one for one in alarms if TESTS[one[1]] == "stuck" and one[2] == 1]
     assert any(100 <= one[0] < 110 and one[4] == MONITOR.stuck for one in at)
     assert {one[0] for one in alarms if TESTS[one[1]] == "missing" and one[2] == 1 and 400 <= one[0] < 420}
+    assert not any(healthy[106:130]) and not any(healthy[404:420])  # longer than MONITOR.memory after the alarm
 
 
 @pytest.mark.usefixtures("as_python")

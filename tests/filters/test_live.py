@@ -1,6 +1,8 @@
 """Real clocks: any dt, sensors at their own times, late samples in order; the same numbers as on a grid."""
 
+import copy
 import math
+import pickle
 from typing import NamedTuple
 
 import numpy as np
@@ -241,3 +243,124 @@ def test_noise_of_no_white_noise_is_refused():
 def test_a_continuous_model_needs_a_substep():
     with pytest.raises(ValueError, match="constants must be a NamedTuple with a field substep"):
         ContinuousModel(rates=rates, observe=both, densities=S, constants=(), arguments={"prior_mean": [0.0, 0.0]})
+
+
+def watched(filter_, samples, late, **monitor):
+    """Live with a monitor over samples (stamp, arrival, channel, value); the alarms at each arrival."""
+    live = filter_.live(late=late, monitor={"steps_between": 100_000.0, **monitor})
+    live.start(0.0)
+    alarms = []
+    for _, arrival, channel, value, stamp in sorted((one[1], one[1], one[2], one[3], one[0]) for one in samples):
+        if arrival > live.time:
+            live.predict_to(arrival, [0.0])
+        live.update(stamp, channel, value)
+        alarms += live.health.alarms
+    return live, alarms
+
+
+def samples_of(plant, steps, delay, bias=0.0, dt=0.05):
+    """Readings of a run under process noise: the position at once, the rate `delay` steps later."""
+    rng, model = np.random.default_rng(11), plant.at(dt)
+    root, x, found = np.linalg.cholesky(model.process_noise_cov), np.array([0.5, 0.0]), []
+    for k in range(1, steps):
+        x = np.array(model.transition(tuple(x), (0.0,), model.constants)) + root @ rng.normal(size=2)
+        rate = x[1] + math.sqrt(0.1) * rng.normal() + bias * (k >= steps // 2)
+        found.append((dt * k, dt * k, "position", x[0] + math.sqrt(0.02) * rng.normal()))
+        found.append((dt * k, dt * (k + delay), "rate", rate))
+    return found
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_monitor_sees_late_samples_in_the_order_of_their_stamps():
+    plant = oscillator()
+    filter_ = make_filter("ekf", plant.at(0.05))
+    _, none = watched(filter_, samples_of(plant, 300, 3), 0.4)
+    assert none == []  # 29 in 1500 steps, when it saw the innovation of the newest sample beside the late one
+    late, found = watched(filter_, samples_of(plant, 120, 3, bias=3.0), 0.4)
+    early, expected = watched(filter_, samples_of(plant, 120, 0, bias=3.0), 0.0)
+    assert {one.test for one in found} & {"cusum", "glr", "outlier"}
+    assert {(one.test, one.channel) for one in found} == {(one.test, one.channel) for one in expected}
+    np.testing.assert_allclose(late._watch._state, early._watch._state, rtol=1e-6, atol=1e-6)
+    assert len(found) == len(set(found))  # none is raised once more when it is gone through again
+
+
+@pytest.mark.usefixtures("as_python")
+def test_late_samples_of_one_stamp_come_in_the_order_of_arrival_with_the_length_of_their_step():
+    plant = oscillator()
+    filter_ = make_filter("ekf", plant.at(0.05))
+    late, early = filter_.live(late=1.0), filter_.live()
+    for live in (late, early):
+        live.start(0.0)
+        live.predict_to(0.03, [1.0])
+    for live in (early,):
+        for channel, value in (("position", 0.4), ("rate", 0.3), ("position", 0.7)):
+            live.update(0.03, channel, value)
+        live.predict_to(0.2, [2.0])
+        live.update(0.2, "position", 0.1)
+    late.update(0.03, "position", 0.4)
+    late.predict_to(0.2, [2.0])
+    late.update(0.2, "position", 0.1)
+    late.update(0.03, "rate", 0.3)
+    late.update(0.03, "position", 0.7)
+    np.testing.assert_allclose(late.mean, early.mean, rtol=1e-12)
+    np.testing.assert_allclose(late.cov, early.cov, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_copy_of_live_has_its_own_estimate():
+    live = make_filter("ekf", thruster_model()).live(late=0.5, monitor=1000)
+    live.start(1.0)
+    live.predict_to(1.02, [4.0])
+    for other in (copy.deepcopy(live), pickle.loads(pickle.dumps(live))):
+        before = live.mean.copy()
+        other.update(1.02, "thrust", 3.0)
+        np.testing.assert_array_equal(live.mean, before)
+        assert (other.mean != before).any() and not np.shares_memory(other.mean, live.mean)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9, -1.7e9])
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+@pytest.mark.usefixtures("as_python")
+def test_stamps_since_1970_divide_no_step(start, rate):
+    dt = 1.0 / rate
+    filter_ = make_filter("ekf", oscillator().at(dt))
+    live, session = filter_.live(), filter_.session()
+    live.start(start)
+    session.start((0, 0), [math.nan, math.nan])
+    rng = np.random.default_rng(12)
+    for k in range(1, 120):
+        u, z = rng.normal(size=1), rng.normal(size=2)
+        live.predict_to(start + k * dt, u)
+        live.update(start + k * dt, None, z)
+        session.step(u, z)
+        assert live._session.belief().step == k
+    np.testing.assert_allclose(live.mean, session.mean, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_clock_that_jumps_is_an_error_of_one_line_and_nothing_changes():
+    live = make_filter("ekf", thruster_model()).live(late=1.0)
+    live.start(0.0)
+    live.predict_to(0.02, [1.0])
+    before = live.mean.copy()
+    for use in (lambda: live.predict_to(1.7e9, [1.0]), lambda: live.update(1.7e9, "thrust", 0.1)):
+        with pytest.raises(
+            ValueError, match="at most 1000000 steps of 0.01 s apart, but are .*start anew"
+        ) as error:
+            use()
+        assert "\n" not in str(error.value)
+    np.testing.assert_array_equal(live.mean, before)
+    live.update(0.02, "thrust", 0.1)  # goes on
+    live.start(1.7e9)
+    live.predict_to(1.7e9 + 0.01, [1.0])
+
+
+@pytest.mark.usefixtures("as_python")
+def test_stamps_of_a_coarse_recorder_are_one_within_its_resolution():
+    live = make_filter("ekf", thruster_model()).live(resolution=0.001)
+    live.start(1.0)
+    live.predict_to(1.011, [4.0])
+    assert live._session.belief().step == 1
+    live.predict_to(1.0105, [4.0])  # of the same time
+    live.update(1.0115, "thrust", 0.2)
+    assert live.time == 1.011

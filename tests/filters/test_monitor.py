@@ -241,3 +241,23 @@ def test_episodes_are_told_in_words():
         "T: a bias of +0.5 N since 2 s, found at 3 s (cusum); 1 more until 4 s (glr)"
     )
     assert episode_sentence(second, thrust, times) == "T: an outlier -4 N off at 9.5 s (outlier)"
+
+
+@pytest.mark.parametrize("dead", ["stuck", "missing"])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_a_dead_sensor_is_not_healthy_again_until_it_moves(dead, channels):
+    v, s, z = drawn(300, channels, seed=4)
+    v[:] *= 0.5  # no other test has an alarm
+    z[20:220, -1] = z[20, -1] if dead == "stuck" else math.nan
+    monitor = Monitor(stuck=6, missing=6, memory=15, block=100_000)
+    watch = monitor.watch(channels)
+    ok = [watch.step(*one).ok for one in zip(v, s, z, strict=True)]
+    assert all(ok[:25]) and not any(ok[25:220]) and all(ok[220:])
+    for last in (22, 30, 120, 219, 220, 240):  # and so it is after going back, as a late sample has it
+        again = monitor.watch(channels)
+        for k in range(last):
+            again.step(v[k], s[k], z[k])
+        memory = again.memory()
+        again.step(v[last], s[last], np.full(channels, 7.0))
+        again.recall(memory)
+        assert [again.step(v[k], s[k], z[k]).ok for k in range(last, 300)] == ok[last:]
