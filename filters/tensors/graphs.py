@@ -31,15 +31,17 @@ WORK: dict[str, Callable] = {
     "==": operator.eq,
     "!=": operator.ne,
     "and": operator.and_,
+    "or": operator.or_,
 }
 """Operations of tensors and floats; other ones are torch's functions of tensors, by their names."""
+NAMES = {"rint": "round"}
 
 HAS_SLOPE: dict[str, Callable] = {
     "sqrt": lambda x: x > 0.0,
     "log": lambda x: x > 0.0,
     "/": lambda a, b: b != 0.0,
     "pow": lambda x, e: torch.isfinite(x**e) & ((x != 0.0) | (e >= 1.0)),
-    "arctan2": lambda a, b: (a != 0.0) | (b != 0.0),
+    **dict.fromkeys(("arctan2", "hypot"), lambda a, b: (a != 0.0) | (b != 0.0)),
     "exp": lambda x: torch.isfinite(torch.exp(x)),
     **dict.fromkeys(("sinh", "cosh"), lambda x: torch.isfinite(torch.cosh(x))),
 }
@@ -86,5 +88,5 @@ def values_of(
         elif one.operation in WORK:
             values[one.place] = WORK[one.operation](*arguments)
         else:
-            values[one.place] = getattr(torch, one.operation)(*map(tensor, arguments))
+            values[one.place] = getattr(torch, NAMES.get(one.operation, one.operation))(*map(tensor, arguments))
     return [values[one.place] for one in wanted]

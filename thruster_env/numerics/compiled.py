@@ -8,6 +8,7 @@ environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
 from __future__ import annotations
 
 import contextlib
+import dis
 import functools
 import hashlib
 import importlib.util
@@ -28,6 +29,9 @@ from thruster_env.numerics.optimising import Which, optimise_once
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
+
+OURS = "thruster_env", "auv_env", "filters", "tuning"  # packages whose quotients may be products with reciprocals
+JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divide divmod".split())
 
 WITHIN = tuple(f"thruster_env.{name}" for name in ("numerics", "plants", "training", "studies"))  # packages apart
 _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
@@ -133,11 +137,32 @@ def compiled(function: Callable) -> Callable:
         _lessons.pop()()
     while _waiting:
         inner = _waiting.pop()
-        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True)(
+        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True, fastmath=fastmath_of(inner))(
             inner
         )  # by itself LLVM inlines small ones only
     _asked.add(function)
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
+
+
+def fastmath_of(function: Callable) -> set[str]:
+    """What LLVM may do with the arithmetic of a function.
+
+    A user's division is one: 49/49 is 1, and 49 * (1/49) is less. Where a function rounds, an ulp may decide, so
+    that it computes as it is written.
+    """
+    if (function.__module__ or "").partition(".")[0] in OURS:
+        return set(FASTMATH)
+    return {"nsz"} if _jumps(function.__code__) else set(FASTMATH - {"arcp"})
+
+
+def _jumps(code: types.CodeType) -> bool:
+    """Whether a function rounds numbers, or takes rests."""
+    signs = {"%", "//", "%=", "//="}
+    return (
+        not JUMPS.isdisjoint(code.co_names)
+        or any(one.opname == "BINARY_OP" and one.argrepr in signs for one in dis.get_instructions(code))
+        or any(_jumps(one) for one in code.co_consts if isinstance(one, types.CodeType))
+    )
 
 
 def tell_when_compiling(tell: Callable[[], None]) -> None:

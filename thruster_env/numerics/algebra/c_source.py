@@ -14,12 +14,12 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from thruster_env.numerics.algebra.graphs import Number
+from thruster_env.numerics.algebra.graphs import COMPARISONS, CONDITIONS, Number
 from thruster_env.numerics.algebra.loops import Cut
 from thruster_env.numerics.algebra.precision import as_single
-from thruster_env.numerics.algebra.programs import CALLED_IN_ROUNDS, DECISIONS, Place, Program
+from thruster_env.numerics.algebra.programs import CALLED_IN_ROUNDS, Place, Program
 
-OF_TWO = {name: name for name in ("+", "-", "*", "/", "<", "<=", ">", ">=", "==", "!=")} | {"and": "&&"}
+OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}
 OTHER_NAMES = {"abs": "fabs", "arctan": "atan", "arctan2": "atan2"}
 """Functions of math.h that have other names in NumPy."""
 
@@ -100,7 +100,7 @@ class _Writer:
             elif one.operation == "call":
                 self._call(one)
             else:
-                whose = "int" if one.operation in DECISIONS else self.kind
+                whose = "int" if one.operation in CONDITIONS else self.kind
                 value = _expression(one, self.names, self._single)
                 self.lines.append(f"const {whose} {self.named(one)} = {value};")
         self.lines += [f"{self._lies(place)} = {self.names[one.place]};" for place, one in stores]

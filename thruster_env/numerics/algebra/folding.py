@@ -18,8 +18,16 @@ if TYPE_CHECKING:
     from thruster_env.numerics.algebra.graphs import Number
 
 
+def as_number(a: Number) -> Number:
+    """A number, of a condition 1.0 where it holds and 0.0 where it does not."""
+    if not a.is_condition:
+        return a
+    return a.graph.make("where", a, a.graph.constant(1.0), a.graph.constant(0.0))
+
+
 def worked_out(operation: str, *numbers: Number) -> Number:
     """An operation of one or two numbers; that of constants is done."""
+    numbers = tuple(map(as_number, numbers))
     values, graph = [number.value for number in numbers], numbers[0].graph
     if None in values:
         return graph.make(operation, *numbers)
@@ -35,6 +43,7 @@ _OF_CONSTANTS: dict[str, Callable] = {
     "arctan": math.atan,
     "arctan2": math.atan2,
     "pow": math.pow,
+    "rint": round,
 }
 
 
@@ -94,3 +103,45 @@ def quotient(a: Number, b: Number) -> Number:
     if b.value is not None:
         return a.graph.make("/", a, b) if b.value == 0.0 else product(a, a.graph.constant(1.0 / b.value))
     return b.graph.make("/", a, b) if a.value == 1.0 else product(a, quotient(b.graph.constant(1.0), b))
+
+
+def divided(a: Number, b: Number) -> Number:
+    """A quotient as Python has it; the reciprocal of a power of two is one, too."""
+    if b.value is None or b.value == 0.0:
+        return a.graph.make("/", a, b)
+    if a.value is not None:
+        return a.graph.constant(a.value / b.value)
+    if abs(math.frexp(b.value)[0]) == 0.5 and math.isfinite(1.0 / b.value):
+        return product(a, a.graph.constant(1.0 / b.value))
+    return a.graph.make("/", a, b)
+
+
+def modulus(a: Number, b: Number) -> Number:
+    """The rest a % b, with the sign of b, as Python and NumPy have it."""
+    rest = worked_out("fmod", a, b)
+    return _chosen(_turns(rest, b), total(rest, b), rest)
+
+
+def floor_quotient(a: Number, b: Number) -> Number:
+    """The quotient a // b, a whole number, as CPython and NumPy find it: 1.0 // 0.1 is 9, though 1.0/0.1 is 10."""
+    if b.value == 0.0:
+        return divided(a, b)
+    rest = worked_out("fmod", a, b)
+    parts = divided(difference(a, rest), b)
+    parts = _chosen(_turns(rest, b), difference(parts, a.graph.constant(1.0)), parts)
+    whole = worked_out("floor", parts)
+    found = _chosen(difference(parts, whole) > 0.5, total(whole, a.graph.constant(1.0)), whole)
+    return found if b.value is not None else _chosen(b == 0.0, divided(a, b), found)
+
+
+def _turns(rest: Number, b: Number) -> Number | bool:
+    """Whether a rest with the sign of the dividend is not zero, and has not that of the divisor."""
+    if b.value is not None:
+        return rest < 0.0 if b.value > 0.0 else rest > 0.0
+    return (rest < 0.0) & (b > 0.0) | (rest > 0.0) & (b < 0.0)
+
+
+def _chosen(condition: Number | bool, a: Number, b: Number) -> Number:
+    if isinstance(condition, bool):
+        return a if condition else b
+    return a if a is b else a.graph.make("where", condition, a, b)

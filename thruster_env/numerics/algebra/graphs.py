@@ -10,26 +10,50 @@ function of floats, called with Numbers, writes down what it computes:
 
 Three things keep the graph small. An operation on the same arguments is there already (`Graph.make`), products
 and sums in either order. What constants make is a constant, and zeros and ones of a matrix's structure vanish.
-A division by a number is a product with its reciprocal, of which there is one.
+A page's division by a number is a product with its reciprocal, of which there is one. Within `Graph.as_written`,
+where the functions of a model are traced, a division is one: 49/49 is 1, and 49 * (1/49) is less.
 
-What a Number cannot do is decide: `if x > 0.0` raises TypeError, and whoever traces a function then calls it
-instead. `where(condition, a, b)` works out both sides.
+A comparison is a condition. In arithmetic it is 1.0 or 0.0, as in Python. What a Number cannot do is decide:
+`if x > 0.0` raises TypeError, and whoever traces a function then calls it instead. `where(condition, a, b)` works
+out both sides.
 """
 
 from __future__ import annotations
 
 import gc
 import math
+import operator
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
-from thruster_env.numerics.algebra.folding import difference, negative, product, quotient, total, worked_out
+from thruster_env.numerics.algebra.folding import (
+    as_number,
+    difference,
+    divided,
+    floor_quotient,
+    modulus,
+    negative,
+    product,
+    quotient,
+    total,
+    worked_out,
+)
 from thruster_env.numerics.algebra.magnitudes import overflow_of, sign_of
 
 UNARY = ("sqrt", "exp", "log", "sin", "cos", "tan", "arctan", "tanh", "sinh", "cosh", "floor", "ceil")
 TWO_SIDED = {"+", "*"}  # operations whose arguments may change places
+COMPARISONS: dict[str, Callable] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+CONDITIONS = (*COMPARISONS, "and", "or")  # operations whose results are no floats
+JUMPS = (*COMPARISONS, "floor", "ceil", "rint", "fmod")  # operations whose results rounding may change by much
 REDUCTIONS = ("sum", "largest")  # operations that make one number of those of all members
 
 
@@ -57,6 +81,7 @@ class Graph:
         self.numbers: list[Number] = []
         self.size = size
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
+        self.exact = False  # whether a model's function is being traced: see `as_written`
         self._made: dict[tuple, Number] = {}
         self._most = most
 
@@ -71,7 +96,27 @@ class Graph:
             if operation in TWO_SIDED:
                 self._made[(operation, key[2], key[1])] = found
             self.numbers.append(found)
+        if self.exact and operation in JUMPS:
+            self._round_as_written(found)
         return found
+
+    @contextmanager
+    def as_written(self) -> Iterator[None]:
+        """Within this context numbers are those of Python: divisions, and all on which a jump depends."""
+        was, self.exact = self.exact, True
+        try:
+            yield
+        finally:
+            self.exact = was
+
+    def _round_as_written(self, jump: Number) -> None:
+        """Have machine code neither reorder nor contract what a jump is made of, up to a function's arguments."""
+        waiting = [jump]
+        while waiting:
+            one = waiting.pop()
+            if not one.exact and one.place not in self.whole and one.operation not in ("given", "constant"):
+                one.exact = True
+                waiting += one.of
 
     def given(self, name: Hashable, *, member: bool = False) -> Number:
         """A number that is known when the graph is worked out: its name, or where it lies."""
@@ -84,8 +129,8 @@ class Graph:
         return self.make("constant", float(value).hex())
 
     def number(self, value: Number | float) -> Number:
-        """A number, known now or not."""
-        return value if isinstance(value, Number) else self.constant(value)
+        """A number, known now or not; a condition as 1.0 or 0.0."""
+        return as_number(value) if isinstance(value, Number) else self.constant(value)
 
 
 class Number:
@@ -98,9 +143,21 @@ class Number:
         value: what a constant is; None for others.
         member: whether it is one number for each member of an ensemble.
         may_overflow, sign: what is known of its size, as `magnitudes` says.
+        exact: whether machine code rounds it as Python does.
     """
 
-    __slots__ = ("graph", "operation", "arguments", "of", "place", "value", "member", "may_overflow", "sign")
+    __slots__ = (
+        "graph",
+        "operation",
+        "arguments",
+        "of",
+        "place",
+        "value",
+        "member",
+        "may_overflow",
+        "sign",
+        "exact",
+    )
     sqrt: Callable[[], Number]  # and so on, as UNARY has them
     log: Callable[[], Number]
     floor: Callable[[], Number]
@@ -113,6 +170,7 @@ class Number:
         self.value = float.fromhex(arguments[0]) if operation == "constant" else None
         self.member: bool = operation not in REDUCTIONS and any([a.member for a in self.of])
         self.may_overflow, self.sign = overflow_of(operation, self.of), sign_of(operation, self.of, self.value)
+        self.exact = False
 
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"
@@ -120,50 +178,99 @@ class Number:
     def __bool__(self) -> bool:
         raise TypeError("a traced value has no truth value: use where(condition, a, b)")
 
+    @property
+    def is_condition(self) -> bool:
+        """Whether it is true or false, and no float yet."""
+        return self.operation in CONDITIONS
+
     def _with(self, other) -> Number | None:
         """The other one as a Number of this graph; None where it is no number."""
         if isinstance(other, Number):
-            return other
+            return as_number(other)
         return self.graph.constant(other) if isinstance(other, (int, float)) or _is_scalar(other) else None
 
+    def _of_two(self, work: Callable, other, turned: bool = False):
+        """What an operation makes of this number and another one, or of the two in turn."""
+        if (b := self._with(other)) is None:
+            return NotImplemented
+        return work(b, as_number(self)) if turned else work(as_number(self), b)
+
     def __add__(self, other):
-        return NotImplemented if (b := self._with(other)) is None else total(self, b)
+        return self._of_two(total, other)
 
     def __radd__(self, other):
-        return NotImplemented if (a := self._with(other)) is None else total(a, self)
+        return self._of_two(total, other, turned=True)
 
     def __sub__(self, other):
-        return NotImplemented if (b := self._with(other)) is None else difference(self, b)
+        return self._of_two(difference, other)
 
     def __rsub__(self, other):
-        return NotImplemented if (a := self._with(other)) is None else difference(a, self)
+        return self._of_two(difference, other, turned=True)
 
     def __mul__(self, other):
-        return NotImplemented if (b := self._with(other)) is None else product(self, b)
+        return self._of_two(product, other)
 
     def __rmul__(self, other):
-        return NotImplemented if (a := self._with(other)) is None else product(a, self)
+        return self._of_two(product, other, turned=True)
 
     def __truediv__(self, other):
-        return NotImplemented if (b := self._with(other)) is None else quotient(self, b)
+        return self._of_two(_over, other)
 
     def __rtruediv__(self, other):
-        return NotImplemented if (a := self._with(other)) is None else quotient(a, self)
+        return self._of_two(_over, other, turned=True)
 
     def __mod__(self, other):
-        return self - other * (self // other)
+        return self._of_two(modulus, other)
+
+    def __rmod__(self, other):
+        return self._of_two(modulus, other, turned=True)
 
     def __floordiv__(self, other):
-        return (self / other).floor()
+        return self._of_two(floor_quotient, other)
+
+    def __rfloordiv__(self, other):
+        return self._of_two(floor_quotient, other, turned=True)
+
+    def __lt__(self, other):
+        return self._compared("<", other)
+
+    def __le__(self, other):
+        return self._compared("<=", other)
+
+    def __gt__(self, other):
+        return self._compared(">", other)
+
+    def __ge__(self, other):
+        return self._compared(">=", other)
+
+    def __eq__(self, other):
+        return False if (found := self._compared("==", other)) is NotImplemented else found
+
+    def __ne__(self, other):
+        return True if (found := self._compared("!=", other)) is NotImplemented else found
+
+    def _compared(self, operation: str, other):
+        """A condition; of numbers that are known now whether it holds."""
+        if (b := self._with(other)) is None:
+            return NotImplemented
+        a = as_number(self)
+        if a.value is not None and b.value is not None:
+            return COMPARISONS[operation](a.value, b.value)
+        return self.graph.make(operation, a, b)
 
     def __neg__(self):
-        return negative(self)
+        return negative(as_number(self))
 
     def __pos__(self):
-        return self
+        return as_number(self)
 
     def __abs__(self):
         return worked_out("abs", self)
+
+    def __round__(self, digits=None):
+        if digits is not None:
+            raise TypeError("a traced value is rounded to whole numbers alone")
+        return worked_out("rint", self)
 
     def __pow__(self, power):
         if isinstance(power, Number):
@@ -179,29 +286,27 @@ class Number:
     def __rpow__(self, base):
         return self._with(base) ** self
 
-    def __lt__(self, other):
-        return self._compared("<", other)
+    def __divmod__(self, other):
+        return self // other, self % other
 
-    def __le__(self, other):
-        return self._compared("<=", other)
-
-    def __gt__(self, other):
-        return self._compared(">", other)
-
-    def __ge__(self, other):
-        return self._compared(">=", other)
-
-    def __eq__(self, other):
-        return False if (b := self._with(other)) is None else self.graph.make("==", self, b)
-
-    def __ne__(self, other):
-        return True if (b := self._with(other)) is None else self.graph.make("!=", self, b)
+    def __rdivmod__(self, other):
+        return other // self, other % self
 
     def __and__(self, other):
-        return self if other is True else self.graph.make("and", self, other)
+        return self._joined("and", other, known=False)
 
-    def _compared(self, sign: str, other):
-        return NotImplemented if (b := self._with(other)) is None else self.graph.make(sign, self, b)
+    def __or__(self, other):
+        return self._joined("or", other, known=True)
+
+    __rand__, __ror__ = __and__, __or__
+
+    def _joined(self, operation: str, other, known: bool):
+        """Both conditions, or one of them; one that is known now decides, or the other one does."""
+        if isinstance(other, (bool, np.bool_)):
+            return known if other == known else self
+        if not (self.is_condition and isinstance(other, Number) and other.is_condition):
+            raise TypeError("floats have no bits: & and | join comparisons")
+        return self.graph.make(operation, self, other)
 
 
 def _unary(name: str):
@@ -217,6 +322,10 @@ for _name in UNARY:
 Number.__floor__, Number.__ceil__ = Number.floor, Number.ceil  # type: ignore[attr-defined]
 
 
+def _over(a: Number, b: Number) -> Number:
+    return divided(a, b) if a.graph.exact else quotient(a, b)
+
+
 def _is_scalar(value) -> bool:
     return isinstance(value, np.generic) or isinstance(value, np.ndarray) and not value.shape
 
@@ -226,6 +335,10 @@ def where(condition, a, b):
     known = next((one for one in (condition, a, b) if isinstance(one, Number)), None)
     if not isinstance(condition, Number):
         return a if condition else b
+    if condition.value is not None:
+        return a if condition.value else b
+    if not condition.is_condition:
+        condition = condition != 0.0
     a, b = known._with(a), known._with(b)  # type: ignore[union-attr]
     return a if a is b else condition.graph.make("where", condition, a, b)
 

@@ -7,6 +7,7 @@ of numbers, one of each run, so that nobody has to find out whether some loop co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -14,15 +15,16 @@ from numba.core import cgutils, types, typing
 from numba.extending import lower_builtin, type_callable
 from numba.np.arrayobj import populate_array
 
-from thruster_env.numerics.algebra.graphs import Number
+from thruster_env.numerics.algebra.graphs import COMPARISONS, Number
 from thruster_env.numerics.algebra.programs import BY_MEMBERS, CALLED, SIDE_BY_SIDE, Place, Program
 from thruster_env.numerics.compiled import FASTMATH
 from thruster_env.numerics.exponential import ROUNDER, ROUNDER_BITS
 
 FLAGS = tuple(sorted(FASTMATH))
+EXACT = ("nsz",)  # of what is rounded as Python does: to operations without flags numba adds all
 OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
 OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "abs": "fabs", "pow": "pow"} | {
-    name: name for name in ("floor", "ceil")
+    name: name for name in ("floor", "ceil", "rint", "copysign")
 }  # functions of vectors; others are called for each run
 IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2"}  # other names than NumPy's in C's library
 DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
@@ -115,10 +117,11 @@ class Writer:
         if operation in self.values_of:
             return self.values_of[operation]
         values = [self.values[one.place] for one in number.of]
+        flags = EXACT if number.exact or operation == "/" and number.of[0].value != 1.0 else FLAGS
         if operation in OF_TWO:
-            return getattr(builder, OF_TWO[operation])(*values, flags=FLAGS)
+            return getattr(builder, OF_TWO[operation])(*values, flags=flags)
         if operation == "negative":
-            return builder.fneg(*values, flags=FLAGS)
+            return builder.fneg(*values, flags=flags)
         if operation == "where":
             return builder.select(*values)
         if operation == "call":
@@ -127,13 +130,40 @@ class Writer:
             return values[0][number.arguments[1]]
         if operation == "and":
             return builder.and_(*values)
+        if operation == "or":
+            return builder.or_(*values)
         if operation == "two_to":
             return self._two_to(*values)
+        if operation == "hypot":
+            return self._length(*values)
         if operation == "!=":
             return builder.fcmp_unordered(operation, *values)
-        if operation in ("<", "<=", ">", ">=", "=="):
+        if operation in COMPARISONS:
             return builder.fcmp_ordered(operation, *values)
-        return self._called(operation, values)
+        return self._called(operation, values, flags)
+
+    def _length(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """The root of x^2 + y^2, of numbers scaled by the larger one where squares would leave float64."""
+        builder = self._builder
+
+        def times(a, b):
+            return builder.fmul(a, b, flags=FLAGS)
+
+        def root_of_squares(a, b):
+            square = builder.fadd(times(a, a), times(b, b), flags=FLAGS)
+            return square, self._called("sqrt", [square], FLAGS)
+
+        least, most, one, none, infinite = (
+            ir.Constant(self._vector, [value] * self._width) for value in (1e-280, 1e300, 1.0, 0.0, math.inf)
+        )
+        square, root = root_of_squares(x, y)
+        usual = builder.and_(builder.fcmp_ordered(">", square, least), builder.fcmp_ordered("<", square, most))
+        x_size, y_size = (self._called("abs", [value], FLAGS) for value in (x, y))
+        scale = builder.select(builder.fcmp_ordered(">", x_size, y_size), x_size, y_size)
+        divides = builder.and_(builder.fcmp_ordered(">", scale, none), builder.fcmp_ordered("<", scale, infinite))
+        scale = builder.select(divides, scale, one)
+        _, scaled = root_of_squares(*(builder.fdiv(value, scale, flags=EXACT) for value in (x, y)))
+        return builder.select(usual, root, times(scale, scaled))
 
     def _two_to(self, whole: ir.Value) -> ir.Value:
         """2^k of whole numbers k, whose last bits become the exponent's."""
@@ -167,11 +197,11 @@ class Writer:
                 found[i] = builder.insert_element(found[i], builder.load(pointer, typ=DOUBLE), at)
         return found
 
-    def _called(self, name: str, values: list[ir.Value]) -> ir.Value:
+    def _called(self, name: str, values: list[ir.Value], flags: Sequence[str]) -> ir.Value:
         builder, module = self._builder, self._builder.module
         if name in OF_LLVM:
             function = _declared(module, f"llvm.{OF_LLVM[name]}.v{self._width}f64", self._vector, len(values))
-            return builder.call(function, values, fastmath=FLAGS)
+            return builder.call(function, values, fastmath=flags)
         function, found = _declared(module, IN_LIBRARY.get(name, name), DOUBLE, len(values)), values[0]
         for k in range(self._width):
             at = ir.Constant(ir.IntType(32), k)

@@ -17,7 +17,7 @@ UNKNOWN, NEVER_NEGATIVE, POSITIVE = range(3)
 
 def overflow_of(operation: str, of: Sequence[Number]) -> bool:
     """Whether the result of an operation may be infinite for numbers of usual size, or is made of such."""
-    divided = operation == "/" and of[1].sign != POSITIVE
+    divided = operation == "/" and of[1].sign != POSITIVE and not of[1].value
     return divided or operation in GROWING or any([one.may_overflow for one in of])
 
 
@@ -29,6 +29,6 @@ def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
         return max(of[0].sign, of[1].sign) if of[0].sign and of[1].sign else UNKNOWN
     if operation == "*":
         return max(NEVER_NEGATIVE, of[0].sign) if of[0] is of[1] else min(of[0].sign, of[1].sign)
-    if operation in ("sqrt", "abs"):
-        return max(NEVER_NEGATIVE, of[0].sign)
+    if operation in ("sqrt", "abs", "hypot"):
+        return max(NEVER_NEGATIVE, *[one.sign for one in of])
     return {"exp": NEVER_NEGATIVE, "cosh": POSITIVE}.get(operation, UNKNOWN)

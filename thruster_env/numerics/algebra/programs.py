@@ -35,11 +35,11 @@ OF_MEMBERS = (
 )  # arguments of programs with loops over members
 BY_MEMBERS = ("table", "draws")  # of these, those with a row for each number and a column for each member
 SIDE_BY_SIDE = ("rows", "change", "given")  # of all, those with a number for each run at each place
-DECISIONS = ("<", "<=", ">", ">=", "==", "!=", "and")  # operations whose results are no floats
 SPECIAL = {
     "negative": "-{}",
     "pow": "{} ** {}",
     "and": "{} & {}",
+    "or": "{} | {}",
     "sum": "over_members({}, size)",
     "largest": "largest_of_members({}, size)",
     "size": "float(size)",
@@ -79,7 +79,7 @@ class Program(NamedTuple):
         lines = [f"{names[one.place]} = {'+' * (place.array in copied)}{place}" for place, one in self.reads]
         for one in self.works:
             values = [names[a.place] if isinstance(a, Number) else a for a in one.arguments]
-            lines.append(f"{names[one.place]} = {_expression(one.operation, values)}")
+            lines.append(f"{names[one.place]} = {_expression(one.operation, values)}{'  # exact' * one.exact}")
         return lines + [f"{place} = {names[one.place]}" for place, one in self.stores]
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from thruster_env.numerics.algebra.graphs import Number, needed_by, where
+from thruster_env.numerics.algebra.graphs import CONDITIONS, Number, needed_by, where
 from thruster_env.numerics.algebra.magnitudes import POSITIVE
 
 Slope = Number | None  # None of a number that does not move
@@ -90,6 +90,16 @@ def _of_angle(y, a, b, da, db):
     return _unless_zero(square, slope)
 
 
+def _of_length(y, a, b, da, db):
+    """Half the slope of the square over the length; 0 at zero, as in between."""
+    products = times(da, lambda: a), times(db, lambda: b)
+    return _unless_zero(y, 0.5 * added(*map(_twice, products)) / y)
+
+
+def _twice(slope: Slope) -> Slope:
+    return None if slope is None else slope + slope
+
+
 def _none(y, *others):
     """Of what is constant but for jumps."""
     return None
@@ -115,5 +125,8 @@ _RULES: dict[str, Callable] = {
     "pow": _of_power,
     "arctan2": _of_angle,
     "where": _of_choice,
-    **dict.fromkeys(("floor", "ceil", "<", "<=", ">", ">=", "==", "!=", "and"), _none),
+    "hypot": _of_length,
+    "fmod": lambda y, a, b, da, db: added(da, times(db, lambda: (y - a) / b)),
+    "copysign": lambda y, a, b, da, db: times(da, lambda: where(a < 0.0, -1.0, 1.0) * where(y < 0.0, -1.0, 1.0)),
+    **dict.fromkeys((*CONDITIONS, "floor", "ceil", "rint"), _none),
 }

@@ -15,12 +15,14 @@ from __future__ import annotations
 
 import builtins
 import math
+import operator
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
+from thruster_env.numerics.algebra.folding import worked_out
 from thruster_env.numerics.algebra.graphs import UNARY, Number, arctan2, where
 
 OTHER_NAMES = {
@@ -29,17 +31,24 @@ OTHER_NAMES = {
     "fabs": "absolute",
     "abs": "absolute",
     "pow": "power",
+    "mod": "remainder",
+    "around": "round",
+    "rint": "round",
+    "fix": "trunc",
+    "deg2rad": "radians",
+    "rad2deg": "degrees",
 }
-"""NumPy's names of functions of `math`."""
+"""NumPy's names of functions of `math`, and one of those that it has twice."""
 
 
-def _of_number(name: str) -> Callable:
-    def function(x):
-        if isinstance(x, np.ndarray) and x.dtype == object:
-            return np.array([function(one) for one in x.ravel()], dtype=object).reshape(x.shape)
-        return getattr(x, name)() if isinstance(x, Number) else getattr(np, name)(x)
+def _operation(name: str) -> Callable:
+    return lambda *numbers: worked_out(name, *_numbers(*numbers))
 
-    return function
+
+def _numbers(*values) -> list[Number]:
+    """Values as Numbers of the graph of those that are."""
+    graph = next(one for one in values if isinstance(one, Number)).graph
+    return [graph.number(one) for one in values]
 
 
 def _largest(*numbers):
@@ -56,35 +65,139 @@ def _smallest(*numbers):
     return found
 
 
+def _extreme(choose: Callable) -> Callable:
+    """The larger or smaller one of two as NumPy has it: NaN if one of them is."""
+
+    def function(a, b):
+        if not isinstance(a, Number) or a.value is not None:
+            a, b = b, a
+        return where(b == b, choose(a, b), b)
+
+    return function
+
+
+def _hypotenuse(x, y=0.0, *others):
+    found = worked_out("hypot", *_numbers(x, y))
+    return _hypotenuse(found, *others) if others else found
+
+
+def _clipped(x, a_min=None, a_max=None, *, min=None, max=None):
+    low, high = a_min if min is None else min, a_max if max is None else max
+    x = x if low is None else FUNCTIONS["maximum"](x, low)
+    return x if high is None else FUNCTIONS["minimum"](x, high)
+
+
+def _rounded(x, decimals=0):
+    """A number with some decimals, as NumPy rounds."""
+    unit = 10.0 ** abs(decimals)
+    if decimals > 0:
+        return round(x * unit) / unit
+    return round(x / unit) * unit if decimals < 0 else round(x)
+
+
+def _nearest_rest(x, n):
+    """The rest of x/n rounded to the nearest whole number, of two such the even one, as IEEE 754 has it."""
+    x, n = _numbers(x, n)
+    size = abs(n)
+    rest = abs(worked_out("fmod", x, 2.0 * size))
+    once = where(rest > 0.5 * size, rest - size, rest)
+    rest = where((rest > 0.5 * size) & (once >= 0.5 * size), once - size, once)
+    return where(x < 0.0, -rest, rest)
+
+
+def _step(x, at_zero):
+    return where(x > 0.0, 1.0, where(x == 0.0, at_zero, where(x < 0.0, 0.0, x)))
+
+
+def _condition(x):
+    """Whether a number is not zero."""
+    return (x if x.is_condition else x != 0.0) if isinstance(x, Number) else bool(x)
+
+
 def _filled(value: float) -> Callable:
     """In place of NumPy's zeros and ones: an array that Numbers may be written to."""
     return lambda shape, *_, **__: np.full(shape, value, dtype=object)
 
 
 FUNCTIONS: dict[str, Callable] = {
-    **{name: _of_number(name) for name in UNARY},
+    **{name: _operation(name) for name in (*UNARY, "fmod", "copysign")},
     "absolute": abs,
     "power": lambda x, e: x**e,
     "square": lambda x: x * x,
-    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
-    "sign": lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, 0.0)),
+    "hypot": _hypotenuse,
+    "sign": lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, where(x == x, 0.0, math.nan))),
     "where": where,
     "arctan2": arctan2,
-    "maximum": _largest,
-    "minimum": _smallest,
-    "zeros": _filled(0.0),
-    "empty": _filled(0.0),
-    "ones": _filled(1.0),
-    "float64": lambda x: x,
+    "maximum": _extreme(_largest),
+    "minimum": _extreme(_smallest),
+    "fmax": lambda a, b: where(a == a, _largest(a, b), b),
+    "fmin": lambda a, b: where(a == a, _smallest(a, b), b),
+    "clip": _clipped,
+    "remainder": operator.mod,
+    "floor_divide": operator.floordiv,
+    "trunc": lambda x: where(x < 0.0, x.ceil(), x.floor()),
+    "round": _rounded,
+    "heaviside": _step,
+    "degrees": lambda x: x * (180.0 / math.pi),
+    "radians": lambda x: x * (math.pi / 180.0),
+    "isnan": lambda x: x != x,
+    "isinf": lambda x: abs(x) == math.inf,
+    "isfinite": lambda x: abs(x) < math.inf,
+    "logical_and": lambda a, b: _condition(a) & _condition(b),
+    "logical_or": lambda a, b: _condition(a) | _condition(b),
+    "logical_xor": lambda a, b: _condition(a) != _condition(b),
+    "logical_not": lambda a: a == 0.0,
+    "greater": operator.gt,
+    "greater_equal": operator.ge,
+    "less": operator.lt,
+    "less_equal": operator.le,
+    "equal": operator.eq,
+    "not_equal": operator.ne,
+    "float64": lambda x: +x,
 }
-"""In place of functions of `math` and NumPy, by NumPy's names."""
+"""In place of functions of `math` and NumPy, by NumPy's names, where they get a Number."""
+
+OF_MATH: dict[str, Callable] = {
+    "remainder": _nearest_rest,
+    "dist": lambda p, q: _hypotenuse(*(a - b for a, b in zip(p, q, strict=True))),
+    "fsum": sum,
+}
+"""In place of functions of `math` that NumPy has otherwise, or has not."""
+
+ARRAYS: dict[str, Callable] = {"zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0)}
+"""In place of functions of NumPy, whatever they get."""
 
 BUILTINS = {
     "max": _largest,
     "min": _smallest,
-    "float": lambda x: x if isinstance(x, Number) else float(x),
+    "float": lambda x: +x if isinstance(x, Number) else float(x),
+    "bool": _condition,
     "pow": pow,
 }
+
+
+def _in_place_of(module: types.ModuleType, name: str):
+    """What traced functions find under a name in `math` or NumPy."""
+    value, name = getattr(module, name), OTHER_NAMES.get(name, name)
+    ours = (OF_MATH if module is math else ARRAYS).get(name) or FUNCTIONS.get(name)
+    if ours is None or name in ARRAYS:
+        return ours or value
+
+    def function(*arguments, **named):
+        if not any(map(_has_numbers, arguments)):
+            return value(*arguments, **named)
+        if module is math or not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
+            return ours(*arguments, **named)
+        of_arrays = np.frompyfunc(lambda *entries: ours(*entries, **named), len(arguments), 1)
+        return of_arrays(*(np.asarray(one, dtype=object) for one in arguments))
+
+    return function
+
+
+def _has_numbers(value) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype == object
+    return isinstance(value, Number) or isinstance(value, (list, tuple)) and any(map(_has_numbers, value))
 
 
 class _Module:
@@ -94,23 +207,43 @@ class _Module:
         self._module = module
 
     def __getattr__(self, name: str):
-        return FUNCTIONS.get(OTHER_NAMES.get(name, name)) or getattr(self._module, name)
+        return _in_place_of(self._module, name)
 
 
 def traced(function: Callable) -> Callable:
     """A copy of a function that takes Numbers; it raises TypeError where they do not do for floats."""
-    return _traced(function, {})
+    copy = _traced(function, {})
+
+    def as_written(*arguments):
+        known = next(_numbers_in(arguments), None)
+        if known is None:
+            return copy(*arguments)
+        with known.graph.as_written():
+            return copy(*arguments)
+
+    return as_written
+
+
+def _numbers_in(value) -> Iterator[Number]:
+    """Numbers among arguments, of which some are tuples or arrays of such."""
+    if isinstance(value, Number):
+        yield value
+    elif isinstance(value, (tuple, list)) or isinstance(value, np.ndarray) and value.dtype == object:
+        for one in value:
+            yield from _numbers_in(one)
 
 
 def _traced(value: Any, copies: dict[int, Any]) -> Any:
     """A value that a function finds under a name, as its copy shall find it."""
     if isinstance(value, types.ModuleType) and value in (math, np):
         return _Module(value)
+    name = getattr(value, "__name__", "")
+    for module in (math, np):
+        if callable(value) and value is getattr(module, name, None):
+            return _in_place_of(module, name)
     function = getattr(value, "py_func", value)  # of a function compiled by numba
     if not isinstance(function, types.FunctionType):
-        name = getattr(value, "__name__", "")
-        ours = callable(value) and (value is getattr(math, name, None) or value is getattr(np, name, None))
-        return FUNCTIONS.get(OTHER_NAMES.get(name, name), value) if ours else value
+        return value
     if id(function) not in copies:
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         names = vars(builtins) | BUILTINS | {"__builtins__": builtins}  # which what NumPy imports late asks for
