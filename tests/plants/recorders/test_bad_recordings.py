@@ -92,7 +92,7 @@ def test_a_file_that_is_cut_off_or_damaged_is_read_in_part_or_refused(tmp_path, 
             np.testing.assert_array_equal(some.values, whole[name].values[: len(some.values)])
         elif ending not in (".ulg", ".bin"):
             refused(path)
-    for _ in range(40):
+    for _ in range(40 if ending != ".h5" else 12):  # which a process of its own reads each time
         damaged = bytearray(data)
         for place in rng.integers(0, len(data), 8):
             damaged[place] = rng.integers(256)

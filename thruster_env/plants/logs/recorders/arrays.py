@@ -42,7 +42,8 @@ def topics_of(
             vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
     known: dict[str, np.ndarray] = {}
     if wanted is None:
-        refused = {name: why for name, one in found.items() if (why := _why_not(one))}
+        within = {name[:place] for name in found for place, letter in enumerate(name) if letter in "({"}
+        refused = {name: why for name, one in found.items() if (why := _why_not(one)) and name not in within}
         yield from [Topic("", None, {}, unread=refused)] if refused else []
     for name, one in found.items():
         if wanted is not None and not any(each == name or each.startswith(f"{name}[") for each in wanted):
@@ -59,7 +60,18 @@ def topics_of(
         if math.prod(one.shape) > MOST_COLUMNS * along:
             continue
         group, _, field = name.rpartition(".")
-        values = _read(name, one, path)
+        try:
+            values = _read(name, one, path)
+        except Refused:
+            raise
+        except Exception as error:  # of this one alone
+            why = " ".join(str(error).split())[:160] or type(error).__name__
+            if wanted is not None:
+                raise Refused(
+                    f"a field must be one that can be read, but {name!r} is not: {why} ({path})"
+                ) from None
+            yield Topic("", None, {}, unread={name: f"damaged: {why}"})
+            continue
         values = values if values.shape[0] == along else values.T
         fields = columns_of(field, values)
         said = unit(one)
@@ -77,7 +89,7 @@ def _why_not(one: Any) -> str:
     """Why an array is not read, empty if it may be."""
     if isinstance(one, str):
         return one
-    return "" if one.dtype.kind in NUMERIC else f"of {one.dtype}"
+    return "" if one.dtype.kind in NUMERIC else getattr(one, "what", f"of {one.dtype}")
 
 
 def _size(one: Any) -> tuple[int, int] | None:

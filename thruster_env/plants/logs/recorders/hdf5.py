@@ -1,30 +1,38 @@
-"""HDF5 and MATLAB's version 7.3, by the package h5py: arrays in groups, beside a vector of times."""
+"""HDF5 and MATLAB's version 7.3, by the package h5py in a process of its own: arrays beside a vector of times."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thruster_env.plants.logs.recorders import topics as limits
 from thruster_env.plants.logs.recorders.arrays import NUMERIC, topics_of
-from thruster_env.plants.logs.recorders.topics import MOST_BYTES, Topic, Wanted, package, reading
+from thruster_env.plants.logs.recorders.topics import Topic, Wanted, package, reading
 
 KIND = "HDF5 file"
 MAGIC = b"\x89HDF\r\n\x1a\n"
-OBJECT, SPARSE = "MATLAB_object_decode", "MATLAB_sparse"  # attributes
-REFERENCES = "#refs#"  # where MATLAB keeps what its cells and objects hold
-DEEPEST = 16  # groups within groups
-MOST_OBJECTS = 20_000  # of a file
+SCRIPT = Path(__file__).with_name("hdf5_process.py")
+UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
+MISSING = ("_fillvalue", "missing_value")
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The numeric arrays of one or two dimensions, by group: GROUP.GROUP.DATASET; see `arrays.topics_of`.
 
-    A unit is the attribute `units` or `unit` of a dataset. No link is followed, neither within the file nor to
-    another one, and no object, reference or text is read; a dataset whose numbers lie in other files is none.
+    A unit is the attribute `units` or `unit` of a dataset, in any case, a text or an array of one. Numbers are
+    `scale_factor` times what is stored plus `add_offset`, NaN where that is `_FillValue` or `missing_value`. Of
+    MATLAB's version 7.3, arrays of structures and cells are STRUCT(1).FIELD and CELL{1}. No link is followed,
+    neither within the file nor to another one, and no object or text is read; a dataset whose numbers lie in other
+    files is none. A process of its own reads the file, since the library breaks off at some that are damaged.
 
     Args:
         path: of the file.
@@ -32,71 +40,115 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
 
     Raises:
         ValueError: if it is no HDF5 file, or its arrays are larger than may be read.
+
+    Source: "NetCDF Climate and Forecast (CF) Metadata Conventions", 1.11, sections 2.5.1 and 8.1.
     """
-    h5py = package("h5py", KIND, path)
-    with reading(KIND, path), h5py.File(path, "r") as file:
-        found: dict[str, Any] = {}
-        _walk(h5py, file, "", found, {h5py.h5o.get_info(file["/"].id).addr})
-        yield from topics_of(found, path, wanted, _unit)
+    if find_spec("h5py") is None:
+        package("h5py", KIND, path)  # which says how to install it
+    with reading(KIND, path), _process(path) as process:
+        yield from topics_of(process.datasets, path, wanted, _unit)
 
 
-def _walk(h5py: Any, group: Any, name: str, found: dict[str, Any], seen: set[int]) -> None:
-    """Collect the datasets of a group and of groups in it by name, each once; a text says why one is none."""
-    for key in group:
-        own = f"{name}.{key}" if name else key
-        if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-            found[own] = "a link"
-            continue
-        one = group[key]
-        number = h5py.h5o.get_info(one.id).addr
-        if number in seen or key == REFERENCES:
-            continue
-        seen.add(number)
-        if len(seen) > MOST_OBJECTS:
-            raise ValueError(f"it has more than {MOST_OBJECTS} objects")
-        if isinstance(one, h5py.Group):
-            if OBJECT in one.attrs or SPARSE in one.attrs:
-                found[own] = "an object or a sparse matrix of MATLAB's"
-            elif own.count(".") < DEEPEST:
-                _walk(h5py, one, own, found, seen)
-        elif isinstance(one, h5py.Dataset):
-            found.update(_datasets(own, one))
+class Dataset:
+    """A dataset in a file that another process reads."""
+
+    def __init__(self, process: Process, number: int, told: Mapping[str, Any]):
+        """Keep what is known of it; nothing is read."""
+        self._process, self._number = process, number
+        self.shape = tuple(int(one) for one in told["shape"])
+        self.dtype = np.dtype(told["dtype"] if told["kind"] in NUMERIC else object)
+        self.what = f"of {told['dtype']}"
+        self.attributes = {key.lower(): value for key, value in told["attributes"].items()}
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Read all of it, in its unit."""
+        stored = self._process.read(self._number)
+        absent = [_number(self.attributes[name]) for name in MISSING if name in self.attributes]
+        scale, offset = (_number(self.attributes.get(name)) for name in (SCALE, OFFSET))
+        if scale is None and offset is None and not absent:
+            return stored
+        values = stored * (1.0 if scale is None else scale) + (0.0 if offset is None else offset)
+        for one in absent:
+            values = np.where(stored == one, np.nan, values)
+        return values
 
 
-def _datasets(name: str, one: Any) -> dict[str, Any]:
-    """A dataset by name, or its columns where it is a table."""
-    if OBJECT in one.attrs:
-        return {name: "an object of MATLAB's"}
-    if one.is_virtual or one.external:
-        return {name: "kept in another file"}
-    if one.chunks is not None and math.prod(one.chunks) * one.dtype.itemsize > MOST_BYTES:
-        return {name: "packed in parts that are too large"}
-    if one.attrs.get("MATLAB_empty", 0) or one.attrs.get("MATLAB_class") == b"char" or one.shape is None:
-        return {}
-    if one.dtype.names is None:
-        return {name: one}
-    return {f"{name}.{field}": Member(one, field) for field in one.dtype.names if one.dtype[field].kind in NUMERIC}
+class Process:
+    """The other process, and the datasets of the file that it has opened."""
+
+    def __init__(self, child: subprocess.Popen, path: Path):
+        """Open a file and list its datasets."""
+        self._child = child
+        request = {"path": str(path.absolute()), "memory": limits.MOST_MEMORY, "bytes": limits.MOST_BYTES}
+        told = self._ask(json.dumps(request))["datasets"]
+        self.datasets: dict[str, Any] = {
+            name: one if isinstance(one, str) else Dataset(self, number, one)
+            for number, (name, one) in enumerate(told.items())
+        }
+
+    def read(self, number: int) -> np.ndarray:
+        """The numbers of a dataset, as they are stored."""
+        told = self._ask(str(number))
+        kind = np.dtype(str(told["dtype"]))
+        if kind.kind not in NUMERIC:
+            raise ValueError(f"numbers of {kind}")
+        values = np.empty(tuple(told["shape"]), kind)
+        left = memoryview(values.reshape(-1)).cast("B")
+        while len(left):
+            count = self._child.stdout.readinto(left)  # type: ignore[union-attr]
+            if not count:
+                raise ValueError(self._end())
+            left = left[count:]
+        return values
+
+    def _ask(self, line: str) -> dict[str, Any]:
+        try:
+            self._child.stdin.write(line.encode() + b"\n")  # type: ignore[union-attr]
+            self._child.stdin.flush()  # type: ignore[union-attr]
+        except BrokenPipeError:
+            raise ValueError(self._end()) from None
+        answer = self._child.stdout.readline()  # type: ignore[union-attr]
+        if not answer.endswith(b"\n"):
+            raise ValueError(self._end())
+        told = json.loads(answer)
+        if "error" in told:
+            raise ValueError(told["error"])
+        return told
+
+    def _end(self) -> str:
+        """Why the other process has ended, in words."""
+        code = self._child.wait()
+        why = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return f"the HDF5 library breaks off at it ({why})"
 
 
-class Member:
-    """A column of numbers of a dataset that is a table."""
+@contextmanager
+def _process(path: Path) -> Iterator[Process]:
+    """A process that has opened a file."""
+    command = [sys.executable, "-P", str(SCRIPT)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as child:
+        try:
+            yield Process(child, path)
+        finally:
+            child.kill()
 
-    def __init__(self, table: Any, field: str):
-        """Keep both; nothing is read."""
-        self.table, self.field = table, field
-        self.shape, self.dtype = table.shape, table.dtype[field]
-        self.attrs: dict[str, str] = {}
 
-    def __getitem__(self, key: tuple) -> np.ndarray:
-        """Read the column."""
-        return self.table.fields(self.field)[key]
+def _number(value: Any) -> float | int | None:
+    """An attribute that is a number, or an array of one; None for none."""
+    value = value[0] if isinstance(value, list) and len(value) == 1 else value
+    if value is None or isinstance(value, int | float):
+        return value
+    raise ValueError(f"the attribute {value!r} is no number")
 
 
-def _unit(one: Any) -> str:
+def _unit(one: Dataset) -> str:
     """The unit that a dataset says it has; of "seconds since 2026-05-01", as of CF conventions, "seconds"."""
-    for name in ("units", "unit"):
-        text = one.attrs.get(name)
-        text = text.decode("utf-8", "replace") if isinstance(text, bytes) else text
-        if isinstance(text, str):
-            return text.partition(" since ")[0].strip()
+    for name in UNITS:
+        value = one.attributes.get(name)
+        while isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        if isinstance(value, str):
+            return value.partition(" since ")[0].strip()
     return ""
