@@ -204,12 +204,25 @@ def test_an_array_that_is_said_to_be_huge_is_refused_before_it_is_read(tmp_path)
 
 
 def test_what_unpacks_to_more_than_may_be_read_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("thruster_env.plants.logs.recorders.mat_elements.MOST_BYTES", 10**7)
     monkeypatch.setattr(topics, "MOST_BYTES", 10**7)
-    packed = zlib.compress(bytes(3 * 10**7))
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-    (tmp_path / "a.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
-    refused(tmp_path / "a.mat", "what a MATLAB file holds must be at most 1e.07 bytes, but got [1-2]")
+    for tag, size, said in (
+        (
+            struct.pack("<II", 14, 15_000_000),
+            15_000_000,
+            "what a MATLAB file holds must be at most 1e.07 bytes, but got [1-2]",
+        ),
+        (
+            struct.pack("<II", 14, 2**32 - 8),
+            10,
+            "what a MATLAB file holds must be at most 1e.07 bytes, but got 4.29e.09",
+        ),
+        (struct.pack("<II", 0, 0), 3 * 10**7, "it holds a damaged element"),  # says 0: no more is unpacked
+        (struct.pack("<II", 14, 1000), 10, "it holds a damaged element"),
+    ):
+        packed = zlib.compress(tag + bytes(size))
+        (tmp_path / "a.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
+        refused(tmp_path / "a.mat", said)
     write_ulog(tmp_path / "a.ulg", [("v", 0, "float x;", {"timestamp": np.arange(9), "x": np.arange(9)})])
     monkeypatch.setattr(topics, "MOST_BYTES", 100)
     refused(tmp_path / "a.ulg", "a ULog must be at most 100 bytes, but got")

@@ -20,6 +20,7 @@ NUMERIC = "biuf"  # NumPy's kinds
 OBJECT, SPARSE = "MATLAB_object_decode", "MATLAB_sparse"  # attributes
 CLASS, EMPTY = "MATLAB_class", "MATLAB_empty"
 REFERENCES = "#refs#"  # where MATLAB keeps what its cells and arrays of structures hold
+MANY = {"{}": "a cell array", "()": "an array of structures"}
 DEEPEST = 16  # groups within groups
 MOST_OBJECTS = 20_000  # of a file
 SECONDS = 600  # of processor time
@@ -89,12 +90,10 @@ class Walk:
 
     def _referred(self, one: Any, name: str, depth: int, brackets: str) -> None:
         """Add what the entries of a cell array, or those of a field of an array of structures, refer to."""
-        what = "a cell array" if brackets == "{}" else "a field of an array of structures"
-        if one.size > MOST_OBJECTS or depth >= DEEPEST:
-            self.found[name] = f"{what} of {one.size} entries"
-            return
-        self.found[name] = what
         group, _, field = name.rpartition(".")
+        self.found[name if brackets == "{}" else group] = MANY[brackets]
+        if one.size > MOST_OBJECTS or depth >= DEEPEST:
+            return
         for place, reference in enumerate(
             np.asarray(one[()]).reshape(-1), 1
         ):  # MATLAB counts along columns, from 1

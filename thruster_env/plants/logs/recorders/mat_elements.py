@@ -10,16 +10,16 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from thruster_env.plants.logs.recorders.topics import MOST_BYTES, check_bytes
+from thruster_env.plants.logs.recorders.topics import MOST_FIELDS, check_bytes
 
 HEADER = 128  # bytes of a file
 MATRIX, COMPRESSED = 14, 15  # types of elements
 INT8, INT32, UINT32, UTF8 = 1, 5, 6, 16
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by type
 TEXTS = (16, 17, 18)
-STRUCTURE, NUMERIC, OPAQUE = 2, range(6, 16), 17  # classes of arrays
+CELL, STRUCTURE, NUMERIC, OPAQUE = 1, 2, range(6, 16), 17  # classes of arrays
 OTHERS = {
-    1: "a cell array",
+    CELL: "a cell array",
     STRUCTURE: "an array of structures",
     4: "text",
     5: "a sparse matrix",
@@ -28,11 +28,15 @@ OTHERS = {
 COMPLEX = 0x0800  # among the flags
 MOST_SIDES = 32
 DEEPEST = 32
+TAG = 8  # bytes of type and size before an element
 PIECE = 2**20  # bytes
+WHOLE = "what a MATLAB file holds"
 
 
 def arrays_of(path: Path) -> dict[str, Any]:
-    """Arrays by "STRUCTURE.FIELD", or a text that says why one is not read.
+    """Arrays by "STRUCTURE.FIELD", "STRUCTURES(2).FIELD" or "CELL{2}", or a text that says why one is not read.
+
+    MATLAB counts the entries of arrays of structures and of cells from 1, along their columns.
 
     Raises:
         ValueError: for a file that is cut off, damaged, or unpacks to more than may be read.
@@ -50,29 +54,40 @@ def arrays_of(path: Path) -> dict[str, Any]:
             if file.tell() + count > size:
                 raise ValueError("it ends within an array")
             if kind == COMPRESSED:
-                data = _unpacked(file, count, MOST_BYTES - total)
+                data = _unpacked(file, count, order, total, path)
             else:
+                check_bytes(total + count, WHOLE, path)
                 data = tag + file.read(count)
             total += len(data)
-            check_bytes(total, "what a MATLAB file holds", path)
             for element in _elements(data, 0, len(data), order):
                 _add(data, element, order, "", found, path)
     return found
 
 
-def _unpacked(file: BinaryIO, count: int, most: int) -> bytes:
-    """What an element unpacks to, as far as just above the most bytes."""
-    packed, out = zlib.decompressobj(), bytearray()
-    while count > 0 and len(out) <= most:
-        piece = file.read(min(count, PIECE))
-        count -= len(piece)
-        while piece and len(out) <= most:
-            out += packed.decompress(piece, PIECE)
-            piece = packed.unconsumed_tail
-    return bytes(out)
+def _unpacked(file: BinaryIO, count: int, order: str, total: int, path: Path) -> bytearray:
+    """What an element unpacks to, as much as its first bytes say; the total is of those before [bytes]."""
+    packed, place = zlib.decompressobj(), 0
+    out = bytearray(TAG)
+    end = file.tell() + count
+    piece = b""
+    while place < len(out) and (piece or file.tell() < end):
+        piece = piece or file.read(min(end - file.tell(), PIECE))
+        data = packed.decompress(piece, min(len(out) - place, PIECE))
+        piece = packed.unconsumed_tail
+        out[place : place + len(data)] = data
+        place += len(data)
+        if place == TAG == len(out):
+            size = struct.unpack(f"{order}II", out)[1]
+            check_bytes(total + TAG + size, WHOLE, path)
+            out += bytes(size)
+        if packed.eof or not (data or piece or file.tell() < end):
+            break
+    file.seek(end)
+    del out[place:]
+    return out
 
 
-def _elements(data: bytes, begin: int, end: int, order: str) -> list[tuple[int, int, int]]:
+def _elements(data: bytes | bytearray, begin: int, end: int, order: str) -> list[tuple[int, int, int]]:
     """Type, place and bytes of the elements that follow one another; ValueError unless they are sound."""
     parts, place = [], begin
     while place < end:
@@ -90,11 +105,16 @@ def _elements(data: bytes, begin: int, end: int, order: str) -> list[tuple[int, 
 
 
 def _add(
-    data: bytes, element: tuple[int, int, int], order: str, name: str, found: dict[str, Any], path: Path
+    data: bytes | bytearray,
+    element: tuple[int, int, int],
+    order: str,
+    name: str,
+    found: dict[str, Any],
+    path: Path,
 ) -> None:
     """Add an array by its own name, or that of its field; of a structure its fields."""
     kind, begin, count = element
-    if kind != MATRIX or name.count(".") > DEEPEST:
+    if kind != MATRIX or sum(map(name.count, ".{(")) > DEEPEST:
         raise ValueError("it holds a damaged array")
     if not count:
         return
@@ -116,8 +136,17 @@ def _add(
         raise ValueError("it holds a damaged array")
     sides = struct.unpack_from(f"{order}{parts[1][2] // 4}i", data, parts[1][1])
     name = name or _text(data, parts[2])
+    if len(found) > MOST_FIELDS:
+        raise ValueError(f"it has more than {MOST_FIELDS} arrays")
     if of == STRUCTURE and sides == (1, 1):
         _add_fields(data, parts, order, name, found, path)
+    elif of in (CELL, STRUCTURE) and 0 < math.prod(sides) <= MOST_FIELDS and min(sides) > 0:
+        found[name] = OTHERS[of]
+        if of == STRUCTURE:
+            _add_fields(data, parts, order, name, found, path, math.prod(sides))
+        else:
+            for place, one in enumerate(parts[3:], 1):
+                _add(data, one, order, f"{name}{{{place}}}", found, path)
     elif of not in NUMERIC or flags & COMPLEX:
         found[name] = OTHERS.get(of, "of complex numbers" if of in NUMERIC else "an object of MATLAB's")
     else:
@@ -125,19 +154,30 @@ def _add(
         found[name] = _numbers(data, parts, order, sides)
 
 
-def _add_fields(data: bytes, parts: list, order: str, name: str, found: dict[str, Any], path: Path) -> None:
+def _add_fields(
+    data: bytes | bytearray,
+    parts: list,
+    order: str,
+    name: str,
+    found: dict[str, Any],
+    path: Path,
+    count: int | None = None,
+) -> None:
+    """Add the fields of a structure, or those of each of an array of so many structures."""
     if len(parts) < 5 or parts[3][0] != INT32 or parts[3][2] != 4 or parts[4][0] != INT8:
         raise ValueError("it holds a damaged structure")
     (length,) = struct.unpack_from(f"{order}i", data, parts[3][1])
-    _, at, count = parts[4]
-    if length < 1 or count != length * len(parts[5:]):
+    _, at, size = parts[4]
+    if length < 1 or size % length or size // length * (count or 1) != len(parts[5:]):
         raise ValueError("it holds a damaged structure")
+    fields = [_text(data, (INT8, at + place, length)) for place in range(0, size, length)]
     for place, element in enumerate(parts[5:]):
-        field = _text(data, (INT8, at + place * length, length))
-        _add(data, element, order, f"{name}.{field}", found, path)
+        number, field = divmod(place, len(fields))
+        whose = name if count is None else f"{name}({number + 1})"
+        _add(data, element, order, f"{whose}.{fields[field]}", found, path)
 
 
-def _numbers(data: bytes, parts: list, order: str, sides: tuple[int, ...]) -> np.ndarray:
+def _numbers(data: bytes | bytearray, parts: list, order: str, sides: tuple[int, ...]) -> np.ndarray:
     """Numbers of an array, whose columns follow one another."""
     kind, at, count = parts[3] if len(parts) == 4 else (0, 0, 0)
     if kind not in NUMBERS or math.prod(sides) * np.dtype(NUMBERS[kind]).itemsize != count or min(sides) < 0:
@@ -146,6 +186,6 @@ def _numbers(data: bytes, parts: list, order: str, sides: tuple[int, ...]) -> np
     return np.frombuffer(data, stored, math.prod(sides), at).reshape(sides, order="F")
 
 
-def _text(data: bytes, part: tuple[int, int, int]) -> str:
+def _text(data: bytes | bytearray, part: tuple[int, int, int]) -> str:
     _, at, count = part
     return data[at : at + count].partition(b"\0")[0].decode("latin-1")
