@@ -9,10 +9,10 @@ import numpy as np
 from filters.wrapped import wrapped_variances
 from thruster_env.numerics.checks import as_floats, at_least, correlations, covariance_root
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.derivatives import RELATIVE_STEP
+from thruster_env.numerics.derivatives import step_of
 from thruster_env.numerics.matrices import multiplier, quadratic_form
 from thruster_env.numerics.progress import told
-from thruster_env.numerics.sources import Source, entrywise
+from thruster_env.numerics.sources import Source
 from thruster_env.numerics.streams import GROUP
 from thruster_env.numerics.threads import cores, spread
 from thruster_env.numerics.tuples import matrix_reader, vector_reader, vector_writer
@@ -26,9 +26,7 @@ MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model tog
 MOST_STEPS = 3e7  # truths x steps x substeps, of all sequences of any model together
 WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
 SINGULAR = 1e-13  # least eigenvalue of Q with unit variances, within rounding: Q has no inverse
-ROUNDING = (
-    8 * 2.0**-52 / RELATIVE_STEP
-)  # of slopes by central differences, relative to (|x_i| + s_i)/(|x_j| + s_j)
+ROUNDING = 8 * 2.0**-52  # of slopes by central differences, relative to (|x_i| + s_i)/h_j
 MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
 
 
@@ -267,7 +265,8 @@ def _from_mean(n: int, by_differences: bool):
         apart = f"f[{i}][{j}] - means[b, k, {i}, {j}]"
         if not by_differences:
             return apart
-        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / (abs(x[{j}]) + s[{j}])"
+        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / step_of(x[{j}], s[{j}])"
         return f"({apart} if abs({apart}) > {noise} else 0.0)"
 
-    return entrywise("less_mean", "f, means, b, k, x, s", (n, n), entry, f=(n, n), x=(n,), s=(n,))
+    source = Source("less_mean", "f, means, b, k, x, s", result=(n, n), f=(n, n), x=(n,), s=(n,))
+    return source.function(source.entries((n, n), entry), step_of=step_of)

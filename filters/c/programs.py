@@ -180,7 +180,7 @@ def _check_traced(name: str, function: Callable, jacobian: Callable | None, othe
         raise
     except Exception as error:  # whatever a user's function raises
         raise ValueError(
-            f"{name} must consist of arithmetic and functions of math or numpy, without branches, but "
+            f"{name} must consist of arithmetic and functions of math or numpy, with a few branches at most, but "
             f"{getattr(function, '__name__', 'it')} raised {type(error).__name__}: {str(error).splitlines()[0]}"
         ) from error
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.numerics.angles import NAMES, short_way
-from thruster_env.numerics.derivatives import RELATIVE_STEP
+from thruster_env.numerics.derivatives import RELATIVE_STEP, step_of
 from thruster_env.numerics.sources import Source, entrywise, is_array, tuple_of, written_out
 from thruster_env.numerics.tuples import scaled_sum, vector_reader
 from thruster_env.plants.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
@@ -102,8 +102,8 @@ def _step(count: int) -> Callable:
     source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
     source.line("h = max(1e-300, size)")
     for i in source.range(count):
-        source.line(f"h = max(h, abs(d[{i}]) / (abs(x[{i}]) + scales[{i}]))")
-    return source.function(f"{RELATIVE_STEP} / h")
+        source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}]))")
+    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of)
 
 
 @cache
@@ -123,7 +123,7 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
         f"out, unit = np.empty(({columns}, {rows}, {columns})), np.zeros({columns})",
         f"for k in range({columns}):",
         "    unit[k] = 1.0",
-        f"    h = {RELATIVE_STEP} * (abs(x[k]) + scales[k])",
+        "    h = step_of(x[k], scales[k])",
         "    d = read(unit)",
         f"    above = matrix(move(x, h, d), scales, {others})",
         f"    below = matrix(move(x, -h, d), scales, {others})",
@@ -133,7 +133,8 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
         "    unit[k] = 0.0",
         "out",
     )
-    names = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns), "np": np}
+    names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
+    names |= {"np": np, "step_of": step_of}
     return written_out("curved", f"x, scales, {others}", *lines, _loops=True, **names)
 
 

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from thruster_env.numerics.algebra.branches import on_every_side
 from thruster_env.numerics.algebra.graphs import Graph, Number
 from thruster_env.numerics.algebra.programs import Place, values_of
 from thruster_env.numerics.algebra.slopes import along
@@ -81,11 +82,14 @@ class Traced:
         return [*plain, c if constants_are_array(form) else tuple(c) if isinstance(form, int) else form(*c)]
 
     def _value(self, x, *others):
-        return np.array([*self._function(*self._given(x, *others))], dtype=object)
+        given = self._given(x, *others)
+        return on_every_side(lambda: np.array([*self._function(*given)], dtype=object), _graph_of(x, *others))
 
     def _matrix(self, x, scales, *others):
         if self._jacobian is not None:
-            return np.array([[*row] for row in self._jacobian(*self._given(x, *others))], dtype=object)
+            given = self._given(x, *others)
+            rows = lambda: np.array([[*row] for row in self._jacobian(*given)], dtype=object)  # noqa: E731
+            return on_every_side(rows, _graph_of(x, *others))
         value = self._value(x, *others)
         return np.array([_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
 
@@ -105,6 +109,11 @@ class Traced:
         of_constants = [(given[-1], dc) for dc in moves[:1]]
         pairs = zip(points.T, changes.T, strict=True)
         return np.array([_along(self._value(x, *given), (x, dx), *of_constants) for x, dx in pairs]).T
+
+
+def _graph_of(*arguments) -> Graph:
+    """The graph of the numbers among some arguments, of which the state's are such."""
+    return next(one.graph for argument in arguments for one in argument if isinstance(one, Number))
 
 
 class Untraced:

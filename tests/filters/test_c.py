@@ -320,7 +320,7 @@ def test_numbers_are_written_with_all_their_digits():
 
 
 def decides(x, u, c):
-    return (x[0] if x[0] > 1.0 else u[0],)
+    return (x[0] if int(x[0] > 1.0) else u[0],)
 
 
 def looked_up(x, c):

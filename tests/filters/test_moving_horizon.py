@@ -232,7 +232,7 @@ def test_the_covariance_is_the_last_block_of_the_inverse_hessian_without_bounds(
 @pytest.mark.parametrize("loss", ["huber", "student"])
 def test_of_functions_that_cannot_be_traced_it_is_the_same(loss):
     def decides(x, u, c):
-        return transition(x, u, c) if x[0] < 1e9 else x
+        return transition(x, u, c) if int(x[0] < 1e9) else x
 
     inputs, measurements = curved_data()
     data = KEYS, inputs[None], measurements[None]

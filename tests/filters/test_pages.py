@@ -118,7 +118,7 @@ def test_a_page_of_a_schedule_is_the_scheduled_filter():
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["ekf-robust", "sage-husa", "vb", "square-root", "information"])
-def test_a_filter_of_a_model_that_decides_is_that_of_one_that_does_not(name):
+def test_a_filter_of_a_model_that_is_called_is_that_of_one_that_is_traced(name):
     forms, inputs_and_z = ("square-root", "information"), simulated(turning_pendulum(), 12, count=2, missing=0.3)
     found = []
     for function in (turn, turn_if):
@@ -134,8 +134,8 @@ def test_a_filter_of_a_model_that_decides_is_that_of_one_that_does_not(name):
 
 
 def turn_if(x, u, c):
-    """The pendulum, by a function that decides."""
-    return (0.0, 0.0) if abs(x[1]) > 1e6 else turn(x, u, c)
+    """The pendulum, by a function that cannot be traced."""
+    return (0.0, 0.0) if int(abs(x[1]) > 1e6) else turn(x, u, c)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -26,8 +26,8 @@ PLAIN = Wanted(information=False, constants=False, tails=False)
 
 
 def turn_if(x, u, c):
-    """The pendulum, by a function that decides."""
-    return (0.0, 0.0) if abs(x[1]) > 1e6 else whirl(x, u, c)
+    """The pendulum, by a function that cannot be traced."""
+    return (0.0, 0.0) if int(abs(x[1]) > 1e6) else whirl(x, u, c)
 
 
 def at_once(model, filter_):

@@ -80,7 +80,7 @@ def bent(x, c):
 
 
 def bent_by_branches(x, c):
-    return (x[0] + 0.3 * x[0] * (x[0] if x[0] > 0.0 else -x[0]),)
+    return (x[0] + 0.3 * x[0] * (x[0] if int(x[0] > 0.0) else -x[0]),)
 
 
 def bent_model(observe):

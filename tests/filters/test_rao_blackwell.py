@@ -35,7 +35,7 @@ def see(x, c):
 
 def see_by_branches(x, c):
     """The same, in a form that cannot be traced."""
-    return (0.1 * x[0] * (x[0] if x[0] > 0.0 else -x[0]) + 0.3 * x[2], x[1] - np.cos(x[0]) * x[2])
+    return (0.1 * x[0] * (x[0] if int(x[0] > 0.0) else -x[0]) + 0.3 * x[2], x[1] - np.cos(x[0]) * x[2])
 
 
 def mixed_model(observe=see):

@@ -344,9 +344,13 @@ def plain():
     return filters.torch(made("ekf", scalar_model()))
 
 
+def truncated(x, u, c):
+    return (x[0] + u[0] * int(x[0]),)
+
+
 def deciding():
     model = StateSpaceModel(
-        transition=if_fast,
+        transition=truncated,
         observe=lambda x, c: (x[0],),
         process_noise_cov=[0.1],
         measurement_noise_cov=[0.1],

@@ -68,7 +68,7 @@ def rows_of(model, seed=1, rows=60):
 
 def jumping(x, u, c):
     """A step that cannot be traced: the spring is stiffer on one side."""
-    stiffness = c.stiffness if x[0] > 0.0 else 2.0 * c.stiffness
+    stiffness = c.stiffness if int(x[0] > 0.0) else 2.0 * c.stiffness
     return x[0] + c.substep * x[1], x[1] + c.substep * (u[0] - stiffness * x[0] - c.damping * x[1])
 
 

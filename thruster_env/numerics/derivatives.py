@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -15,9 +16,46 @@ from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
+LEAST_STEP = 2.0**-42  # relative to the number itself, which has 52 bits
 COMPLEX_STEP = 1e-100  # no subtraction, hence no cancellation: it may be this small
 
 _EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
+
+
+@inlined
+def step_of(x, scale):
+    """How far to go from x for a central difference of a function that curves over lengths like `scale`.
+
+        h = (eps (|x| + s) s^2)^(1/3)
+
+    Rounding, eps |x|/h, and truncation, (h/s)^2, are then alike, however far from zero x is. It is a power of two,
+    so that x + h and x - h are exact.
+    """
+    size = scale if scale > 0.0 else abs(x) if x != 0.0 else 1.0
+    h = max(RELATIVE_STEP * size * (abs(x) / size + 1.0) ** (1.0 / 3.0), LEAST_STEP * abs(x))
+    return math.ldexp(1.0, math.frexp(h)[1] - 1)
+
+
+def _sides(name: str, rows: int, call: str, width: str, h: str) -> list[str]:
+    """Lines after those that set both sides: of one that has no value, the middle takes its place.
+
+    Args:
+        name: of the sides, {name} the word "above" or "below".
+        rows: number of components.
+        call: the function's value in the middle.
+        width: name of the distance between both sides.
+        h: of half of it.
+    """
+    lines = [f"{width} = 2.0 * {h}"]
+    for word, side in (("if", "above"), ("elif", "below")):
+        one = name.format(side)
+        finite = f"np.isfinite({one}).all()" if is_array(rows) else _all_finite(one, rows)
+        lines += [f"{word} not ({finite}):", f"    {one}, {width} = {call}, {h}"]
+    return lines
+
+
+def _all_finite(name: str, rows: int) -> str:
+    return " and ".join(f"isfinite({name}[{i}])" for i in range(rows))
 
 
 def _stores(rows: int, entry: Callable) -> list[str]:
@@ -78,6 +116,9 @@ def by_complex_step(function: Callable) -> bool:
     return function in _EXACT
 
 
+TOOLS: dict[str, Any] = {"np": np, "isfinite": math.isfinite, "step_of": step_of, **NAMES}
+
+
 def _differences_in_loops(
     function: Callable, rows: int, columns: int, arguments: str, angles: tuple[bool, ...]
 ) -> Callable:
@@ -92,11 +133,12 @@ def _differences_in_loops(
     size = "x[j]" if is_array(columns) else "sizes[j]"
     scale = "scales[j]" if is_array(columns) else "steps[j]"
     copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
-    stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
-    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *stores
+    sides += _sides("{}", rows, f"function(x, {arguments})", "width", "h")
+    stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / width")
+    body = f"h = step_of({size}, {scale})", *sides, *stores
     start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
     lines = *start, *(f"    {line}" for line in body)
-    names: dict[str, Any] = {"function": inlined(function), "np": np, **NAMES}
+    names: dict[str, Any] = {"function": inlined(function), **TOOLS}
     return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
@@ -119,7 +161,8 @@ def jacobian(
         arguments: names of the other arguments, comma separated.
         angles: which components of the result are angles, whose differences are wrapped to (-pi, pi].
 
-    The steps of central differences are relative to |x| + scales, both tuples of `columns` components.
+    The steps of central differences are `step_of(x, scales)`, of tuples of `columns` components. Where the
+    function has no value on one side, the difference is one-sided.
     """
     signature = f"x, scales, {arguments}"
     if analytic is not None:
@@ -128,14 +171,14 @@ def jacobian(
         return _differences_in_loops(function, rows, columns, arguments, angles)
     lines = []
     for j in range(columns):
-        lines.append(f"h{j} = {RELATIVE_STEP} * (abs(x[{j}]) + scales[{j}])")
+        lines.append(f"h{j} = step_of(x[{j}], scales[{j}])")
         for name, sign in (("above", "+"), ("below", "-")):
             point = tuple_of(f"x[{i}] {sign} h{j}" if i == j else f"x[{i}]" for i in range(columns))
             lines.append(f"{name}{j} = function({point}, {arguments})")
+        lines += _sides(f"{{}}{j}", rows, f"function(x, {arguments})", f"width{j}", f"h{j}")
 
     def slope(i, j):
-        return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / (2.0 * h{j})"
+        return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / width{j}"
 
-    return written_out(
-        "jacobian", signature, *lines, matrix_of(rows, columns, slope), function=inlined(function), **NAMES
-    )
+    names: dict[str, Any] = {"function": inlined(function), **TOOLS}
+    return written_out("jacobian", signature, *lines, matrix_of(rows, columns, slope), **names)

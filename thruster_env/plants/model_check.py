@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thruster_env.numerics.checks import as_floats, short_repr
+from thruster_env.numerics.derivatives import by_complex_step
 from thruster_env.numerics.modules import said
 from thruster_env.numerics.sources import as_value, is_array
 
@@ -46,6 +47,30 @@ def check_functions(model) -> None:
             _check_result(name, function, model, arguments, shape, rule)
 
 
+def _refuse_slopes(name: str, model, arguments: str, found: str) -> None:
+    """Raise ValueError for a Jacobian that is not finite at the prior mean, if its function is."""
+    function = getattr(model, name.removesuffix("_jacobian"))
+    try:
+        with np.errstate(all="ignore"):
+            value = as_floats(function(*_arguments(arguments, model, model.prior_mean)))
+    except (ArithmeticError, ValueError):
+        return
+    if np.isfinite(value).all():
+        raise ValueError(
+            f"{name} must be finite at the prior mean with inputs of zero, as its function is, but got {found}: "
+            "return a limit there, or leave it out"
+        )
+
+
+def _arguments(names: str, model, x: np.ndarray) -> list:
+    given = {
+        "x": as_value(x.tolist()),
+        "u": as_value([0.0] * model.inputs),
+        "c": model.given_constants,
+    }
+    return [given[name] for name in names.split(", ")]
+
+
 def _check_arguments(name: str, function: Callable, arguments: str) -> None:
     if not callable(function):
         raise ValueError(f"{name} must be a function of ({arguments}), but got {short_repr(function)}")
@@ -69,19 +94,22 @@ def _place(function: Callable) -> str:
 
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
-        must_be_known = point is model.prior_mean and not name.endswith("jacobian")
-        x, u = as_value(point.tolist()), as_value([0.0] * model.inputs)
-        given = {"x": x, "u": u, "c": model.given_constants}
+        at_mean, slopes = point is model.prior_mean, name.endswith("jacobian")
+        must_be_known = at_mean and not slopes
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of a derivative that is lost
-                result = function(*(given[argument] for argument in arguments.split(", ")))
-        except ArithmeticError:  # machine code has infinity there
+                result = function(*_arguments(arguments, model, point))
+        except ArithmeticError as error:  # machine code has infinity there
+            if at_mean and slopes:
+                _refuse_slopes(name, model, arguments, said(error))
             continue
         except Exception as error:
             if str(error).startswith("math "):  # "math domain error", where machine code has NaN
                 if must_be_known:
                     raise ValueError(_not_nan(name, str(error))) from None
+                if at_mean:
+                    _refuse_slopes(name, model, arguments, str(error))
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             where = _place(function)
@@ -91,6 +119,8 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
         if must_be_known and np.isnan(as_floats(result)).any():
             raise ValueError(_not_nan(name, short_repr(result)))
+        if at_mean and slopes and not by_complex_step(function) and not np.isfinite(as_floats(result)).all():
+            _refuse_slopes(name, model, arguments, short_repr(result))
         return
 
 

@@ -23,6 +23,7 @@ from thruster_env.plants.positions import Positions
 from thruster_env.plants.quantities import Quantities, count_of, outputs, quantities
 from thruster_env.plants.shape import Functions, Shape, constants_are_array, constants_form
 from thruster_env.plants.state_bounds import checked_bounds
+from thruster_env.plants.state_scales import scales_of
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
 
@@ -268,12 +269,8 @@ class StateSpaceModel:
 
     @property
     def scales(self) -> np.ndarray:
-        """Scale of each state for the steps of central differences, (n,): its standard deviation in prior and Q.
-
-        Results then do not depend on the units.
-        """
-        spread = np.sqrt(np.diag(self.prior_cov) + np.diag(self.process_noise_cov))
-        return np.where(spread > 0, spread, 1.0)
+        """Scale of each state for the steps of central differences, (n,): see `state_scales`."""
+        return scales_of(self)
 
 
 def _channels(r) -> int:

@@ -1,7 +1,9 @@
 """Algebra that is written once, as in a textbook, and worked out, differentiated and compiled by programs.
 
 graphs, folding, tracing          what a plain function of floats computes, as a graph of numbers
+branches                          the same of a function that decides: a choice between what it does on each side
 slopes                            derivatives of such a graph
+magnitudes                        what is known of a number's size
 matrices, operations, densities   what is computed of matrices: A @ B.T, divide(C, S), log_density(v, S, seen)
 points                            roots of covariances, and sigma points as columns of a matrix
 scalars, blocks, upper            numbers, choices and weights; inverses, triangles, blocks; factors U, D

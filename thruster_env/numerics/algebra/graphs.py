@@ -14,8 +14,8 @@ A page's division by a number is a product with its reciprocal, of which there i
 where the functions of a model are traced, a division is one: 49/49 is 1, and 49 * (1/49) is less.
 
 A comparison is a condition. In arithmetic it is 1.0 or 0.0, as in Python. What a Number cannot do is decide:
-`if x > 0.0` raises TypeError, and whoever traces a function then calls it instead. `where(condition, a, b)` works
-out both sides.
+`if x > 0.0` raises TypeError, unless both sides are asked for (`branches`). `where(condition, a, b)` works out
+both sides.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ class Graph:
         """Begin without numbers; more operations than `most` raise TooLarge. `size` members may be known now."""
         self.numbers: list[Number] = []
         self.size = size
+        self.decide: Callable[[Number], bool] | None = None  # what a condition is taken for, see `branches`
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self.exact = False  # whether a model's function is being traced: see `as_written`
         self._made: dict[tuple, Number] = {}
@@ -176,7 +177,9 @@ class Number:
         return f"<number {self.place}: {self.operation}>"
 
     def __bool__(self) -> bool:
-        raise TypeError("a traced value has no truth value: use where(condition, a, b)")
+        if self.graph.decide is None:
+            raise TypeError("a traced value has no truth value: use where(condition, a, b)")
+        return self.graph.decide(self)
 
     @property
     def is_condition(self) -> bool:

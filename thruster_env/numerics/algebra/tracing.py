@@ -1,4 +1,4 @@
-"""A plain function of floats, called with Numbers: what it computes becomes a graph, if it never decides.
+"""A plain function of floats, called with Numbers: what it computes becomes a graph.
 
 A user's function knows nothing of Numbers. It says `math.sin(x)`, which wants a float, or `max(x, 0.0)`, which
 decides. So a copy of it is made that finds our own functions under these names, and so are copies of all
@@ -8,7 +8,7 @@ functions that it calls:
 
 A function that decides for itself (`if x > 0.0`, `while error > 1e-9`), looks a number up in a table or hands
 it to something that wants a float raises TypeError on the way: it cannot be traced, and has to be called as it
-is.
+is, but for a few decisions, of which all sides can be traced (`branches`).
 """
 
 from __future__ import annotations
