@@ -11,7 +11,7 @@ import numpy as np
 from thruster_env.numerics.angles import NAMES, short_way
 from thruster_env.numerics.checks import finite, positive
 from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.derivatives import step_of
+from thruster_env.numerics.derivatives import step_of, stretch
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.sources import Source, entrywise, tuple_of, written_out
 from thruster_env.numerics.tuples import assembled, joiner, vector_part
@@ -175,9 +175,10 @@ def _augmented_functions(
     }
 
     def jacobian(name, function, analytic, size, arguments, angles, identity):
-        lines = [*begin, f"a = analytic(s, {arguments}fill(t, c))"]
+        spreads = tuple_of(f"c[{count + q}]" for q in range(added))
+        lines = [*begin, f"far = stretch(t, {spreads})", f"a = analytic(s, {arguments}fill(t, c))"]
         for q in range(added):
-            lines.append(f"step{q} = step_of(t[{q}], c[{count + q}])")
+            lines.append(f"step{q} = step_of(t[{q}], c[{count + q}], far)")
             for side, sign in (("above", "+"), ("below", "-")):
                 shifted = tuple_of(f"t[{r}] {sign} step{q}" if r == q else f"t[{r}]" for r in range(added))
                 lines.append(f"{side}{q} = {function}(s, {arguments}fill({shifted}, c))")
@@ -188,6 +189,7 @@ def _augmented_functions(
             lines.append(f"slope{q} = difference(above{q}, below{q}, step{q})")
         tools: dict[str, Any] = {
             "step_of": step_of,
+            "stretch": stretch(added),
             "difference": _difference_quotient(size, angles),
             "one": entrywise("one", "", (1, 1), lambda i, j: "1.0"),
             "whole": assembled(

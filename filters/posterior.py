@@ -9,7 +9,7 @@ import numpy as np
 from filters.wrapped import wrapped_variances
 from thruster_env.numerics.checks import as_floats, at_least, correlations, covariance_root
 from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.derivatives import step_of
+from thruster_env.numerics.derivatives import step_of, stretch
 from thruster_env.numerics.matrices import multiplier, quadratic_form
 from thruster_env.numerics.progress import told
 from thruster_env.numerics.sources import Source
@@ -265,8 +265,9 @@ def _from_mean(n: int, by_differences: bool):
         apart = f"f[{i}][{j}] - means[b, k, {i}, {j}]"
         if not by_differences:
             return apart
-        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / step_of(x[{j}], s[{j}])"
+        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / step_of(x[{j}], s[{j}], far)"
         return f"({apart} if abs({apart}) > {noise} else 0.0)"
 
     source = Source("less_mean", "f, means, b, k, x, s", result=(n, n), f=(n, n), x=(n,), s=(n,))
-    return source.function(source.entries((n, n), entry), step_of=step_of)
+    source.line("far = stretch(x, s)")
+    return source.function(source.entries((n, n), entry), step_of=step_of, stretch=stretch(n))

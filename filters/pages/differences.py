@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.numerics.angles import NAMES, short_way
-from thruster_env.numerics.derivatives import RELATIVE_STEP, step_of
+from thruster_env.numerics.derivatives import RELATIVE_STEP, step_of, stretch
 from thruster_env.numerics.sources import Source, entrywise, is_array, tuple_of, written_out
 from thruster_env.numerics.tuples import scaled_sum, vector_reader
 from thruster_env.plants.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
@@ -100,10 +100,10 @@ def slope_of(
 def _step(count: int) -> Callable:
     """Return `step(x, scales, d, size)`: how far to go along d, and along constants of a relative size."""
     source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
-    source.line("h = max(1e-300, size)")
+    source.line("h, far = max(1e-300, size), stretch(x, scales)")
     for i in source.range(count):
-        source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}]))")
-    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of)
+        source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}], far))")
+    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of, stretch=stretch(count))
 
 
 @cache
@@ -121,9 +121,10 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
     """`curved(x, scales, ..., c)`: a Jacobian's derivative by each component of x, (columns, rows, columns)."""
     lines = (
         f"out, unit = np.empty(({columns}, {rows}, {columns})), np.zeros({columns})",
+        "far = stretch(x, scales)",
         f"for k in range({columns}):",
         "    unit[k] = 1.0",
-        "    h = step_of(x[k], scales[k])",
+        "    h = step_of(x[k], scales[k], far)",
         "    d = read(unit)",
         f"    above = matrix(move(x, h, d), scales, {others})",
         f"    below = matrix(move(x, -h, d), scales, {others})",
@@ -134,7 +135,7 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
         "out",
     )
     names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
-    names |= {"np": np, "step_of": step_of}
+    names |= {"np": np, "step_of": step_of, "stretch": stretch(columns)}
     return written_out("curved", f"x, scales, {others}", *lines, _loops=True, **names)
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from thruster_env.numerics.angles import NAMES, short_way
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.pickling import makes_functions
-from thruster_env.numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
+from thruster_env.numerics.sources import Index, Source, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
+MOST_SCALES = 1e9  # from zero: steps are at most 0.6 % of a scale
 LEAST_STEP = 2.0**-42  # relative to the number itself, which has 52 bits
 COMPLEX_STEP = 1e-100  # no subtraction, hence no cancellation: it may be this small
 
@@ -23,17 +24,35 @@ _EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
 
 
 @inlined
-def step_of(x, scale):
+def step_of(x, scale, far):
     """How far to go from x for a central difference of a function that curves over lengths like `scale`.
 
-        h = (eps (|x| + s) s^2)^(1/3)
+        h = (eps r)^(1/3) s
 
-    Rounding, eps |x|/h, and truncation, (h/s)^2, are then alike, however far from zero x is. It is a power of two,
-    so that x + h and x - h are exact.
+    Rounding, eps r s/h, and truncation, (h/s)^2, are then alike. It is a power of two, so that far from
+    zero x + h and x - h are exact.
+
+    Args:
+        x: component of a vector.
+        scale: s, of the component.
+        far: r^(1/3), with the largest magnitude r of all components in their scales; see `stretch`.
     """
     size = scale if scale > 0.0 else abs(x) if x != 0.0 else 1.0
-    h = max(RELATIVE_STEP * size * (abs(x) / size + 1.0) ** (1.0 / 3.0), LEAST_STEP * abs(x))
+    h = max(RELATIVE_STEP * size * far, LEAST_STEP * abs(x))
     return math.ldexp(1.0, math.frexp(h)[1] - 1)
+
+
+@cache
+def stretch(count: int) -> Callable:
+    """Return `stretch(x, scales)`: the cube root of the largest 1 + |x_i|/s_i of `count` components.
+
+    What is computed of a component far from zero is rounded as it is, whichever component moves.
+    """
+    source = Source("stretch", "x, scales", x=(count,), scales=(count,))
+    source.line("most = 1.0")
+    for i in source.range(count):
+        source.line(f"most = max(most, 1.0 + abs(x[{i}]) / max(scales[{i}], 1e-300))")
+    return source.function(f"min(most, {MOST_SCALES}) ** (1.0 / 3.0)")
 
 
 def _sides(name: str, rows: int, call: str, width: str, h: str) -> list[str]:
@@ -135,10 +154,15 @@ def _differences_in_loops(
     copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
     sides += _sides("{}", rows, f"function(x, {arguments})", "width", "h")
     stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / width")
-    body = f"h = step_of({size}, {scale})", *sides, *stores
-    start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
+    body = f"h = step_of({size}, {scale}, far)", *sides, *stores
+    start = (
+        "far = stretch(x, scales)",
+        f"out = np.empty(({rows}, {columns}))",
+        *copies,
+        f"for j in range({columns}):",
+    )
     lines = *start, *(f"    {line}" for line in body)
-    names: dict[str, Any] = {"function": inlined(function), **TOOLS}
+    names: dict[str, Any] = {"function": inlined(function), "stretch": stretch(columns), **TOOLS}
     return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
@@ -161,7 +185,7 @@ def jacobian(
         arguments: names of the other arguments, comma separated.
         angles: which components of the result are angles, whose differences are wrapped to (-pi, pi].
 
-    The steps of central differences are `step_of(x, scales)`, of tuples of `columns` components. Where the
+    The steps of central differences are `step_of`, of tuples x and scales of `columns` components. Where the
     function has no value on one side, the difference is one-sided.
     """
     signature = f"x, scales, {arguments}"
@@ -169,9 +193,9 @@ def jacobian(
         return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
     if is_array(rows, columns) or is_array(columns):
         return _differences_in_loops(function, rows, columns, arguments, angles)
-    lines = []
+    lines = ["far = stretch(x, scales)"]
     for j in range(columns):
-        lines.append(f"h{j} = step_of(x[{j}], scales[{j}])")
+        lines.append(f"h{j} = step_of(x[{j}], scales[{j}], far)")
         for name, sign in (("above", "+"), ("below", "-")):
             point = tuple_of(f"x[{i}] {sign} h{j}" if i == j else f"x[{i}]" for i in range(columns))
             lines.append(f"{name}{j} = function({point}, {arguments})")
@@ -180,5 +204,5 @@ def jacobian(
     def slope(i, j):
         return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / width{j}"
 
-    names: dict[str, Any] = {"function": inlined(function), **TOOLS}
+    names: dict[str, Any] = {"function": inlined(function), "stretch": stretch(columns), **TOOLS}
     return written_out("jacobian", signature, *lines, matrix_of(rows, columns, slope), **names)
