@@ -83,7 +83,7 @@ def found_at(function: Callable, point: np.ndarray) -> float:
 
 
 def far_from_zero(rng: np.random.Generator, seconds: float) -> str:
-    """Filters that linearise, of models that branch, traced and called: moved by up to 1e9, in units of 1e-9 to 1e9."""
+    """Filters that linearise, of models that branch, moved by up to 1e9, in units of 1e-9 to 1e9."""
     counts = Counter()
     with interpreted():
         for _ in _until(seconds):
