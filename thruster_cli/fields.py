@@ -12,12 +12,15 @@ from rich.console import RenderableType
 from thruster_env.numerics.checks import listed
 from thruster_env.numerics.text_tables import plain_text, table
 from thruster_env.plants.logs.columns import find_columns, quantities_of
+from thruster_env.plants.logs.recorders.one_clock import HEADER, RECEIPT
 from thruster_env.plants.logs.recorders.registry import ENDINGS, METADATA, Contents, Field, contents, format_of
+from thruster_env.plants.logs.stamps import time_text
 from thruster_env.plants.logs.table import SUFFIXES, read_table
 from thruster_env.plants.replay import ANY_DT
 from tuning.problems.plant_packages import logs_package
 
 BLOCKS = "▁▂▃▄▅▆▇█"
+CLOCKS = {HEADER: "stamps of headers", RECEIPT: "when messages were received"}  # in words
 WIDE = 400  # characters of a line that goes into a file or another program: no name is folded there
 
 
@@ -56,9 +59,9 @@ def _is_foreign(log: Path) -> bool:
     return True
 
 
-def found_in(log: Path, only: str | None) -> Contents:
+def found_in(log: Path, only: str | None, stamps: str | None = None) -> Contents:
     """What is in a file, fields whose names contain a text in any case; ValueError if there are none."""
-    every = contents(log)
+    every = contents(log, stamps)
     some = [one for one in every.fields if only is None or only.casefold() in one.name.casefold()]
     if not some:
         what = "some field of numbers" if only is None else f"a field whose name contains {only!r}"
@@ -82,11 +85,14 @@ def _listed(unread: Mapping[str, str]) -> str:
 
 def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableType:
     """The table of fields: by topics for a terminal, or lines of plain text whose names nothing folds."""
-    columns = ["field", "samples", "rate\n[Hz]", "longest\ngap [s]", "unit", "least", "greatest", "course"]
+    of_times = ["rate\n[Hz]", "longest\ngap [s]", "begin\n[s]", "end\n[s]"]
+    columns = ["field", "samples", *of_times, "unit", "least", "greatest", "course"]
     rows = _by_topics(some) if is_terminal else [[one.name, *_counts(one), *_values(one)] for one in some]
     form = format_of(log)
     title = f"{log}: {form.kind if form else 'table'}, {len(some)} {'fields' if form else 'columns'}"
     caption = "To read it as a log: --column NAME=FIELD for each input and measurement"
+    clocks = dict.fromkeys(CLOCKS[one.clock] for one in some if one.clock)
+    caption += f"; times: {' and '.join(clocks)}" if clocks else ""
     shown = table(title, columns, rows, caption=caption)
     return shown if is_terminal else plain_text([shown], WIDE)
 
@@ -94,7 +100,8 @@ def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableT
 def as_json(log: Path, some: Contents) -> dict:
     """The same as data."""
     form = format_of(log)
-    names = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "unit", "least", "greatest", "course")
+    names = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "begin_s", "end_s", "stamps")
+    names += ("unit", "least", "greatest", "course")
     rows = [dict(zip(names, one, strict=True)) for one in some.fields]
     found = {"log": str(log), "format": form.kind if form else "table", "fields": rows}
     return {**found, "not_read": some.unread, "damage": list(some.damage)}
@@ -106,13 +113,14 @@ def _by_topics(some: Sequence[Field]) -> list[list[str]]:
     for (topic, *counts), group in groupby(some, lambda one: (one.topic, *_counts(one))):
         rows += [[topic, *counts, *[""] * 4]] if topic else []
         for one in group:
-            name, own = (f"  {one.name[len(topic) :]}", [""] * 3) if topic else (one.name, counts)
+            name, own = (f"  {one.name[len(topic) :]}", [""] * len(counts)) if topic else (one.name, counts)
             rows.append([name, *own, *_values(one)])
     return rows
 
 
 def _counts(one: Field) -> list[str]:
-    return [str(one.samples), _short(one.rate), _short(one.gap)]
+    ends = [time_text(end, one.gap, 4) if math.isfinite(end) else "" for end in (one.begin, one.end)]
+    return [str(one.samples), _short(one.rate), _short(one.gap), *ends]
 
 
 def _values(one: Field) -> list[str]:

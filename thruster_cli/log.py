@@ -60,9 +60,10 @@ def command(
 
     Example: thruster log flight.ulg --only actuator
     """
-    if is_listed(log, only, any((*reading.named().values(), plot))):
+    of_log = {key: value for key, value in reading.named().items() if key != "stamps"}
+    if is_listed(log, only, any((*of_log.values(), plot))):
         check_targets((), json, read=(log,))
-        some = found_in(log, only)
+        some = found_in(log, only, reading.stamps)
         shown, said = as_table(log, some.fields, console.is_terminal), remarks(some)
         emit([shown, *said] if console.is_terminal else [], as_json(log, some), json)
         if isinstance(shown, str) and json != "-":

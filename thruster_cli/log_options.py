@@ -21,6 +21,7 @@ from thruster_cli.options import (
     SensorOption,
     spelt,
 )
+from thruster_env.plants.logs.recorders.one_clock import STAMPS
 
 
 def with_groups(command: Callable) -> Callable:
@@ -90,10 +91,21 @@ class ReadingOptions:
         ),
     ] = None
 
+    stamps: Annotated[
+        str | None,
+        typer.Option(
+            help="Clock of all topics of a bag: header (stamps of their headers) or receipt (when messages were "
+            "received); by default that of the headers if all have one clock.",
+            callback=spelt(STAMPS),
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+
     def named(self) -> dict[str, Any]:
         """The arguments of `tuning.logs.read.read_named`."""
         of_model = {"preset": self.preset, "model": self.model, "sensors": self.sensor}
-        return {**of_model, "columns": self.column, "clock_offset": self.clock_offset, "dt": self.dt}
+        of_times = {"clock_offset": self.clock_offset, "dt": self.dt, "stamps": self.stamps}
+        return {**of_model, "columns": self.column, **of_times}
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,7 @@ def estimate(
     clock_offset: Mapping[str, float] | None = None,
     dt: float | None = None,
     grid: bool = True,
+    stamps: str | None = None,
     model_arguments: Mapping | None = None,
     seed: int = 0,
     **numbers,
@@ -96,6 +97,7 @@ def estimate(
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
         grid: whether a file is put on a grid, as `read_log` takes it.
+        stamps: "header" or "receipt" of a bag, as `read_log` takes it.
         model_arguments: arguments of the function that makes the model, such as `process_noise_cov`.
         seed: of the filter's random numbers.
         **numbers: the filter's own parameters, such as `ensemble_size`.
@@ -103,7 +105,8 @@ def estimate(
     Raises:
         ValueError: if an argument is wrong, or the file, the model and the filter do not fit.
     """
-    env = ReplayEnv(log, model, columns=columns, clock_offset=clock_offset, dt=dt, grid=grid)
+    options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid, "stamps": stamps}
+    env = ReplayEnv(log, model, **options)
     filter_ = filter_for(env, filter, None, None if tuned is None else str(tuned), model_arguments, numbers)
     noise = None if env.log.stamps is None else noise_by_rates(env.continuous, filter_.model, env.log.dt)
     return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed, noise=noise)

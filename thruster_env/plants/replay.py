@@ -43,6 +43,7 @@ class ReplayEnv(gym.Env):
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it.
         grid: as `read_log` takes it; a log on its own stamps cannot be replayed.
+        stamps: as `read_log` takes it.
 
     Raises:
         ValueError: if the file cannot be used, or the model is not one or does not fit the log.
@@ -59,9 +60,10 @@ class ReplayEnv(gym.Env):
         clock_offset: Mapping[str, float] | None = None,
         dt: float | None = None,
         grid: bool = True,
+        stamps: str | None = None,
     ):
         """Read the log and make spaces; see the class for the arguments."""
-        options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
+        options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid, "stamps": stamps}
         self.log, maker = read_for(log, model, **options)
         offer = object_named(model, "model") if isinstance(model, str) else model
         self.continuous = None if self.log.stamps is None else continuous_of(offer)

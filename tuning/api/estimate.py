@@ -33,6 +33,7 @@ def estimate(
     clock_offset: Any = None,
     dt: float | None = None,
     grid: bool = True,
+    stamps: str | None = None,
     smoother: bool = False,
     lag: int | None = None,
     skip: int | None = None,
@@ -61,6 +62,7 @@ def estimate(
         clock_offset: seconds by quantity that a channel's clock is ahead.
         dt: sample time [s] of a log without times, or of the grid.
         grid: whether to put the log on a grid; otherwise the filter uses its own time stamps.
+        stamps: of a bag, "header" or "receipt": the clock of all topics.
         smoother: correct estimates by later measurements.
         lag: number of later measurements, also without `smoother`; all by default.
         skip: initial rows that are not scored; 50, or a quarter of a short log, by default.
@@ -78,7 +80,7 @@ def estimate(
             f"give either a tuned file or a filter, but got both, {short_repr(tuned)} and {short_repr(filter)}"
         )
     log, model, preset = model_of_logs(log, model, preset)
-    named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
+    named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns, "stamps": stamps}
     read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
     with _as_file(tuned) as file:
         found = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)

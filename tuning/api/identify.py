@@ -42,6 +42,7 @@ def identify(
     use_all: bool = False,
     hold_gaps: bool = False,
     grid: bool = True,
+    stamps: str | None = None,
     filter: str = "ekf",
     predicted: Sequence[str] = (),
     degrees: float = math.inf,
@@ -78,6 +79,7 @@ def identify(
         held_out: runs used only for validation, as objects or paths; by default every third of three or more.
         use_all: hold no run out.
         hold_gaps: hold the last input over gaps of a log; by default runs are split there.
+        stamps: of bags, "header" or "receipt", as in `estimate`.
         grid: whether logs are put on one; else on their own stamps, for a model whose sample time is a constant:
             Q of a step is then in proportion to its length, and the values are those of `dt`.
         filter: "ekf", or "kf" for affine models.
@@ -99,6 +101,7 @@ def identify(
     logs, model, preset = model_of_logs(logs, model, preset)
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
     read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
+    read["stamps"] = stamps
     runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **read)
     family = family_of(runs, names, **whose, noise=noise, filter=filter)
     search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}

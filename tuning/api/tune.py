@@ -44,6 +44,7 @@ def tune(
     clock_offset: Any = None,
     dt: float | None = None,
     grid: bool = True,
+    stamps: str | None = None,
     held_out: Any = None,
     blocks: int | None = None,
     lead: int | None = None,
@@ -102,6 +103,7 @@ def tune(
         clock_offset: for recorded runs, seconds by quantity that a channel's clock is ahead.
         dt: for recorded runs, the sample time [s].
         grid: for recorded runs, whether they are put on a grid; else on their own stamps, as in `estimate`.
+        stamps: for bags, "header" or "receipt", as in `estimate`.
         held_out: recorded runs used only for the held-out evaluation; by default every third.
         blocks: number of blocks per recorded run.
         lead: rows at the beginning of a block that are not scored.
@@ -122,7 +124,7 @@ def tune(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
         )
     of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
-    of_logs["grid"] = None if grid else False
+    of_logs |= {"grid": None if grid else False, "stamps": stamps}
     of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
     unknown = unknowns_of(augment)
     problems = tuple(augmented(one, unknown) for one in problems_of(problem, preset, **of_logs))

@@ -18,7 +18,7 @@ from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 
-OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid")  # of `read_named`
+OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "stamps")  # of `read_named`
 CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start")
 
 

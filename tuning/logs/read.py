@@ -26,6 +26,7 @@ def read_named(
     dt: float | None = None,
     name: str | None = None,
     grid: bool = True,
+    stamps: str | None = None,
 ) -> tuple[Log, Any]:
     """A log, and the source of its model at its sample time.
 
@@ -40,6 +41,7 @@ def read_named(
         dt: sample time [s].
         name: name of a log that is not a file.
         grid: whether samples are put on a grid; else the log is on its own stamps.
+        stamps: "header" or "receipt" of a bag.
 
     Raises:
         ValueError: states the rule and the value.
@@ -54,6 +56,7 @@ def read_named(
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,
         "grid": None if grid else False,
+        "stamps": stamps,
     }
     if isinstance(path, Log):
         given = next((key for key, value in options.items() if value not in (None, {})), None)

@@ -1,6 +1,7 @@
 """Findings in a recorded run that affect the trust in results from it.
 
-Gaps, rows that were moved, dropped or doubled, sensors that are stuck or saturated, and outliers.
+Gaps, rows that were moved, dropped or doubled, inputs without samples, sensors that are stuck or saturated, and
+outliers; and how times were read, where the file does not say it.
 
 Stuck. Identical samples in a row are explained by quantisation where equal neighbours are common, in the channel
 or at this value: if a share p of the other neighbours is equal, so many in a row come by chance with probability
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
 GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped", "doubled"
 STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
 DAMAGED = "damaged"  # the file: of its messages some are not read
-SPOILING = (GAP, STUCK, SATURATED, OUTLIER)  # what moves estimates
+CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
+SPOILING = (GAP, STALE, STUCK, SATURATED, OUTLIER)  # what moves estimates
 LEVEL = 1e-4
 SHORTEST = 8  # samples: a run of equal ones that is worth a word
 COMMON = 0.1  # of neighbours that are equal: the channel is quantised
@@ -42,6 +44,14 @@ SPIKE, ALONE = 7.0, 2.0
 AROUND = 25  # samples before and after, whose differences tell the noise, too
 NORMAL = 1.4826  # standard deviation over the median of magnitudes
 LISTED = 3  # findings of one kind and channel that are said one by one
+
+
+class Remark(NamedTuple):
+    """A finding in a whole file."""
+
+    kind: str
+    channel: str  # such as "input:V_s"; empty for all
+    sentence: str  # in words, without a full stop
 
 
 class Recording(NamedTuple):
@@ -55,6 +65,7 @@ class Recording(NamedTuple):
     doubled: int = 0  # rows with the stamp of the row before
     dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
     damage: tuple[str, ...] = ()  # what of the file is not read because it is damaged, in words
+    remarks: tuple[Remark, ...] = ()  # how the file was read
 
 
 @dataclass(frozen=True)
@@ -62,7 +73,8 @@ class Finding:
     """One thing that was found in a log.
 
     Attributes:
-        kind: "damaged", "gap", "missing rows", "moved", "dropped", "doubled", "stuck", "saturated" or "outlier".
+        kind: "damaged", "clock", "outside", "no input", "gap", "missing rows", "moved", "dropped", "doubled",
+            "stuck", "saturated" or "outlier".
         channel: such as "measurement:thrust"; empty for all of a row.
         first: row of the log where it begins; 0 if it is everywhere.
         last: row where it ends, included.
@@ -116,6 +128,7 @@ def has_outliers(logs: Sequence[Log]) -> bool:
 def _of_rows(log: Log) -> list[Finding]:
     told, last = log.recording, log.steps
     found = [Finding(DAMAGED, "", 0, last, 1, said) for said in told.damage]
+    found += [Finding(one.kind, one.channel, 0, last, last + 1, one.sentence) for one in told.remarks]
     for first, count in told.gaps:
         said = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
         found.append(Finding(GAP, "", first, first + count - 1, count, said))

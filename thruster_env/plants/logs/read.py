@@ -26,7 +26,9 @@ from thruster_env.plants.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, gr
 from thruster_env.plants.logs.log import FEWEST_STEPS, Log
 from thruster_env.plants.logs.own_stamps import at_own_stamps
 from thruster_env.plants.logs.recorders.merged import Recorded
-from thruster_env.plants.logs.recorders.registry import format_of
+from thruster_env.plants.logs.recorders.registry import check_stamps, format_of
+from thruster_env.plants.logs.stale_inputs import stale_inputs
+from thruster_env.plants.logs.stamps import follows
 from thruster_env.plants.logs.table import Table, read_table, table_of
 from thruster_env.plants.logs.units import converted
 from thruster_env.plants.state_space import StateSpaceModel
@@ -43,6 +45,7 @@ class Description(NamedTuple):
     units: Mapping[str, str] = {}  # by header
     clock_offset: Mapping[str, float] = {}  # by quantity [s]: how far its clock is ahead
     dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
+    stamps: str | None = None  # of a bag: "header" or "receipt"
 
     def updated(self, other: Description) -> Description:
         """This one, overridden by the other."""
@@ -51,6 +54,7 @@ class Description(NamedTuple):
             units={**self.units, **other.units},
             clock_offset={**self.clock_offset, **other.clock_offset},
             dt=self.dt if other.dt is None else other.dt,
+            stamps=self.stamps if other.stamps is None else other.stamps,
         )
 
 
@@ -62,6 +66,7 @@ def read_log(
     clock_offset: Mapping[str, float] | None = None,
     dt: float | None = None,
     grid: bool = True,
+    stamps: str | None = None,
     name: str = "a table",
 ) -> Log:
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
@@ -71,6 +76,7 @@ def read_log(
     numbers, or ISO 8601 dates, the first of which is time 0. A file beside it, run.toml for run.csv, may say
 
         dt = 0.01
+        stamps = "receipt"
         [columns]
         thrust = "loadcell[kgf]"
         [units]
@@ -90,6 +96,8 @@ def read_log(
         dt: sample time [s], for files without a time column, or whose time stamps lie on no grid.
         grid: whether samples are put on a grid; else rows are the times of samples
             (`thruster_env.plants.logs.own_stamps`), and `dt` is the sample time to which covariances belong.
+        stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
+            topics have stamps of one clock (`thruster_env.plants.logs.recorders.one_clock`).
         name: of a log that is not a file.
 
     Raises:
@@ -100,14 +108,15 @@ def read_log(
         if not isinstance(given, Mapping | None):
             raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(given)}")
     beside = _described(Path(path)) if is_file else Description()
-    said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
+    said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt, stamps))
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None
     if form is not None:
         asked = [text for text in said.columns.values() if isinstance(text, str)]
-        recorded = Recorded(path, form, asked)
+        recorded = Recorded(path, form, asked, said.stamps)
         table, found = recorded.table(recorded.columns(wanted, said.columns, said.units, said.dt is None))
     else:
+        check_stamps(said.stamps, None, path if is_file else name)
         table = read_table(path) if is_file else table_of(path, name)
         found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
     file = table.file
@@ -133,16 +142,23 @@ def read_log(
             parts[one.key] = sampled(series, dt, of_file.rows, offset, one.quantity.angle)
             lost = len(series.values) - int((~np.isnan(sampled(series, dt, of_file.rows))).sum())
             dropped += [(one.key, lost)] if lost else []
-    stamps, last = None, of_file.rows - 1
+    marks, last = None, of_file.rows - 1
     if not grid:
         driving = [one.key for one in wanted if one.kind == INPUT]
-        stamps, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]), start)
-        last = len(stamps) - 1
+        marks, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]), start)
+        last = len(marks) - 1
 
     def those(kind: str, rows: int) -> np.ndarray:
         some = [parts[one.key] for one in wanted if one.kind == kind]
         return np.column_stack(some) if some else np.empty((rows, 0))
 
+    driven = {
+        one.key: samples[one.key]._replace(times=samples[one.key].times - offsets.get(one.key, 0.0))
+        for one in wanted
+        if one.kind == INPUT
+    }
+    end = float(of_file.times[-1]) if marks is not None else of_file.dt * (of_file.rows - 1)
+    remarks = (*table.remarks, *stale_inputs(driven, end, dt, start))
     referred = {
         one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
     }
@@ -162,8 +178,8 @@ def read_log(
         source=source,
         offsets=offsets,
         irregular=of_file.irregular,
-        recording=recording._replace(damage=table.damage),
-        stamps=stamps,
+        recording=recording._replace(damage=table.damage, remarks=remarks),
+        stamps=marks,
     )
 
 
@@ -234,7 +250,7 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     if len(back):
         row = int(back[0]) + 1
         raise ValueError(
-            f"times must increase from row to row, but {own[row]:.16g} s follows {own[row - 1]:.16g} s in "
+            f"times must increase from row to row, but {follows(own[row - 1], own[row])} in "
             f"{table.place(row, column.header)}"
         )
     count = (own[-1] - own[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)

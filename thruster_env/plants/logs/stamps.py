@@ -63,6 +63,12 @@ def time_text(seconds: float, dt: float, least: int = 6) -> str:
     return f"{seconds:.{digits_for(abs(seconds), dt, least)}g}"
 
 
+def follows(before: float, after: float) -> str:
+    """Two times that are in the wrong order: "0.07 s follows 0.08 s"."""
+    some = [time_text(one, abs(after - before), 10) for one in (after, before)]
+    return f"{some[0]} s follows {some[1]} s"
+
+
 def date_text(seconds: float) -> str:
     """The date of a time since 1970, in parentheses behind a blank; empty for any other time."""
     if not SINCE_1970[0] <= seconds <= SINCE_1970[1]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.extras import to_install
+from thruster_env.plants.logs.findings import Remark
 from thruster_env.plants.logs.recorders.topics import Refused, bounded, check_bytes
 from thruster_env.plants.logs.stamps import MISSING as MISSING_TEXT
 from thruster_env.plants.logs.stamps import seconds_of, since_first
@@ -41,6 +42,7 @@ class Table:
         line_word: the word for a line.
         clock: rows whose times make the grid, where that are not all (rows,).
         damage: what of the file is not read because it is damaged, in words.
+        remarks: findings in the file, by which its rows were made.
     """
 
     file: str
@@ -49,6 +51,7 @@ class Table:
     line_word: str = "line"
     clock: np.ndarray | None = None
     damage: tuple[str, ...] = ()
+    remarks: Sequence[Remark] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

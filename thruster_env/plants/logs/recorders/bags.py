@@ -15,6 +15,7 @@ import numpy as np
 
 from thruster_env.plants.logs.recorders.bag_counts import check_counts, check_topics, counts_of, is_ros1
 from thruster_env.plants.logs.recorders.bag_files import Bag, files_of, unpacker
+from thruster_env.plants.logs.recorders.one_clock import HEADER, RECEIPT
 from thruster_env.plants.logs.recorders.topics import (
     MOST_COLUMNS,
     MOST_FIELDS,
@@ -31,7 +32,7 @@ KIND = "bag"
 TICKS = 1e9  # a second
 NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
 NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
-HEADER = "std_msgs/msg/Header"
+HEADER_TYPE = "std_msgs/msg/Header"
 DEEPEST = 8  # messages within messages
 
 
@@ -46,10 +47,11 @@ class Leaf(NamedTuple):
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The topics of a bag: times are the stamps of the messages' headers, else when the messages were received.
 
-    Times are [s] since the bag's first message was received; a topic has those of headers if all its messages have
-    one that is not 0. Fields are numbers and short arrays, of which each message has as many; a bag has no units.
-    Types come from the bag, or where it has none from the newest release of ROS 2 that the package knows. If a
-    topic has several, its messages are matched by the names of fields; a field is NaN in messages without it.
+    Times are [s] since the bag's first message was received; a topic has those of headers if these have stamps: 0
+    is one only at the beginning, where simulated time begins. It has the times of reception, too. Fields are
+    numbers and short arrays, of which each message has as many; a bag has no units. Types come from the bag, or
+    where it has none from the newest release of ROS 2 that the package knows. If a topic has several, its messages
+    are matched by the names of fields; a field is NaN in messages without it.
 
     Args:
         path: of a .bag, .db3 or .mcap file, or of the folder of a bag of ROS 2.
@@ -152,7 +154,7 @@ class Decoder:
         self._message = lambda data: read(data, kind)
         self._fields = attrgetter(*(one.path for one in self.leaves), "__class__") if self.leaves else None
         fields = dict(store.fielddefs.get(kind, ((), ()))[1])
-        self._has_header = "header" in fields and fields["header"][1] == HEADER
+        self._has_header = "header" in fields and fields["header"][1] == HEADER_TYPE
 
     def read(self, data: bytes) -> tuple[int, tuple]:
         """The header's stamp [ns], 0 where there is none, and what each leaf holds."""
@@ -208,10 +210,17 @@ class Samples:
         return values, unread
 
 
+def _are_set(stamps: np.ndarray) -> bool:
+    """Whether headers have stamps; 0 stands where there is none, and at the beginning of simulated time."""
+    nothing = np.flatnonzero(stamps == 0)
+    return len(nothing) < len(stamps) and bool((nothing == np.arange(len(nothing))).all())
+
+
 def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str, str]) -> Topic:
     """A topic whose messages are of one type or several, in order of their times [s] since the beginning [ns]."""
     stamps, received = (np.concatenate([np.empty(0, np.int64), *some]) for some in _ticks(parts))
-    ticks = (stamps if stamps.all() else received).astype(np.int64)
+    has_stamps = _are_set(stamps[np.argsort(received, kind="stable")])
+    ticks = (stamps if has_stamps else received).astype(np.int64)
     order = np.argsort(ticks, kind="stable")
     values: dict[str, np.ndarray] = {}
     unread, row = dict(unread), 0
@@ -221,9 +230,10 @@ def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str,
         for field, numbers in columns.items():
             values.setdefault(field, np.full(len(ticks), np.nan))[row : row + len(numbers)] = numbers
         row += len(one.received)
-    return Topic(
-        name, (ticks[order] - begin) / TICKS, {key: one[order] for key, one in values.items()}, unread=unread
-    )
+    times, received = ((some[order] - begin) / TICKS for some in (ticks, received))
+    values = {key: one[order] for key, one in values.items()}
+    clock = (HEADER, received) if has_stamps else (RECEIPT, None)
+    return Topic(name, times, values, unread=unread, clock=clock[0], received=clock[1])
 
 
 def _ticks(parts: Sequence[Samples]) -> Iterator[list[np.ndarray]]:
@@ -238,7 +248,7 @@ def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Itera
         path = before + (f"{name}_" if iskeyword(name) else name)
         if node.name == "BASE" and NUMBER.fullmatch(what[0]):
             yield Leaf(path, False)
-        elif node.name == "NAME" and what != HEADER and what in defined and depth < DEEPEST:
+        elif node.name == "NAME" and what != HEADER_TYPE and what in defined and depth < DEEPEST:
             yield from _leaves(defined, what, f"{path}.", depth + 1)
         elif node.name in ("ARRAY", "SEQUENCE"):
             (inner, base), size = what

@@ -9,7 +9,10 @@ import numpy as np
 
 from thruster_env.numerics.checks import listed
 from thruster_env.plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns
-from thruster_env.plants.logs.recorders.registry import Format, Samples, read
+from thruster_env.plants.logs.findings import CLOCK, OUTSIDE, Remark
+from thruster_env.plants.logs.recorders.one_clock import HEADER, RECEIPT, Choice, chosen_clock
+from thruster_env.plants.logs.recorders.registry import Format, Samples, check_stamps, read
+from thruster_env.plants.logs.stamps import follows, time_text
 from thruster_env.plants.logs.table import Table
 from thruster_env.plants.logs.units import parted
 
@@ -24,9 +27,13 @@ class Recorded:
         samples: by name; of a format with stamps, those that are asked for, as one file may have hundreds.
     """
 
-    def __init__(self, path: str | Path, form: Format, asked: Collection[str]):
-        """Read the fields that are asked for, "HEADER" or "HEADER[UNIT]"; all of arrays, found by their names."""
-        self.path, self.form = Path(path), form
+    def __init__(self, path: str | Path, form: Format, asked: Collection[str], stamps: str | None = None):
+        """Read the fields that are asked for, "HEADER" or "HEADER[UNIT]"; all of arrays, found by their names.
+
+        `stamps` of a bag is "header" or "receipt", None for what `one_clock` chooses.
+        """
+        check_stamps(stamps, form, path)
+        self.path, self.form, self.stamps = Path(path), form, stamps
         names = {name for text in asked for name in (text, text.rpartition("[")[0].strip()) if name}
         self.is_whole, self.is_timed = not form.has_stamps, False
         self.samples = read(path, None if self.is_whole else names)
@@ -57,7 +64,8 @@ class Recorded:
         """The rows of a log and their columns: at the times of all samples, from when all inputs are known.
 
         The measurement with most samples gives the grid: the log begins and ends with it. Before it, an input's
-        last sample counts. Of two samples of a field at one time, the last is used.
+        last sample counts. Of two samples of a field at one time, the last is used. All fields have the times of
+        one clock.
 
         Args:
             found: columns by quantity.
@@ -69,6 +77,8 @@ class Recorded:
             key: one for key, one in found.items() if key != TIME or self.is_timed or not self.has_times(found)
         }
         some = {column.header: self.samples[column.header] for column in found.values()}
+        choice = chosen_clock({name: one.clocked for name, one in some.items()}, self.stamps, self.path)
+        some = {name: one.by(choice.clock) for name, one in some.items()}
         for name, one in some.items():
             _check(name, one, self.path)
         if TIME in found or all(one.times is None for one in some.values()):
@@ -88,12 +98,38 @@ class Recorded:
         for name in (found[key].header for key in found if key.startswith(f"{INPUT}:")):
             cells[name][0] = some[name].values[_times(some[name]) <= stamps[0]][-1]
         rows = range(1, len(stamps) + 1)
-        is_clock = np.isin(stamps, clock)
-        table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(some))
+        is_clock, remarks = np.isin(stamps, clock), [*_of_choice(choice), *_not_used(found, some, clock)]
+        table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(some), remarks)
         return table, {**found, TIME: Column(STAMP, None)}
 
 
 KINDS = (INPUT, MEASUREMENT)
+MANY = 0.1  # of the samples of a channel outside the log: worth a word
+
+
+def _of_choice(choice: Choice) -> list[Remark]:
+    """Why a bag's topics have the times of reception, where some have others."""
+    if not choice.why:
+        return []
+    said = f"all topics have the times at which messages were received, because {choice.why}"
+    return [Remark(CLOCK, "", f"{said} (stamps, --stamps {HEADER}|{RECEIPT})")]
+
+
+def _not_used(found: Mapping[str, Column], some: Mapping[str, Samples], clock: np.ndarray) -> list[Remark]:
+    """Channels of which many samples, or all, lie outside the log."""
+    remarks = []
+    for key, column in found.items():
+        times = _times(some[column.header])
+        outside = int(((times < clock[0]) | (times > clock[-1])).sum())
+        if outside > MANY * len(times):
+            dt = float(np.median(np.diff(clock)))
+            ends = [time_text(one, dt) for one in (times[0], times[-1], clock[0], clock[-1])]
+            count = "all" if outside == len(times) else f"{outside} of {len(times)}"
+            said = (
+                f"{count} samples of {column.header} lie outside the log: they are from {ends[0]} to {ends[1]} s,"
+            )
+            remarks.append(Remark(OUTSIDE, key, f"{said} the log from {ends[2]} to {ends[3]} s"))
+    return remarks
 
 
 def _unit(name: str, one: Samples) -> str | None:
@@ -113,13 +149,11 @@ def _check(name: str, one: Samples, path: Path) -> None:
         raise ValueError(f"every sample must have a time, but one of {name!r} in {path} has none")
     if (np.diff(times) < 0).any():
         row = int(np.argmax(np.diff(times) < 0)) + 1
-        raise ValueError(
-            f"times must increase from sample to sample, but {times[row]:.16g} s follows {times[row - 1]:.16g} s "
-            f"in {name!r} of {path}"
-        )
+        rule = "times must increase from sample to sample"
+        raise ValueError(f"{rule}, but {follows(times[row - 1], times[row])} in {name!r} of {path}")
     if np.isinf(one.values).any():
         row = int(np.argmax(np.isinf(one.values)))
-        where = f"at {times[row]:.16g} s" if len(times) else f"in row {row + 1}"
+        where = f"at {times[row]:.15g} s" if len(times) else f"in row {row + 1}"
         raise ValueError(f"numbers must be finite, but got {one.values[row]} {where} in {name!r} of {path}")
 
 
@@ -145,9 +179,10 @@ def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.nda
     within = [_times(one)[_times(one) >= begin] for one in measured]
     clock = max(within, key=len, default=np.empty(0))
     if len(clock) < 2:
+        end = max((_times(one)[-1] for one in measured if len(one.values)), default=np.nan)
         raise ValueError(
-            f"measurements must continue after all inputs have begun, at {begin:.16g} s, but {path} has "
-            f"{len(clock)} from there on"
+            f"measurements must continue after all inputs have begun, at {begin:.15g} s, but {path} has "
+            f"{len(clock)} from there on, and they end at {end:.15g} s"
         )
     return clock
 

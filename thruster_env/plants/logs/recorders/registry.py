@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from thruster_env.numerics.checks import one_of
 from thruster_env.plants.logs.columns import TIME, find_columns
 from thruster_env.plants.logs.recorders import bag_counts, bags, dataflash, hdf5, matlab, ulog
 from thruster_env.plants.logs.recorders.bag_files import METADATA
-from thruster_env.plants.logs.recorders.topics import Reader, Wanted, unreadable
+from thruster_env.plants.logs.recorders.one_clock import RECEIPT, STAMPS, Clocked, chosen_clock
+from thruster_env.plants.logs.recorders.topics import Reader, Topic, Wanted, unreadable
 from thruster_env.plants.logs.table import SUFFIXES, Table, read_table
 from thruster_env.plants.logs.units import converted, parted
 
@@ -26,14 +28,15 @@ class Format(NamedTuple):
     magic: bytes  # the first bytes of a file
     topics: Reader
     has_stamps: bool = True  # whether each topic has times of its own, whatever its fields are called
+    has_receipt: bool = False  # whether messages have times of reception beside those of headers
 
 
 FORMATS = (
     Format(ulog.KIND, (".ulg", ".ulog"), ulog.MAGIC, ulog.topics),
     Format(dataflash.KIND, (".bin",), dataflash.MAGIC, dataflash.topics),
-    Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics),
-    Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics),
-    Format("bag of ROS 2", (".db3",), bag_counts.DB3, bags.topics),
+    Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics, has_receipt=True),
+    Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics, has_receipt=True),
+    Format("bag of ROS 2", (".db3",), bag_counts.DB3, bags.topics, has_receipt=True),
     Format(matlab.KIND, (".mat",), matlab.MAGIC, matlab.topics, False),
     Format(hdf5.KIND, (".h5", ".hdf5", ".hdf"), hdf5.MAGIC, hdf5.topics, False),
 )
@@ -47,6 +50,20 @@ class Samples(NamedTuple):
     values: np.ndarray  # (samples,)
     unit: str  # empty where the file has none
     damage: str = ""  # what of the file is not read because it is damaged, in words
+    clock: str = ""  # "header" or "receipt" in a bag
+    received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
+
+    @property
+    def clocked(self) -> Clocked:
+        """Its times, to choose one clock for all."""
+        return Clocked(self.clock, np.empty(0) if self.times is None else self.times, self.received)
+
+    def by(self, clock: str) -> Samples:
+        """These samples by the times at which they were received, or as they are."""
+        if clock != RECEIPT or self.received is None:
+            return self
+        order = self.clocked.order
+        return self._replace(times=self.received[order], values=self.values[order], clock=RECEIPT, received=None)
 
 
 class Field(NamedTuple):
@@ -57,6 +74,9 @@ class Field(NamedTuple):
     samples: int
     rate: float  # [Hz], over the whole field
     gap: float  # [s], the longest between two samples
+    begin: float  # [s], of its times
+    end: float
+    clock: str  # of its times: "header" or "receipt" in a bag, else empty
     unit: str  # empty where the file has none
     least: float
     greatest: float
@@ -97,26 +117,36 @@ def format_of(path: str | Path) -> Format | None:
     return begun
 
 
-def contents(path: str | Path) -> Contents:
+def contents(path: str | Path, stamps: str | None = None) -> Contents:
     """All fields of a recorder's file or a table that hold numbers, and what of it is not read.
 
     Args:
         path: of the file.
+        stamps: of a bag, the clock of all topics: "header" or "receipt", as in
+            `thruster_env.plants.logs.recorders.one_clock`; of topics without stamps in headers always "receipt".
+            By default that of headers if all topics have stamps of one clock.
 
     Raises:
         ValueError: if it is no recorder's file and no table, or is damaged; the message is one line.
     """
     if Path(path).suffix.lower() in SUFFIXES:
+        check_stamps(stamps, None, path)
         return _of_table(read_table(path))
-    found, unread, damage = list[Field](), dict[str, str](), dict[str, None]()
-    for topic in _known(path).topics(Path(path), None):
-        found += [
-            _field(topic.column(name), topic.name, topic.times, values, topic.units.get(name, ""))
-            for name, values in topic.values.items()
-        ]
+    form = _known(path)
+    check_stamps(stamps, form, path)
+    listed, found, clocked = list[Field](), list[tuple[str, str, Samples]](), dict[str, Clocked]()
+    unread, damage = dict[str, str](), dict[str, None]()
+    for topic in form.topics(Path(path), None):
+        found += [(topic.name, *one) for one in _samples(topic)]
+        clocked |= {topic.name: found[-1][2].clocked} if topic.clock and topic.values else {}
         unread |= {topic.column(name) if name else topic.name: why for name, why in topic.unread.items()}
         damage |= {topic.damage: None} if topic.damage else {}
-    return Contents(found, unread, tuple(damage))
+        if not form.has_receipt:  # nothing has to be known of all topics first
+            listed += [_field(name, topic, one) for topic, name, one in found]
+            found.clear()
+    clock = stamps or chosen_clock(clocked, None, Path(path)).clock
+    listed += [_field(name, topic, one.by(clock)) for topic, name, one in found]
+    return Contents(listed, unread, tuple(damage))
 
 
 def _of_table(table: Table) -> Contents:
@@ -138,14 +168,24 @@ def _of_table(table: Table) -> Contents:
         else:
             there = ~np.isnan(values) & (True if times is None else ~np.isnan(times))
             own = times[there] if times is not None else None
-            found.append(_field(name, "", own, values[there], parted(name)[1] or ""))
+            found.append(_field(name, "", Samples(own, values[there], parted(name)[1] or "")))
     return Contents(found, unread, ())
 
 
-def fields(path: str | Path) -> list[Field]:
+def fields(path: str | Path, stamps: str | None = None) -> list[Field]:
     """All fields of a recorder's file that hold numbers, in order of topics; raises as `contents`."""
     _known(path)
-    return contents(path).fields
+    return contents(path, stamps).fields
+
+
+def check_stamps(stamps: str | None, form: Format | None, path: str | Path) -> None:
+    """Raise ValueError for a choice of stamps that is none, or of a file whose messages have one time."""
+    if stamps is None:
+        return
+    one_of("stamps (--stamps)", stamps, STAMPS)
+    if form is None or not form.has_receipt:
+        what = "a table" if form is None else f"a {form.kind}"
+        raise ValueError(f"stamps (--stamps) must be chosen for a bag, but got {stamps!r} for {what}, {path}")
 
 
 def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
@@ -160,11 +200,18 @@ def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
     """
     wanted: Wanted = None if names is None else frozenset(names)
     return {
-        topic.column(name): Samples(topic.times, values, topic.units.get(name, ""), topic.damage)
+        name: one
         for topic in _known(path).topics(Path(path), wanted)
-        for name, values in topic.values.items()
-        if wanted is None or topic.column(name) in wanted
+        for name, one in _samples(topic)
+        if wanted is None or name in wanted
     }
+
+
+def _samples(topic: Topic) -> Iterator[tuple[str, Samples]]:
+    """Column and samples of each field of a topic."""
+    for name, values in topic.values.items():
+        unit = topic.units.get(name, "")
+        yield topic.column(name), Samples(topic.times, values, unit, topic.damage, topic.clock, topic.received)
 
 
 def _known(path: str | Path) -> Format:
@@ -175,9 +222,12 @@ def _known(path: str | Path) -> Format:
     return found
 
 
-def _field(name: str, topic: str, times: np.ndarray | None, values: np.ndarray, unit: str) -> Field:
+def _field(name: str, topic: str, one: Samples) -> Field:
+    times, values = one.times, one.values
     nothing, count = float("nan"), len(values)
-    rate = gap = nothing
+    rate = gap = begin = end = nothing
+    if times is not None and count:
+        begin, end = float(times.min()), float(times.max())
     if times is not None and count > 1:
         length = float(times.max() - times.min())
         rate = (count - 1) / length if length > 0.0 else nothing
@@ -191,4 +241,4 @@ def _field(name: str, topic: str, times: np.ndarray | None, values: np.ndarray, 
         with np.errstate(all="ignore"):  # a part without numbers has no mean
             sums = np.add.reduceat(np.where(known, values, 0.0), starts)
             course = sums / np.add.reduceat(known, starts, dtype=int)
-    return Field(name, topic, count, rate, gap, unit, *ends, tuple(course.tolist()))
+    return Field(name, topic, count, rate, gap, begin, end, one.clock, one.unit, *ends, tuple(course.tolist()))

@@ -30,6 +30,8 @@ class Topic(NamedTuple):
     units: Mapping[str, str] = {}  # by field, where the file has them
     unread: Mapping[str, str] = {}  # why fields are not read; "" for all of the topic
     damage: str = ""  # what of the file is not read because it is damaged, in words
+    clock: str = ""  # "header" or "receipt" in a bag
+    received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
 
     def column(self, field: str) -> str:
         """The name of a field's column: TOPIC.FIELD."""
