@@ -53,7 +53,7 @@ class Live:
             came after. The estimate is that of the right order.
         skip_missing: whether a NaN is left out; else it is refused.
         monitor: tests on the innovations, as wrappers take them. It sees all samples in the order in which they
-            were measured: where a late one comes in, it goes back as well.
+            were measured: where a late one comes in, it goes back as well. Its steps are updates, of any sensor.
         resolution: of the stamps [s]; float64's where that is coarser, as of seconds since 1970. Two stamps that
             are no further apart are one, and a step that is longer than the sample time by no more is one step.
 

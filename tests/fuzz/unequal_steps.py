@@ -188,7 +188,7 @@ def _log(rng, of: LinearModel, kind: str, given: str) -> None:
     hand.update(z[0], of.dt, of.r)
     for k in range(steps):
         apart = float(log.times[k + 1] - log.times[k])
-        count = max(1, int(np.ceil(apart / of.dt - max(1e-6, 2.0 * np.spacing(stamps[-1]) / of.dt))))
+        count = max(1, int(np.ceil(apart / of.dt - max(1e-6, 4.0 * np.spacing(stamps[-1]) / of.dt))))
         for _ in range(count):
             hand.predict(u[k], apart / count, of.q * (apart / count / of.dt))
         length = apart / count

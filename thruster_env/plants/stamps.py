@@ -31,9 +31,11 @@ def closeness(dt: float, resolution: float) -> float:
 def count_steps(length: float, dt: float, resolution: float) -> int:
     """How many equal steps of at most dt [s] a time [s] is divided into, for stamps of some resolution [s].
 
+    Both the time and dt, which is often read off stamps, are rounded.
+
     Raises ValueError for more than MOST_STEPS, as after a clock was set.
     """
-    count = length / dt - max(ROUNDING, resolution / dt)
+    count = length / dt - max(ROUNDING, 2.0 * resolution / dt)
     if not count <= MOST_STEPS:
         raise ValueError(
             f"two successive stamps must be at most {MOST_STEPS} steps of {dt:g} s apart, but are {length:.9g} s: "
