@@ -293,3 +293,39 @@ def test_arguments_are_checked():
             MovingHorizonFilter(model=model, **{number: value})
     with pytest.raises(ValueError, match="loss must be one of huber, student, quadratic, but got 'cauchy'"):
         MovingHorizonFilter(model=model, loss="cauchy")
+
+
+@pytest.mark.parametrize("loss", ["quadratic", "huber", "student"])
+def test_its_window_is_where_the_cost_is_least_with_the_noise_of_each_step(loss):
+    """The slope of the cost, each step with Q and R of its own and one step with two measurements, is zero."""
+    inputs, measurements = curved_data()
+    rng = np.random.default_rng(5)
+    qs, rs = ([factor * one for factor in rng.uniform(0.2, 4.0, 8)] for one in (Q, R))
+    filter_ = MovingHorizonFilter(model=curved_model(), horizon=20, iterations=50, loss=loss, threshold=K)
+    belief, _ = filter_.update(filter_.init(), measurements[0], measurement_noise_cov=rs[0])
+    second = np.array([1.1, 0.4])
+    belief, _ = filter_.update(belief, second, measurement_noise_cov=rs[7])
+    for k, (u, z) in enumerate(zip(inputs, measurements[1:], strict=True)):
+        belief = filter_.predict(belief, u, process_noise_cov=qs[k])
+        belief, _ = filter_.update(belief, z, measurement_noise_cov=rs[k + 1])
+    window = filter_.window(belief)
+    np.testing.assert_allclose(window[0], window[1], rtol=1e-9)  # one state, twice
+
+    def of_one(x, z, r):
+        seen = ~np.isnan(z)
+        v = (z - observe(x, ()))[seen]
+        return rho(v @ np.linalg.solve(r[np.ix_(seen, seen)], v), seen.sum(), loss) if seen.any() else 0.0
+
+    def total(states):
+        states = states.reshape(-1, 2)
+        found = 0.5 * (states[0] - PRIOR) @ np.linalg.solve(PRIOR_COV, states[0] - PRIOR) + of_one(
+            states[0], second, rs[7]
+        )
+        found += sum(
+            0.5 * w @ np.linalg.solve(q, w) for w, q in zip(disturbances(states, inputs), qs, strict=False)
+        )
+        return found + sum(of_one(x, z, r) for x, z, r in zip(states, measurements, rs, strict=False))
+
+    at = window[1:].ravel()
+    slope = [(total(at + step) - total(at - step)) / 2e-5 for step in 1e-5 * np.eye(len(at))]
+    np.testing.assert_allclose(slope, 0.0, atol=2e-3)
