@@ -269,11 +269,14 @@ class Live:
             self._watch.recall(first.tests)
         if time > first.begin + near:
             self._predict(time, first.given)
-        alarms = self._update(z)
-        for one, before in zip(again, raised, strict=True):
+        alarms = list(self._update(z))
+        for one in again:
             if one.is_prediction:
                 self._predict(one.end, one.given)
-                continue
-            known = {(alarm.test, alarm.channel) for alarm in before}
-            alarms += tuple(new for new in self._update(one.given) if (new.test, new.channel) not in known)
-        return alarms
+            else:
+                alarms += self._update(one.given)
+        for old in (alarm for some in raised for alarm in some):  # of which one may come some steps later now
+            same = [new for new in alarms if (new.test, new.channel) == (old.test, old.channel)]
+            if same:
+                alarms.remove(same[0])
+        return tuple(alarms)

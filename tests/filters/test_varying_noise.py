@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -36,6 +37,14 @@ REFUSED = {
     **{(name, "factor"): "scale_process_noise needs a filter with one model" for name in ("imm", "mmae", "fuzzy")},
     ("kf-steady", "factor"): "Q and R of the filter 'kf-steady' cannot vary",
 }
+
+
+class Both(NamedTuple):
+    """Constants of which either may be the sample time."""
+
+    dt: float
+    drag: float
+    substep: float
 
 
 def moving(q=(0.01, 0.01), r=(0.05, 0.05), dt=0.1):
@@ -316,3 +325,10 @@ def test_the_gradient_along_the_prior_has_the_weights_that_follow_from_it():
         return run(make_filter("h-infinity", moved), None, u, z).log_likelihoods.sum()
 
     assert out[0, 0, 1] == pytest.approx((level(1e-5) - level(-1e-5)) / 2e-5, rel=1e-5)
+
+
+def test_of_two_constants_that_may_be_the_sample_time_none_is_taken():
+    model = moving().replace(constants=Both(0.1, 0.3, 0.05))
+    for use in (lambda: make_filter("ekf", model).session().set_dt(0.2), lambda: make_filter("ekf", model).live()):
+        with pytest.raises(ValueError, match="a model with one of the constants dt and substep, but got both"):
+            use()

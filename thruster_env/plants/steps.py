@@ -121,13 +121,15 @@ def sample_time_place(model: StateSpaceModel, what: str) -> tuple[int, int]:
         what: needs it, for the message.
 
     Raises:
-        ValueError: for a model without one, or whose other constants follow from it.
+        ValueError: for a model without one, or with both of them, or whose other constants follow from it.
     """
     names = getattr(model.constants, "_fields", ())
     called = "needs" if what == "set_dt" else "must be of"
     if "of_one_dt" in names:
         rule = f"{what} {called} a model whose other constants do not follow from dt"
         raise ValueError(f"{rule}, but got those of lagging sensors")
+    if "dt" in names and "substep" in names:
+        raise ValueError(f"{what} {called} a model with one of the constants dt and substep, but got both")
     for name, parts in (("dt", 1), ("substep", model.substeps)):
         if name in names:
             return names.index(name), parts
