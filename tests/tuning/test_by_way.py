@@ -9,12 +9,18 @@ import pytest
 import tuning
 from tests.linear_problem import LinearProblem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.ways.problems import linear
+from thruster_env.plants.affine import affine_model
 from tuning.api import by_way
+from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
+from tuning.problems.runs_problem import RunsProblem
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.ways.registry import WAYS
+from tuning.search.space import untuned_choice
+from tuning.ways.registry import WAYS, find_way
+from tuning.ways.task import Budget, Task
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
@@ -95,3 +101,78 @@ def test_ctrl_c_ends_a_way_with_what_it_has_found(monkeypatch, tmp_path):
     before = SHORT.untuned["process_noise_cov"]
     np.testing.assert_allclose(study.choice.model["process_noise_cov"], np.multiply(2.0, before))
     assert study.save(tmp_path / "tuned.json").is_file()
+
+
+def singular(first_scored_step=0, runs=6, steps=60):
+    """Runs of a position and a velocity that one noise drives, without true states."""
+    rng, drive = np.random.default_rng(0), np.array([0.005, 0.1])
+    a, c = np.array([[1.0, 0.1], [0.0, 0.95]]), np.array([[1.0, 0.0]])
+    model = affine_model(
+        a=a,
+        b=np.zeros((2, 0)),
+        c=c,
+        process_noise_cov=np.outer(drive, drive),
+        measurement_noise_cov=[0.04],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[0.5, 0.5],
+    )
+    found = []
+    for _ in range(runs):
+        x, rows = rng.normal(size=2), []
+        for _ in range(steps):
+            rows.append(x[:1] + 0.2 * rng.normal(size=1))
+            x = a @ x + drive * rng.normal()
+        found.append({"measurements": np.array(rows)})
+    return RunsProblem(found, model, first_scored_step=first_scored_step, name="driven")
+
+
+@pytest.mark.parametrize("way", ["em", "squarem", "als", "mehra"])
+def test_ways_of_q_and_r_alone_say_how_p0_is_left_out(as_python, way):
+    with pytest.raises(
+        ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*way 'likelihood'"
+    ) as said:
+        tuning.tune(singular(), "kf", way=way, trials=3, progress=False)
+    assert "\n" not in str(said.value)
+    problem = singular(first_scored_step=50)
+    task = Task("kf", problem, problem.data([0, 1]), options={"prior": problem.counts_start_up})
+    WAYS[way].check(way, task)
+
+
+def with_larger_r(task):
+    """A way that believes the measurements far too little."""
+    task.keep(task.with_values([1e3 * one for one in task.values_of(task.start, task.free)], task.free))
+
+
+def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypatch, tmp_path):
+    monkeypatch.setitem(WAYS, "scoring", WAYS["scoring"]._replace(follow=with_larger_r))
+    problem, options = singular(first_scored_step=50), {"trials": 3, "progress": False}
+    storage = tmp_path / "studies.journal"
+    study = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
+    assert same_filter(study.choice, untuned_choice("kf", problem))
+    refused = study.tuning.way.refused
+    assert refused.found > refused.given == pytest.approx(study.tuning.result.best_value)
+    again = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
+    for one in (study, again):
+        assert f"worse on these ({refused.found:.4g} for {refused.given:.4g})" in one.tuning.chosen[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [one for one in WAYS if one not in ("nuts", "posterior")])
+def test_no_way_returns_worse_than_it_was_given(way):
+    problem = singular(first_scored_step=50)
+    task = Task("kf", problem, problem.data(range(4)), budget=Budget(1000, 3.0))
+    try:
+        find_way(way).run(way, task)
+    except ValueError as lacking:
+        assert "needs" in str(lacking) or "tunes" in str(lacking)
+    meter = Task("kf", problem, problem.data(range(4)))
+    assert meter.value(task.best) <= meter.value(task.start) * (1 + 1e-6)
+
+
+def test_em_with_long_steps_ends_where_a_variance_goes_to_zero():
+    """It took 20 000 steps and minutes for some sixty rows."""
+    problem = linear(runs=2, steps=30, truth=False)
+    task = Task("kf", problem, problem.data([0, 1]), options={})
+    find_way("squarem").run("squarem", task)
+    assert task.runs < 20_000
+    assert task.value(task.best) == pytest.approx(64.2459381973658, abs=1e-4)  # of way "likelihood"

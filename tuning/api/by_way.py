@@ -21,7 +21,7 @@ from tuning.search.space import AUTO, Choice, trial_parameters, untuned_choice, 
 from tuning.search.study import FINISHED, OnTrial, StudyResult
 from tuning.search.trials import run_trial
 from tuning.ways.registry import WAYS, find_way
-from tuning.ways.task import Budget, Task
+from tuning.ways.task import Budget, Refused, Task
 
 ANSWER = "answer of the way"  # attribute of a study
 
@@ -33,6 +33,7 @@ class Followed(NamedTuple):
     choice: Choice
     runs: float  # passes of the filter over one run each
     seconds: float  # of processor time, without compilation
+    refused: Refused | None = None  # where the choice is what the way was given
 
 
 def check_way(plan: Plan, name: str, workers: int) -> None:
@@ -71,7 +72,8 @@ def follow(
         find_way(name).run(name, task)
         stopped = interrupted()
     space = plan.space()
-    for choice in _some([one.choice for one in task.kept[1:]], trials - 1):
+    path = task.kept[1:] if task.refused is None else task.kept[1:-1]
+    for choice in _some([one.choice for one in path], trials - 1):
         study.enqueue_trial(within_ranges(trial_parameters(choice, space), space))
     waiting = len(study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.WAITING,)))
 
@@ -79,7 +81,7 @@ def follow(
         on_trial(study, len(study.get_trials(deepcopy=False, states=FINISHED)))
 
     study.optimize(lambda trial: run_trial(trial, plan, data, space), n_trials=waiting, callbacks=[after])
-    answer = {"choice": task.best._asdict(), "runs": task.runs, "seconds": task.seconds}
+    answer = {"choice": task.best._asdict(), "runs": task.runs, "seconds": task.seconds, "refused": task.refused}
     study.set_user_attr(ANSWER, answer)
     return stopped
 
@@ -102,13 +104,13 @@ def _start(plan: Plan, name: str) -> Choice | None:
 def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
     """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
     answer = study.user_attrs[ANSWER]
-    found = answer["choice"]
+    found, refused = answer["choice"], answer.get("refused")
     choice = Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"]))
     value = measured(choice, plan, plan.training_data()).value
     nothing: dict[str, Any] = {"consistent": None, "nis": (), "validation": None, "sizes": [], "free_value": None}
     return (
         result._replace(choice=choice, best_value=value, **nothing),
-        Followed(name, choice, answer["runs"], answer["seconds"]),
+        Followed(name, choice, answer["runs"], answer["seconds"], refused and Refused(*refused)),
     )
 
 
@@ -116,7 +118,11 @@ def way_sentence(found: Followed, word: str) -> str:
     """How the parameters were found, and the cost."""
     way = WAYS[found.name]
     took = f"It took {found.seconds:.2g} s and as much as {found.runs:.0f} passes of the filter over one of the"
-    return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}."
+    worse = ""
+    if found.refused is not None:
+        given, answer = found.refused
+        worse = f" Its answer is worse on these ({answer:.4g} for {given:.4g}), so the start is chosen."
+    return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
 
 
 def _some(choices: Sequence[Choice], count: int) -> list[Choice]:

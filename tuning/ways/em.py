@@ -8,10 +8,14 @@ from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.goal import Goal
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
-from tuning.ways.task import FEW, Task
+from tuning.ways.task import FEW, Task, way_out
 
 MOST = 20_000  # steps
 CLOSE = 1e-9  # largest relative change of a variance in a step that ends the search
+ENOUGH, PATIENCE = (
+    1e-8,
+    100,
+)  # log L rises by less in so many steps where a variance goes to zero: an end, too
 LEAST = 0.1  # factor of a step; only those of a nonlinear filter could be smaller, or negative
 
 
@@ -50,11 +54,14 @@ def squarem(task: Task) -> None:
     """
     goal = task.goal(LIKELIHOOD)
     point, counts = _start(task, goal)
+    level, quiet = -np.inf, 0
     for _ in range(MOST):
         once, before = _step(goal, point, counts)
         twice, _ = _step(goal, once, counts)
         r, v = once - point, twice - once - (once - point)
-        if abs(twice - once).max() < CLOSE:
+        quiet = 0 if before > level + ENOUGH else quiet + 1
+        level = level if quiet else before
+        if abs(twice - once).max() < CLOSE or quiet == PATIENCE:
             return
         a = -max(1.0, float(np.sqrt((r @ r) / max(v @ v, 1e-300))))
         far = np.clip(point - 2.0 * a * r + a * a * v, goal.coordinates.low, goal.coordinates.high)
@@ -72,7 +79,9 @@ def _start(task: Task, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
         elif isinstance(one.place, MeasurementVariance):
             counts.append(measured[one.place.index])
         else:
-            raise ValueError(f"EM tunes only variances in Q and R, but {one.name} is tuned, too")
+            raise ValueError(
+                f"EM tunes only variances in Q and R, but {one.name} is tuned, too{way_out(one.name)}"
+            )
     first = np.clip(goal.coordinates.of(goal.untuned), goal.coordinates.low, goal.coordinates.high)
     return first, np.array(counts, dtype=np.float64)
 

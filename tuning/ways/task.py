@@ -20,7 +20,7 @@ from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.goal import Goal
-from tuning.problems.data import Data
+from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
@@ -29,6 +29,7 @@ from tuning.search.space import Choice, neutral, parameters, untuned_choice
 
 FEW = 32  # runs, by which passes are priced
 TIMED = 3  # calls, of which the shortest counts, of what is priced
+ROUNDING = 1e-6  # part of an objective: an answer that is worse by less is as good
 SMOOTHER = 2.0  # passes that a smoother counts
 
 
@@ -45,6 +46,13 @@ class Kept(NamedTuple):
     runs: float
     seconds: float
     choice: Choice
+
+
+class Refused(NamedTuple):
+    """An answer that was worse than what the way was given, which then is the answer."""
+
+    given: float  # the objective of what was given
+    found: float  # that of the answer
 
 
 class Spent(Exception):
@@ -93,6 +101,7 @@ class Task:
         self.runs, self._excluded = 0.0, 0.0
         self._prices: dict[str, float] = {}
         self.kept = [Kept(0.0, 0.0, self.start)]
+        self.refused: Refused | None = None
         self._seen: set[tuple] = set()
         self._begun = time.process_time()
 
@@ -166,6 +175,19 @@ class Task:
         """Raise Spent once the budget is over, or an end is asked for."""
         if self.runs > self.budget.runs or self.seconds > self.budget.seconds or self.stop():
             raise Spent
+
+    def refuse_worse(self) -> None:
+        """Return to the start where the best is worse on the same runs, by the objective and by the likelihood."""
+        if same_filter(self.best, self.start):
+            return
+        with self.uncounted():
+            values = {
+                name: [self._value(one, name, self.data) for one in (self.start, self.best)]
+                for name in {self.objective, LIKELIHOOD}
+            }
+        if all(not found <= given + ROUNDING * abs(given) for given, found in values.values()):
+            self.kept.append(Kept(self.runs, self.seconds, self.start))
+            self.refused = Refused(*values[self.objective])
 
     @contextmanager
     def uncounted(self) -> Iterator[None]:
@@ -252,6 +274,16 @@ def shortest(call: Callable[[], object]) -> float:
         call()
         found.append(time.process_time() - begin)
     return max(min(found), 1e-6)
+
+
+def way_out(name: str) -> str:
+    """How P0 is not tuned, for the message of a way that cannot; nothing for other parameters."""
+    if name != "P0":
+        return ""
+    return (
+        f", as the first steps of runs are scored: leave out {FIRST_SCORED_STEP} of them (first_scored_step="
+        f"{FIRST_SCORED_STEP} of RunsProblem), or take way 'likelihood'"
+    )
 
 
 def within_first_range(one: Parameter) -> Parameter:

@@ -12,7 +12,7 @@ from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
 from tuning.ways.lagged import stationary
-from tuning.ways.task import Spent, Task
+from tuning.ways.task import Spent, Task, way_out
 
 TRUTH = "truth"  # true states
 GRADIENT = "gradient"  # a Kalman filter with derivatives
@@ -62,15 +62,19 @@ class Way(NamedTuple):
             raise ValueError(f"way {name!r} needs {NUTPIE}, which is not installed: {to_install('nuts')}")
         unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
         if unable:
-            raise ValueError(f"way {name!r} must come without {', '.join(unable)}")
+            rest = f": P0 is tuned{way_out('P0')}" if "prior" in unable else ""
+            raise ValueError(f"way {name!r} must come without {', '.join(unable)}{rest}")
 
-    def run(self, name: str, task: Task) -> None:
+    def run(self, name: str, task: Task, guarded: bool = True) -> None:
         """Follow the way until it is done or the budget spent; ValueError if the task lacks what it needs.
 
-        What it found is `task.best`, and what it would have found for less is `task.kept`.
+        What it found is `task.best`, and what it would have found for less is `task.kept`. What is worse than the
+        start by the task's objective is not the answer: the start is (`task.refused`).
         """
         self.check(name, task)
         try:
             self.follow(task)
         except Spent:
             pass
+        if guarded and not task.stop():  # whoever asks for an end waits for no more
+            task.refuse_worse()

@@ -175,7 +175,7 @@ def _follow(case: Case, way: str, place: int, task: Task) -> None:
     """Let a task keep what a way finds."""
     problem = task.problems[0]
     if way in WAYS:
-        return find_way(way).run(way, task)
+        return find_way(way).run(way, task, guarded=False)
     found: Choice | None = task.start
     if way == SCALED:
         found = scaled_default(case.filter, problem, place).choice
