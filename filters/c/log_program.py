@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from filters.c.log_reader import READER
 from filters.c.programs import FilterPrograms
 from filters.logs.columns import header_of
 from filters.logs.estimate import SKIPPED
 from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.columns import plain
-from thruster_env.plants.logs.units import suffix
+from thruster_env.plants.logs import write
+from thruster_env.plants.logs.columns import DATE_NAMES, TIME_NAMES, plain
+from thruster_env.plants.logs.units import LENGTHS, WORDS, conversion
 from thruster_env.plants.quantities import Quantity
 
 MAIN = """\
@@ -15,43 +17,30 @@ MAIN = """\
 
        @NAME@_log [HEADER ...] < log.csv > estimates.csv
 
-   HEADER names the columns of the inputs, then of the measurements; without any they are those below. An input
-   acts from its row on. An empty cell is a missing measurement.@ABOUT@ */
+   HEADER names the columns of the inputs, then of the measurements, "HEADER[UNIT]" with another unit; without any
+   they are those below, or others of the same name or symbol. An input acts from its row on, and is held where its
+   cell is empty; an empty cell of a measurement is a missing one. Text, infinite
+   numbers, unknown units, and times that are not one step apart end it with the number of the line.@ABOUT@ */
 #include "@NAME@.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 enum { INPUTS = @INPUTS@, CHANNELS = @CHANNELS@, COLUMNS = INPUTS + CHANNELS, STATES = @STATES@@TESTED@ };
-enum { LONGEST = 65536 };
+enum { LONGEST = 65536, MOST_CELLS = 4096, TIME = COLUMNS, FEWEST_ROWS = 3 };
+#define LARGEST @LARGEST@
 
-static const char *headers[COLUMNS] = {@HEADERS@};
-static int column_of[COLUMNS];
-static char line[LONGEST];
-
-/* The next cell of a line, cut off from the rest; NULL behind the last one. */
-static char *next_cell(char **rest)
-{
-    char *cell = *rest;
-
-    if (cell != NULL) {
-        char *end = strpbrk(cell, ",\\r\\n");
-        *rest = end != NULL && *end == ',' ? end + 1 : NULL;
-        if (end != NULL) {
-            *end = '\\0';
-        }
-    }
-    return cell;
-}
-
+@TABLES@
+@READER@
 static void show(double number)
 {
     if (isnan(number)) {
         printf(",");
     } else {
-        printf(",%.10g", number);
+        printf(",%.@DIGITS@g", number);
     }
 }
 
@@ -59,56 +48,28 @@ int main(int count, char **words)
 {
     @NAME@ filter;
     @REAL@ values[COLUMNS] = {0}, last[COLUMNS];
-    char *rest = line, *cell;
-    int time_column = -1;
 
     if (count != 1 && count != 1 + COLUMNS) {
         fprintf(stderr, "give no header, or %d, inputs first\\n", (int)COLUMNS);
         return 2;
     }
-    if (fgets(line, LONGEST, stdin) == NULL) {
-        fprintf(stderr, "a log must have a line of headers\\n");
+    if (!read_headers(count > 1 ? words + 1 : NULL)) {
         return 2;
-    }
-    for (int i = 0; i < COLUMNS; i++) {
-        headers[i] = count > 1 ? words[1 + i] : headers[i];
-        column_of[i] = -1;
-    }
-    for (int k = 0; (cell = next_cell(&rest)) != NULL; k++) {
-        for (int i = 0; i < COLUMNS; i++) {
-            column_of[i] = strcmp(cell, headers[i]) == 0 ? k : column_of[i];
-        }
-        time_column = strcmp(cell, "time_s") == 0 ? k : time_column;
-    }
-    for (int i = 0; i < COLUMNS; i++) {
-        if (column_of[i] < 0) {
-            fprintf(stderr, "a log must have a column %s, or its headers be given\\n", headers[i]);
-            return 2;
-        }
     }
     printf("time_s@TITLES@\\n");
     @NAME@_init(&filter@KEY@);
-    for (long row = 0; fgets(line, LONGEST, stdin) != NULL; row++) {
-        const char *time = "";
-
-        rest = line;
+    for (long row = 0; read_row(row); row++) {
         for (int i = 0; i < COLUMNS; i++) {
             last[i] = values[i];
-            values[i] = (@REAL@)NAN;
-        }
-        for (int k = 0; (cell = next_cell(&rest)) != NULL; k++) {
-            time = k == time_column ? cell : time;
-            for (int i = 0; i < COLUMNS; i++) {
-                if (column_of[i] == k && *cell != '\\0') {
-                    values[i] = (@REAL@)strtod(cell, NULL);
-                }
+            if (i >= INPUTS || !isnan(numbers[i])) {
+                values[i] = (@REAL@)numbers[i];
             }
         }
         if (row > 0) {
-@CHECK@            @NAME@_predict(&filter@LAST@);
+            @NAME@_predict(&filter@LAST@);
         }
 @BEGIN@        @NAME@_update(&filter, values + INPUTS);
-        printf("%s", time);
+        printf("%s", time_text);
         for (int i = 0; i < STATES; i++) {
             show((double)filter.x[i]);
             show(sqrt((double)filter.P[i * (STATES + 1)]));
@@ -119,18 +80,10 @@ int main(int count, char **words)
         }
 @ALARMS@        printf("\\n");
     }
-    return 0;
+    (void)last;
+    return is_sound() ? 0 : 2;
 }
 """
-CHECK = """\
-            for (int i = 0; i < INPUTS; i++) {
-                if (isnan(last[i])) {
-                    fprintf(stderr, "row %ld has no %s\\n", row, headers[i]);
-                    return 2;
-                }
-            }
-"""
-
 
 ABOUT = """ Columns alarm_... count the tests of a
    channel that raise an alarm, from row TESTED on."""
@@ -153,28 +106,31 @@ ALARMS = """\
 def log_program(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
     """The source of the program for a filter in C of this name.
 
-    An ensemble's random numbers are those of seed 0 in `thruster estimate`, whose columns are those of its output:
-    the estimate and its standard deviation, then each innovation with its own. Where the filter tests its
-    innovations, the number of alarms of each channel follows, from row 50 on, as with `--skip 50`.
+    It reads numbers, missing ones, units and times as `thruster_env.plants.logs.read.read_log` does, or ends with
+    exit code 2 and the number of the line. An ensemble's random numbers are those of seed 0 in `thruster
+    estimate`, whose columns are those of its output: the estimate and its standard deviation, then each innovation
+    with its own. Where the filter tests its innovations, the number of alarms of each channel follows, from row 50
+    on, as with `--skip 50`.
     """
     model, key = programs.model, "".join(f", {int(word)}" for word in filter_keys([0])[0])
     pairs = [(model.states, ("", "std")), (model.measurements, ("innovation", "innovation_std"))]
     titles = [header_of(what, one) for some, kinds in pairs for one in some for what in kinds]
     titles += [header_of("alarm", one._replace(unit="")) for one in model.measurements if tested]
-    headers = [_header(one) for one in (*model.input_quantities, *model.measurements)]
     words = {
         "ABOUT": ABOUT * tested,
         "BEGIN": BEGIN * tested,
         "ALARMS": ALARMS * tested,
         "TESTED": f", TESTED = {SKIPPED}" * tested,
-        "CHECK": CHECK if model.inputs else "            (void)last;\n",
+        "TABLES": _tables((*model.input_quantities, *model.measurements)),
+        "READER": READER,
         "KEY": key * (programs.members > 0),
         "NAME": name,
         "REAL": "float" if single else "double",
+        "LARGEST": "FLT_MAX" if single else "DBL_MAX",
+        "DIGITS": "9" if single else "15",
         "INPUTS": str(model.inputs),
         "CHANNELS": str(model.m),
         "STATES": str(model.n),
-        "HEADERS": ", ".join(f'"{_text(one)}"' for one in headers),
         "TITLES": _text("".join(f",{one}" for one in titles)).replace("%", "%%"),
         "LAST": ", last" * (model.inputs > 0),
     }
@@ -184,11 +140,62 @@ def log_program(name: str, programs: FilterPrograms, *, single: bool = False, te
     return found
 
 
-def _header(one: Quantity) -> str:
-    """The header of a column as `thruster simulate` writes it: the name and the unit."""
-    return "_".join(filter(None, (plain(one.name), suffix(one.unit))))
+def _tables(quantities: tuple[Quantity, ...]) -> str:
+    """The constants of the reader: headers, names and symbols of columns, and the units that it converts."""
+    headers: dict[str, None] = {}
+    names: list[str] = []
+    for one in quantities:
+        headers[write.header_of(one, headers)] = None
+        name = plain(one.name).lower()
+        names.append("" if name in names else name)  # of two quantities of one name the second has its symbol
+    units = [*(one.unit for one in quantities), "s"]
+    rates = [
+        f"{over}/{under}{power}" for over in WORDS for under in ("s", "min", "h") for power in ("", "^2", "^3")
+    ]
+    rows = []
+    for wanted in dict.fromkeys(units):
+        for unit in dict.fromkeys([wanted, *WORDS, *rates]):
+            known = (1.0, 1.0, 0.0) if unit == wanted else conversion(unit, wanted) if unit else None
+            if unit and known is not None:
+                rows.append(
+                    f'    {{{units.index(wanted)}, "{_text(unit)}", {known[0]!r}, {known[1]!r}, {known[2]!r}}},'
+                )
+    firsts = ", ".join(str(units.index(one)) for one in units)
+    return "\n".join(
+        [
+            _array("headers[COLUMNS]", headers),
+            _array("names[COLUMNS]", names),
+            _array("symbols[COLUMNS]", [plain(one.symbol) for one in quantities]),
+            _array("time_names[]", [*TIME_NAMES, ""]),
+            _array("date_names[]", [*DATE_NAMES, ""]),
+            _array("known_units[]", [*WORDS, ""]),
+            _array("lengths[]", [*LENGTHS, ""]),
+            "/* Units by the first column that has them, the last for times: (number factor + zero)/divisor. */",
+            f"static const int unit_of[COLUMNS + 1] = {{{firsts}}};",
+            "static const struct {",
+            "    int of;",
+            "    const char *text;",
+            "    double factor, divisor, zero;",
+            "} units[] = {",
+            *rows,
+            "};",
+        ]
+    )
+
+
+def _array(name: str, texts) -> str:
+    """An array of texts, some to a line."""
+    lines, line = [], "   "
+    for one in texts:
+        word = f' "{_text(one)}",'
+        if len(line) + len(word) > 110:
+            lines, line = [*lines, line], "   "
+        line += word
+    return f"static const char *const {name} = {{\n" + "\n".join([*lines, line]) + "\n};"
 
 
 def _text(text: str) -> str:
-    """Text within a string of C."""
-    return text.encode("ascii", "replace").decode().replace("\\", "\\\\").replace('"', '\\"')
+    """Text within a string of C, in UTF-8."""
+    return "".join(
+        f"\\{byte:03o}" if byte < 32 or byte > 126 or chr(byte) in '"\\?' else chr(byte) for byte in text.encode()
+    )

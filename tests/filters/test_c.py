@@ -27,6 +27,7 @@ from thruster_env.numerics.algebra.graphs import Graph, arctan2, where
 from thruster_env.numerics.algebra.programs import Place, program_of
 from thruster_env.numerics.angles import difference
 from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.replay import ReplayEnv
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
@@ -426,17 +427,93 @@ def log_of(model, inputs, z):
     return "\r\n".join(rows) + "\r\n"
 
 
+STEP = "times must be one step apart, to a twentieth of a step"
+
+
 @pytest.mark.usefixtures("as_python")
-def test_a_log_without_a_column_is_refused(tmp_path):
+def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
     write_project(made("ekf", thruster_model()), tmp_path, "one")
     command = ["gcc", *WARNINGS, "one.c", "main.c", "-lm", "-o", "one_log"]
     assert subprocess.run(command, cwd=tmp_path).returncode == 0
     for words, log, told in [
         ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
+        (
+            [],
+            "voltage_V,V_s,thrust\n",
+            "line 1: a column must be there once for voltage_V, but there are voltage_V and V_s\n",
+        ),
         (["u", "z"], "u,thrust\n", "a log must have a column z, or its headers be given\n"),
         (["u"], "u,z\n", "give no header, or 2, inputs first\n"),
-        (["u", "z"], "u,z\n1,2\n,3\n4,5\n", "row 2 has no u\n"),
+        (
+            ["u", "z"],
+            "u,z\n,2\n1,3\n4,5\n",
+            "line 2: an input must be known from the first row on, but got 'voltage_V'\n",
+        ),
+        (["u", "z"], "u,z\n1,2\n1,3.1 N\n4,5\n", "line 3: column z must hold numbers, but got '3.1 N'\n"),
+        (["u", "z"], 'u,z\n1,2\n"off",3\n4,5\n', "line 3: column u must hold numbers, but got 'off'\n"),
+        (["u", "z"], "u,z\n1,2\n1,--\n4,5\n", "line 3: column z must hold numbers, but got '--'\n"),
+        (["u", "z"], "u,z\n1,2\n1,inf\n4,5\n", "line 3: column z must hold numbers, but got 'inf'\n"),
+        (["u", "z"], "u,z\n1,2\n1,0x1p3\n4,5\n", "line 3: column z must hold numbers, but got '0x1p3'\n"),
+        (["u", "z"], "u,z\n1,2\n1,-1e400\n4,5\n", "line 3: column z must hold finite numbers, but got '-1e400'\n"),
+        (
+            ["u", "z"],
+            "u,z\n1,2\n1\n4,5\n",
+            "line 3: a row must have as many cells as the header, but got 'fewer'\n",
+        ),
+        (
+            ["u", "z"],
+            "u,z\n1,2\n\n4,5\n4,6\n",
+            "line 3 is empty: rows of a log without times must follow one another\n",
+        ),
+        (["u", "z"], "u,z,u\n1,2,1\n", "line 1: names of columns must differ from one another, but got 'u'\n"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.03\n", f"line 4: {STEP}, but got '.03'\n"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.01\n", f"line 4: {STEP}, but got '.01'\n"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,-.01\n4,5,.01\n", f"line 3: {STEP}, but got '-.01'\n"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,\n4,5,.01\n", "line 3: every row must have a time, but got ''\n"),
+        (
+            ["u_uA", "z"],
+            "u_uA,z\n",
+            "line 1: the unit of column u_uA must be one that this program converts, but got 'uA'\n",
+        ),
+        (
+            ["u", "z[kg]"],
+            "u,z\n",
+            "line 1: the unit of column z must be one that this program converts, but got 'kg'\n",
+        ),
+        (["u", "z"], "u,z\n1,2\n2,2\n3,2\n", "a measurement must vary, but column z does not\n"),
+        (["u", "z"], "u,z\n1,2\n2,3\n", "a log must have at least 3 rows, but got 2\n"),
         ([], "", "a log must have a line of headers\n"),
     ]:
         result = subprocess.run([tmp_path / "one_log", *words], input=log, capture_output=True, text=True)
         assert (result.returncode, result.stderr) == (2, told)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(
+    ("words", "log"),
+    [
+        ([], "voltage_mV,measured thrust [kN],t\n1000,.002,0\n3000,0.003,1\n2000,.005,2\n"),
+        ([], "V_s;thrust\n1;2\n3;3\n2;5\n\n"),
+        ([], '\ufeffvoltage_V,thrust_N,"time [min]"\r\n1,"2",0\r\n 3 ,3,1\r\n2,+.5e1,2\r\n\r\n'),
+        (["U_mV", "F_N"], "U_mV,F_N\n1000,2\n3000,3\n2000,5\n"),
+        (["U[kV]", "F[mN]"], "#U\tF\n1e-3\t2000\n3e-3\t3000\n.002\t5000\n,,\n".replace(",,", "\t")),
+        (["U_uV", "F"], "U_uV,F,x\n1e6,2,text\n3e6,3,\n2e6,5,-\n"),
+    ],
+)
+def test_a_log_is_read_in_any_unit_as_estimate_reads_it(words, log, tmp_path):
+    model = thruster_model()
+    write_project(made("ekf", model), tmp_path, "one")
+    assert subprocess.run(["gcc", "one.c", "main.c", "-lm", "-o", "one_log"], cwd=tmp_path).returncode == 0
+    given = subprocess.run([tmp_path / "one_log", *words], input=log.encode(), capture_output=True, check=True)
+    plain = "voltage_V,measured_thrust_N\n1,2\n3,3\n2,5\n"
+    same = subprocess.run([tmp_path / "one_log"], input=plain.encode(), capture_output=True, check=True)
+    for one, other in zip(
+        given.stdout.decode().splitlines()[1:], same.stdout.decode().splitlines()[1:], strict=True
+    ):
+        np.testing.assert_allclose(np.array(one.split(",")[1:], float), np.array(other.split(",")[1:], float))
+    (tmp_path / "log.csv").write_text(log)
+    columns, header = dict(zip(("V_s", "thrust"), words, strict=False)), log.split("\n")[0]
+    has_times = "time" in header or header.endswith(",t")
+    log = read_log(tmp_path / "log.csv", model, columns, dt=None if has_times else 1.0)
+    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 3.0])
+    np.testing.assert_allclose(log.measurements[:, 0], [2.0, 3.0, 5.0])

@@ -226,6 +226,12 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     count = len(table.lines)
     if dt is not None:
         dt = positive("dt", dt)
+    apart = np.flatnonzero(np.diff(table.lines) != 1)
+    if column is None and len(apart):
+        line = table.lines[int(apart[0])] + 1
+        raise ValueError(
+            f"rows of a log without times must follow one another, but line {line} of {file} is empty"
+        )
     if column is None:
         if dt is None:
             raise ValueError(

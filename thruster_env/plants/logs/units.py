@@ -13,9 +13,13 @@ WORDS = (
     *("V", "mV", "kV", "A", "mA", "W", "kW", "Hz", "kHz", "rpm", "rps", "rad", "mrad", "deg", "turn", "rev"),
     *("N", "mN", "kN", "kgf", "lbf", "Nm", "kg", "g", "Pa", "kPa", "bar", "K", "degC", "degF"),
     *("m", "mm", "cm", "km", "s", "ms", "us", "ns", "min", "h", "sec", "minutes", "hours", "days"),
+    *("uV", "nV", "uA", "nA", "mW", "MW", "MHz", "uN", "MN", "mNm", "kNm", "mPa", "hPa", "MPa", "mbar", "mK"),
+    *("um", "nm", "urad", "mg", "ug"),
 )
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K")
+GRAVITY = "g_0"  # standard gravity; also "g" of accelerometers, where the other unit is an acceleration
+GRAMS = {"g": "g_0", "mg": "mg_0", "ug": "ug_0", "G": "g_0"}
 # Units as multiples of others. What turns or swings so often a second has an angle of 2 pi each time.
 MULTIPLES = {
     "rpm": ("rad/s", 2.0 * math.pi / 60.0),
@@ -29,12 +33,14 @@ MULTIPLES = {
     **dict.fromkeys(("minute", "minutes"), ("s", 60.0)),
     **dict.fromkeys(("hour", "hours"), ("s", 3600.0)),
     **dict.fromkeys(("d", "day", "days"), ("s", 86400.0)),
+    **{f"{prefix}{GRAVITY}": ("m/s^2", size * 9.80665) for prefix, size in (("", 1.0), ("m", 1e-3), ("u", 1e-6))},
     "degC": ("K", 1.0),  # a difference, as in K/min; a temperature itself is among OFFSET
     "degF": ("K", 5.0 / 9.0),
 }
 OFFSET = {"K": (1.0, 0.0), "degC": (1.0, 273.15), "degF": (5.0 / 9.0, 459.67 * 5.0 / 9.0)}  # factor, and K of 0
 TURNING = ("1/s", "1/min", "1/h", "s^-1", "min^-1", "h^-1")  # of turns, or of radians: nobody knows
 WRITTEN = {"Nm": "N*m", "°C": "degC", "°F": "degF", "°": "deg"}  # as pint reads them
+WRITTEN |= {**dict.fromkeys(("m/s/s", "m/s2", "m/s²", "m/s**2"), "m/s^2"), **dict.fromkeys(("g0", "gn"), "g_0")}
 LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
 _RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
 _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
@@ -98,13 +104,11 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
     """
     if unit is None or unit == wanted:
         return values
-    ends = [WRITTEN.get(text, text) for text in (unit, wanted)]
-    if all(end in OFFSET for end in ends):
-        (factor, zero), (of_wanted, of_zero) = (OFFSET[end] for end in ends)
-        return (values * factor + zero - of_zero) / of_wanted
-    (given, factor), (target, of_wanted) = simple(unit), simple(wanted)
-    if given == target:
-        return values * (factor / of_wanted)
+    known = conversion(unit, wanted)
+    if known is not None:
+        factor, divisor, zero = known
+        return (values * factor + zero) / divisor if zero else values * (factor / divisor)
+    (given, _), (target, _) = simple(unit), simple(wanted)
     for one, other, base in ((unit, wanted, target), (wanted, unit, given)):
         if one.replace(" ", "") in TURNING and base == "rad/s" and "Hz" not in other:
             rule = f"the unit of {where} must say whether it counts turns or radians (rpm, Hz, rad/min)"
@@ -121,9 +125,29 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         given, target = (WRITTEN.get(text, text) for text in (unit, wanted))
         return np.asarray(registry.Quantity(values, given).to(target).magnitude, dtype=np.float64)
     except pint.DimensionalityError:
-        raise ValueError(
-            f"the unit of {where} must be one that converts to {wanted or 'a pure number'}, but got {unit!r}"
-        ) from None
+        rule = f"the unit of {where} must be one that converts to {wanted or 'a pure number'}"
+        raise ValueError(f"{rule}, but got {unit!r} (name another in brackets: {_example(wanted)})") from None
     except Exception as error:  # pint raises many kinds for text that is no unit
         why = " ".join(str(error).split())
-        raise ValueError(f"the unit of {where} must be one that pint knows, but got {unit!r}: {why}") from None
+        rule = f"the unit of {where} must be one that pint knows, but got {unit!r}: {why}"
+        raise ValueError(f"{rule} (name another in brackets: {_example(wanted)})") from None
+
+
+def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
+    """Factor, divisor and zero of values in a unit: (value factor + zero)/divisor; None if `simple` knows none.
+
+    A "g" is a gram, and the standard gravity where the other unit is an acceleration.
+    """
+    ends = [WRITTEN.get(text, text) for text in (unit, wanted)]
+    if all(end in OFFSET for end in ends):
+        (factor, zero), (of_wanted, of_zero) = (OFFSET[end] for end in ends)
+        return factor, of_wanted, zero - of_zero
+    if sum(simple(end)[0] == "m/s^2" for end in ends) == 1:
+        ends = [GRAMS.get(end, end) for end in ends]
+    (given, factor), (target, of_wanted) = map(simple, ends)
+    return (factor, of_wanted, 0.0) if given == target else None
+
+
+def _example(wanted: str) -> str:
+    """How a unit is named."""
+    return f"--column NAME=HEADER[{wanted or 'UNIT'}]"
