@@ -87,6 +87,9 @@ class MultipleModelFilter(Filter):
             if not one.gaussian_likelihood or one.size or not one.has_covariance:
                 rule = "mode_filter must be a filter of one mean and covariance"
                 raise ValueError(f"{rule}, such as 'ekf', but got {one.name!r}")
+            if self.mixing is not None and not one.mixable:
+                rule = f"mode_filter of {self.name!r}, which mixes estimates, must keep no window of steps"
+                raise ValueError(f"{rule}, but got {one.name!r}: 'mmae' takes it")
         return found
 
     @cached_property

@@ -66,6 +66,7 @@ class MovingHorizonFilter(Filter):
     """
 
     name: ClassVar[str] = "mhe"
+    mixable: ClassVar[bool] = False  # its window would not know
     horizon: int = 10
     iterations: int = 3
     loss: str = HUBER

@@ -329,3 +329,14 @@ def test_its_window_is_where_the_cost_is_least_with_the_noise_of_each_step(loss)
     at = window[1:].ravel()
     slope = [(total(at + step) - total(at - step)) / 2e-5 for step in 1e-5 * np.eye(len(at))]
     np.testing.assert_allclose(slope, 0.0, atol=2e-3)
+
+
+def test_a_window_is_no_mode_of_a_filter_that_mixes_estimates():
+    with pytest.raises(
+        ValueError, match="'imm', which mixes estimates, must keep no window of steps, but got 'mhe'"
+    ):
+        make_filter("imm", line_model(), mode_filter="mhe")
+    modes, (inputs, measurements) = [{}, {}], simulated(line_model(), 6)
+    found = run(make_filter("mmae", line_model(), modes=modes, mode_filter="mhe"), KEYS, inputs, measurements)
+    expected = run(make_filter("mhe", line_model()), KEYS, inputs, measurements)
+    np.testing.assert_allclose(found.means, expected.means, rtol=1e-9)
