@@ -31,7 +31,8 @@ class TrainedEstimator:
     Attributes:
         path: of the file.
         name: of the estimator, such as "kalmannet".
-        about: what the file says: `kind`, `options`, `model` (a digest of its equations), `sizes`, `training`.
+        about: what the file says: `kind`, `options`, `model` (a digest of its equations), `sizes`, `quantities`
+            (names and units, which older files lack), `training`.
     """
 
     def __init__(self, path: str | Path):
@@ -46,8 +47,10 @@ class TrainedEstimator:
             if self.about["format"] != FORMAT:
                 raise ValueError(f"its format is not {FORMAT}")
             kind, self._options = str(self.about["kind"]), dict(self.about["options"])
-            self._made_for = {True: self.about["model"], False: self.about["sizes"]}
-        except (SafetensorError, KeyError, TypeError, ValueError) as error:
+            self._digest, self._quantities = self.about["model"], self.about.get("quantities")
+            if self._quantities is not None:
+                self._quantities = [[tuple(map(str, one)) for one in some] for some in self._quantities]
+        except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"an estimator's file must be one of `thruster train-estimator`, but {self.path} is not: {error}"
             ) from None
@@ -56,17 +59,49 @@ class TrainedEstimator:
     def __call__(self, model: StateSpaceModel) -> LearnedEstimator:
         """The estimator for a model; ValueError for another model than that of the training."""
         kind = LEARNED[self.name]
-        own, found = self._made_for[kind.needs_model], model.digest if kind.needs_model else sizes_of(model)
-        if own != found:
-            raise ValueError(
-                f"{self.path} must be used with the model that it was trained with, {own}, but got {found}"
-            )
+        self._check(model, kind.needs_model)
         made = kind(model, **self._options)
         try:
             made.load_state_dict(self._numbers)
         except RuntimeError as error:
             raise ValueError(f"{self.path} must have the numbers of a {self.name}, but: {error}") from None
         return made
+
+    def _check(self, model: StateSpaceModel, needs_model: bool) -> None:
+        """Raise ValueError for another model; without a model's equations for other names and units of quantities.
+
+        Names that nobody has chosen, such as x_1 without a unit, are those of any plant, and so are missing ones:
+        then the equations must agree.
+        """
+        found = quantities_of(model)
+        if model.digest == self._digest:
+            return
+        if not needs_model and found == self._quantities and not _are_unnamed(model):
+            return
+        own, given = self._digest, model.digest
+        if self._quantities is not None and found != self._quantities:
+            both = zip(self._quantities, found, strict=True)
+            own, given = next((_listed(one), _listed(other)) for one, other in both if one != other)
+        raise ValueError(
+            f"{self.path} must be used with the model that it was trained with, {own}, but got {given}"
+        )
+
+
+def quantities_of(model: StateSpaceModel) -> list[list[tuple[str, str]]]:
+    """Symbols and units of states, inputs and measurements."""
+    return [[(one.symbol, one.unit) for one in some] for some in model.quantities]
+
+
+def _are_unnamed(model: StateSpaceModel) -> bool:
+    """Whether all quantities have the symbols that they get of themselves, and no unit."""
+    pairs = zip("xuz", model.quantities, strict=True)
+    return quantities_of(model) == [
+        [(f"{letter}_{i + 1}", "") for i in range(len(some))] for letter, some in pairs
+    ]
+
+
+def _listed(quantities: list[tuple[str, str]]) -> str:
+    return ", ".join(f"{symbol} [{unit}]" if unit else symbol for symbol, unit in quantities) or "none"
 
 
 def sizes_of(model: StateSpaceModel) -> list[int]:
@@ -90,6 +125,7 @@ def write_estimator(path: str | Path, estimator: LearnedEstimator, training: dic
         "options": estimator.chosen,
         "model": estimator.model.digest,
         "sizes": sizes_of(estimator.model),
+        "quantities": quantities_of(estimator.model),
         "training": training,
     }
     numbers = {name: one.contiguous() for name, one in estimator.state_dict().items()}

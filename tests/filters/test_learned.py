@@ -19,6 +19,7 @@ from filters.learned.gains import KalmanNet
 from filters.learned.networks import GainNetwork
 from filters.wrappers.vector import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
+from thruster_env.plants.affine import affine_model
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6
@@ -303,6 +304,43 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
     )
     with pytest.raises(ValueError, match="must have the numbers of a kalmannet"):
         read(tmp_path / "odd.safetensors")(plane_model())
+
+
+def test_a_gru_is_refused_for_other_quantities_and_for_other_equations_of_unnamed_ones(tmp_path, as_python):
+    def plant(a=0.9, named=True, **changes):
+        names = {
+            "states": [("temperature", "T", "K")],
+            "input_quantities": [("power", "P", "W")],
+            "measurements": [("reading", "r", "K")],
+        }
+        names = names if named else {}
+        noise = {"process_noise_cov": [0.01], "measurement_noise_cov": [1.0]}
+        known = {"b": [[0.5]], "c": [[1.0]], "prior_mean": [0.0], "prior_cov": [1.0], **noise}
+        return affine_model(a=[[a]], **{**known, **names, **changes})
+
+    path = tmp_path / "gru.safetensors"
+    write_estimator(path, made("gru", plant(), width=3), {})
+    for model in (plant(), plant(a=0.8), plant(measurement_noise_cov=[4.0])):
+        assert read(path)(model).name == "gru"
+    for change, told in (
+        ({"states": [("speed", "v", "m/s")]}, r"T \[K\], but got v \[m/s\]"),
+        ({"measurements": [("reading", "r", "degC")]}, r"r \[K\], but got r \[degC\]"),
+        ({"input_quantities": [("power", "P", "kW")]}, r"P \[W\], but got P \[kW\]"),
+        ({"named": False}, r"T \[K\], but got x_1"),
+    ):
+        with pytest.raises(ValueError, match=f"the model that it was trained with, {told}$"):
+            read(path)(plant(**change))
+    write_estimator(tmp_path / "plain.safetensors", made("gru", plant(named=False), width=3), {})
+    assert read(tmp_path / "plain.safetensors")(plant(named=False)).name == "gru"
+    with pytest.raises(
+        ValueError, match="the model that it was trained with, [0-9a-f]{12}, but got [0-9a-f]{12}$"
+    ):
+        read(tmp_path / "plain.safetensors")(plant(a=0.8, named=False))
+    about = {key: value for key, value in read(path).about.items() if key != "quantities"}  # as older files
+    save_file(load_file(path), tmp_path / "old.safetensors", {"estimator": json.dumps(about)})
+    assert read(tmp_path / "old.safetensors")(plant()).name == "gru"
+    with pytest.raises(ValueError, match="the model that it was trained with"):
+        read(tmp_path / "old.safetensors")(plant(a=0.8))
 
 
 def test_unknown_and_wrong_options_are_refused():

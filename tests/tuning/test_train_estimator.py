@@ -93,6 +93,17 @@ def test_longer_runs_begin_as_the_others_and_larger_noise_has_four_times_r():
     assert twice_as_long(fixed, range(3)) is None
 
 
+def test_a_channel_without_measurements_is_refused_and_one_with_few_has_a_scale(runs):
+    filter_, data, _ = runs
+    measurements = data.measurements.copy()
+    measurements[:, 1::2] = np.nan
+    found = scales_of(filter_, data._replace(measurements=measurements))
+    assert all(np.isfinite(one).all() for one in found)
+    np.testing.assert_allclose(found.measured, np.nanstd(measurements, axis=(0, 1)))
+    with pytest.raises(ValueError, match="must have measurements of each channel, but .* has none"):
+        new_estimator("gru", filter_, data._replace(measurements=np.full_like(measurements, np.nan)), seed=1)
+
+
 def test_training_lowers_the_score_and_the_same_seed_gives_the_same_weights(runs):
     filter_, data, validation = runs
     threads, drawn, found = torch.get_num_threads(), torch.random.get_rng_state(), []

@@ -83,7 +83,10 @@ def scales_of(filter_: Filter, data: Data) -> Scales:
     error = np.ones(model.n)
     error[:n] = _size(wrapped_where((mean[..., :n] - states)[counted], model.shape.state_angles[:n]))
     truth = states[counted] if n == model.n else mean[counted]
+    _check_measured(seen.measurements, model)
     gain = np.linalg.lstsq(innovation[:, 1:][later], corrected[later], rcond=None)[0].T
+    spread = _large(np.nanstd(seen.measurements, axis=(0, 1)))
+    steps = _size(measured[later])
     return Scales(
         truth.mean(axis=0),
         _large(truth.std(axis=0)),
@@ -91,13 +94,20 @@ def scales_of(filter_: Filter, data: Data) -> Scales:
         _size(corrected[later]),
         error,
         np.nanmean(seen.measurements, axis=(0, 1)),
-        _large(np.nanstd(seen.measurements, axis=(0, 1))),
-        _size(measured[later]),
+        spread,
+        np.where(np.isnan(steps), spread, steps),  # of a channel that is never measured twice in a row
         _size(innovation[counted]),
         seen.inputs.mean(axis=(0, 1)),
         _large(seen.inputs.std(axis=(0, 1))),
         gain,
     )
+
+
+def _check_measured(measurements: np.ndarray, model: StateSpaceModel) -> None:
+    """Raise ValueError unless each channel (B, K + 1, m) has measurements, without which it has no scale."""
+    for one, values in zip(model.measurements, np.moveaxis(measurements, -1, 0), strict=True):
+        if not np.isfinite(values).any():
+            raise ValueError(f"a training must have measurements of each channel, but {one.symbol} has none")
 
 
 def _predicted(model: StateSpaceModel, mean: np.ndarray, inputs: np.ndarray) -> np.ndarray:
@@ -107,8 +117,9 @@ def _predicted(model: StateSpaceModel, mean: np.ndarray, inputs: np.ndarray) -> 
 
 
 def _size(values: np.ndarray) -> np.ndarray:
-    """Root mean squares of rows (rows, size)."""
-    return _large(np.sqrt(np.nanmean(values**2, axis=0)))
+    """Root mean squares of rows (rows, size); NaN for a column of which nothing is known."""
+    counts, sums = (~np.isnan(values)).sum(axis=0), np.nansum(values**2, axis=0)
+    return _large(np.sqrt(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)))
 
 
 def _large(values: np.ndarray) -> np.ndarray:
