@@ -22,7 +22,7 @@ from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
 from tuning.reporting.two_studies import Source, write_two_studies
 from tuning.search.sizing import SIZES
-from tuning.search.storage import open_storage
+from tuning.search.storage import open_storage, storage_text
 
 STUDIES = "out/studies.journal"  # where studies are unless it is told
 
@@ -70,7 +70,7 @@ def report(
         found = [
             _of_value(one, Path(scratch) / str(place))
             if isinstance(one, Study)
-            else Source(one, str(storage), _given(one, problem, model))
+            else Source(one, storage_text(storage), _given(one, problem, model))
             for place, one in enumerate(several)
         ]
         if len(found) == 1:

@@ -13,6 +13,7 @@ from tuning.api.run import aim_of, run_tuning
 from tuning.api.study import Study
 from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.plan import Plan
+from tuning.search.storage import storage_text
 
 
 def tune(
@@ -145,6 +146,6 @@ def tune(
         where=(where,) if isinstance(where, str) else tuple(where),
         worst=worst,
     )
-    place = None if storage is None else str(storage)
+    place = None if storage is None else storage_text(storage)
     console = console_for(progress)
     return Study(run_tuning(plan, trials, console, place, name, by_gradient=aim, way=way, workers=workers))

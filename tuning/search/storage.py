@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
@@ -12,6 +14,7 @@ from optuna.storages import BaseStorage
 from optuna.storages.journal import JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
+from thruster_env.numerics.checks import short_repr
 from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
 from tuning.search.storage_url import first_line, is_misspelt, public_url, without_secrets
 
@@ -23,7 +26,7 @@ PROCESS, RETRY_OF = (
 )  # trial attributes: who runs it, and which one it repeats
 
 
-def open_storage(storage: str) -> BaseStorage:
+def open_storage(storage: Any) -> BaseStorage:
     """Open a storage: a URL such as "postgresql+psycopg2://..." or "grpc://host:port", else a journal file.
 
     A database may be unreachable for a minute; a trial without a heartbeat is lost, and enqueued again.
@@ -31,8 +34,9 @@ def open_storage(storage: str) -> BaseStorage:
     A last line that a killed process left unfinished in a journal is cut off, with a warning.
 
     Raises:
-        ValueError: if it cannot be reached or is no journal.
+        ValueError: if it cannot be reached, is no journal, or is neither text nor a path.
     """
+    storage = storage_text(storage)
     if "://" in storage:
         from tuning.search.database import open_database
 
@@ -65,6 +69,15 @@ def open_storage(storage: str) -> BaseStorage:
         ) from None
 
 
+def storage_text(storage: Any) -> str:
+    """A storage as text; ValueError for what is neither text nor a path: a number would name a file."""
+    text = os.fspath(storage) if isinstance(storage, str | os.PathLike) else None
+    if not isinstance(text, str) or not text:
+        rule = "storage must be a journal file, such as 'studies.journal', or the URL of a database"
+        raise ValueError(f"{rule}, but got {short_repr(storage)}")
+    return text
+
+
 def this_process() -> str:
     """Name of this process for trials that it runs: host and process number."""
     return f"{os.uname().nodename}:{os.getpid()}"
@@ -92,6 +105,14 @@ def retry_once(study: optuna.Study, trial: FrozenTrial) -> bool:
         return False
     study.enqueue_trial(parameters, user_attrs={RETRY_OF: trial.number})
     return True
+
+
+def drop_waiting(study: optuna.Study) -> None:
+    """Fail trials that are enqueued, each unless another process begins it first."""
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+        with suppress(UpdateFinishedTrialError):
+            if study._storage.set_trial_state_values(trial._trial_id, state=TrialState.RUNNING):
+                study.tell(trial.number, state=TrialState.FAIL)
 
 
 def _wait_for_signature(study: optuna.Study, trial: FrozenTrial) -> FrozenTrial:

@@ -25,7 +25,7 @@ from tuning.search.plan import Plan
 from tuning.search.samplers import give_sampler, make_sampler
 from tuning.search.sizing import sized, sizes_of
 from tuning.search.space import Choice, trial_parameters
-from tuning.search.storage import PROCESS, retry_orphans, this_process
+from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
 from tuning.search.trials import cost_of, make_pruner, measure, run_trial
 from tuning.search.validation import Validation, as_data, validate
 
@@ -253,8 +253,11 @@ def run_trials(
     on_trial: OnTrial = lambda study, finished: None,
     stop: Callable[[], bool] = lambda: False,
     on_choice: Callable[[Choice], None] = lambda choice: None,
+    drops_waiting: bool = True,
 ) -> bool:
     """Run trials in this process until the study has `trials` finished ones; return whether Ctrl-C ended it.
+
+    Beside other processes nothing is enqueued for which no trial is left.
 
     Args:
         study: from `open_study`; other processes may run trials of it, too.
@@ -264,10 +267,11 @@ def run_trials(
         on_trial: called after each trial with the study and the number of finished trials.
         stop: asked before the first and after each trial whether to end.
         on_choice: called with the choice of each trial.
+        drops_waiting: whether trials that two processes enqueued at once, and nobody needs, are failed at the end.
     """
     if stop() or finished_trials(study) >= trials:
         return False
-    space = plan.space()
+    space, beside_others = plan.space(), False
 
     def objective(trial: optuna.Trial) -> list[float]:
         trial.set_user_attr(PROCESS, this_process())
@@ -275,8 +279,11 @@ def run_trials(
 
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
         _note_best(study, trial)
-        finished = finished_trials(study)
-        if finished < trials:
+        nonlocal beside_others
+        finished, others = finished_trials(study), _in_state(study, TrialState.RUNNING)
+        beside_others |= others > 0
+        waiting = _in_state(study, TrialState.WAITING) if others else 0
+        if finished + others + waiting < trials:
             enqueue_after(study, plan, trial)
         on_trial(study, finished)
         if finished >= trials or interrupted() or stop():
@@ -285,11 +292,17 @@ def run_trials(
     try:
         with stop_on_interrupt() as interrupted:
             study.optimize(objective, callbacks=[after])
+        if drops_waiting and beside_others and finished_trials(study) >= trials:
+            drop_waiting(study)
         return interrupted()
     except KeyboardInterrupt:
         return True
     except (AssertionError, UnboundLocalError) as error:  # of Optuna's, when its storage fails it
         raise _first_cause(error) from None
+
+
+def _in_state(study: optuna.Study, state: TrialState) -> int:
+    return len(study.get_trials(deepcopy=False, states=(state,)))
 
 
 def _first_cause(error: BaseException) -> BaseException:

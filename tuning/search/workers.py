@@ -120,7 +120,7 @@ def main() -> None:
     try:
         plan = plan_of(orders)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
-        run_trials(study, plan, plan.training_data(), orders["trials"], stop=parent_says_stop)
+        run_trials(study, plan, plan.training_data(), orders["trials"], stop=parent_says_stop, drops_waiting=False)
     except (ValueError, OSError) as error:
         sys.exit(f"thruster: worker {orders['worker']}: {error}")
 

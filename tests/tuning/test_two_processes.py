@@ -1,0 +1,106 @@
+"""Two `tune` processes on one journal: at most one trial more than asked for, and none is left waiting."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+import tuning
+from tests.tuning.test_study import PLAN
+from tuning.search.storage import PROCESS, drop_waiting, open_storage
+from tuning.search.study import finished_trials, open_study, run_trials
+
+FINISHED = {TrialState.COMPLETE, TrialState.PRUNED}
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+
+def beside_another(path, trials):
+    """A study of which another process finishes every other trial, begun while this one runs its own."""
+    study, data = open_study("s", PLAN, open_storage(path)), PLAN.training_data()
+    other = optuna.load_study(study_name="s", storage=open_storage(path))
+    begun = []
+
+    def finish_and_begin(*_):
+        for trial in begun:
+            other.tell(trial, 1e3 + trial.number)
+        begun[:] = []
+        if finished_trials(study) < trials:
+            trial = other.ask(PLAN.space())
+            trial.set_user_attr(PROCESS, "another host:1")
+            begun.append(trial)
+
+    finish_and_begin()
+    run_trials(study, PLAN, data, trials, finish_and_begin)
+    for trial in begun:
+        other.tell(trial, 1e3)
+    return optuna.load_study(study_name="s", storage=open_storage(path)).trials
+
+
+@pytest.mark.parametrize("trials", [2, 5, 8])
+def test_nothing_waits_at_the_end_of_a_study_of_two_processes(as_python, tmp_path, monkeypatch, trials):
+    monkeypatch.setattr("tuning.search.study.run_trial", lambda trial, plan, *_: run_nothing(trial, plan))
+    found = beside_another(str(tmp_path / "j"), trials)
+    assert {one.state for one in found} <= {*FINISHED, TrialState.FAIL}
+    assert trials <= sum(one.state in FINISHED for one in found) <= trials + 1
+    assert sum(one.state == TrialState.FAIL for one in found) <= 5  # what followed from the first one, at once
+
+
+def run_nothing(trial, plan):
+    for name, distribution in plan.space().items():
+        trial._suggest(name, distribution)
+    return [float(trial.number)]
+
+
+def test_a_trial_that_another_process_has_begun_is_not_dropped(tmp_path):
+    path = str(tmp_path / "j")
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    for x in (1.0, 2.0, 3.0):
+        study.enqueue_trial({"x": x})
+    trial = optuna.load_study(study_name="s", storage=open_storage(path)).ask()
+    drop_waiting(study)
+    assert [one.state for one in study.trials] == [TrialState.RUNNING, TrialState.FAIL, TrialState.FAIL]
+    assert trial.number == 0
+
+
+@pytest.mark.slow
+def test_two_commands_on_one_journal_end_it_together(tmp_path):
+    options = f"tune --filter kf --problem nominal --no-pruning --trials 16 --study s --storage {tmp_path / 'j'}"
+    command = [sys.executable, "-m", "thruster_cli", *options.split()]
+    processes = [
+        subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        for _ in range(2)
+    ]
+    for process in processes:
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, said
+    found = optuna.load_study(study_name="s", storage=open_storage(str(tmp_path / "j"))).trials
+    assert {one.state for one in found} <= {*FINISHED, TrialState.FAIL}
+    assert 16 <= sum(one.state in FINISHED for one in found) <= 17
+
+
+@pytest.mark.parametrize("storage", [5, 5.0, True, np.int64(3), b"j", ["j"], "", object()])
+def test_a_storage_is_text_or_a_path(storage, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rule = "storage must be a journal file, such as 'studies.journal', or the URL of a database, but got "
+    for call in (
+        lambda: tuning.tune("nominal", "ekf", trials=1, storage=storage, progress=False),
+        lambda: tuning.report("s", storage=storage),
+        lambda: open_storage(storage),
+    ):
+        with pytest.raises(ValueError, match=re.escape(rule)) as said:
+            call()
+        assert "\n" not in str(said.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_path_is_a_storage(tmp_path):
+    assert open_storage(Path(tmp_path / "j")) is not None
