@@ -6,7 +6,7 @@ import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from thruster_env.numerics.checks import as_floats
+from thruster_env.numerics.checks import as_floats, correlations
 from thruster_env.plants.affine import AffineModel
 from thruster_env.plants.simulate import simulate
 from thruster_env.plants.state_space import StateSpaceModel
@@ -20,14 +20,31 @@ def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
     P solves the discrete algebraic Riccati equation P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q; the
     posterior is P - P C' (C P C' + R)^-1 C P. Source: Anderson and Moore (1979), Optimal Filtering, ch. 4.
     """
+    a, _, _, c, _ = model.matrices()
+    predicted, gain = steady_state(a, c, model.process_noise_cov, model.measurement_noise_cov)
+    posterior = predicted - gain @ (c @ predicted @ c.T + model.measurement_noise_cov) @ gain.T
+    return predicted, (posterior + posterior.T) / 2
+
+
+def steady_state(a: np.ndarray, c: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The predicted covariance (n, n) that solves Riccati's equation, and the gain (n, m), in any units.
+
+    It is solved in units of R's deviations and of those that Q gives the states in n steps.
+
+    Raises numpy.linalg.LinAlgError if there is no stabilising solution.
+    """
     from scipy.linalg import solve_discrete_are
 
-    a, _, _, c, _ = model.matrices()
-    predicted = solve_discrete_are(a.T, c.T, model.process_noise_cov, model.measurement_noise_cov)
-    innovation_cov = c @ predicted @ c.T + model.measurement_noise_cov
-    gain = np.linalg.solve(innovation_cov, c @ predicted).T
-    posterior = predicted - gain @ innovation_cov @ gain.T
-    return (predicted + predicted.T) / 2, (posterior + posterior.T) / 2
+    reached, power = np.zeros_like(q), np.eye(len(a))
+    for _ in range(len(a)):
+        reached, power = reached + power @ q @ power.T, a @ power
+    states, channels = correlations(reached)[1], correlations(r)[1]
+    a, c = a / states[:, None] * states, c / channels[:, None] * states
+    q, r = q / states[:, None] / states, r / channels[:, None] / channels
+    predicted = solve_discrete_are(a.T, c.T, q, r)
+    predicted = (predicted + predicted.T) / 2
+    gain = np.linalg.solve(c @ predicted @ c.T + r, c @ predicted).T
+    return predicted * states[:, None] * states, gain * states[:, None] / channels
 
 
 def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:

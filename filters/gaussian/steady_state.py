@@ -74,12 +74,11 @@ class SteadyStateKalmanFilter(AffineFilter):
     @cached_property
     def gain(self) -> np.ndarray:
         """The gain K (n, m)."""
-        from filters.bounds import riccati_covariances  # which runs filters of this room
+        from filters.bounds import steady_state  # which runs filters of this package
 
         model = self.kernel_model
-        predicted, _ = riccati_covariances(model)
-        c = model.matrices()[3]
-        return np.linalg.solve(c @ predicted @ c.T + model.measurement_noise_cov, c @ predicted).T
+        a, _, _, c, _ = model.matrices()
+        return steady_state(a, c, model.process_noise_cov, model.measurement_noise_cov)[1]
 
     @property
     def parameters(self) -> dict[str, np.ndarray]:

@@ -28,6 +28,11 @@ def test_a_change_of_units_changes_no_estimate(name, states, channels):
     np.testing.assert_allclose(after.covs / np.outer(states, states), before.covs, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["kf", "kf-steady", "ukf"])
+def test_units_that_differ_by_many_orders_change_no_estimate(name):
+    test_a_change_of_units_changes_no_estimate(name, (1e9, 3e-9, 7e4), (2e-8, 5e8))
+
+
 @pytest.mark.parametrize("name", UNIT_FREE)
 @pytest.mark.parametrize("analytic", [True, False])
 def test_a_change_of_units_of_a_nonlinear_model_changes_no_estimate(name, analytic):

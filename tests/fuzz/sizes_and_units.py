@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 import filters
-from filters import EstimateState, make_filter, run, smooth
+from filters import EstimateState, Inversion, make_filter, run, smooth
 from filters.filter import Filter
 from filters.registry import FILTERS
 from tests.filters.test_c import built, estimated
@@ -39,8 +39,6 @@ EXACT = {
 IN_C = ("kf", "ekf", "iekf", "ukf", "ckf", "fading", "ekf-robust", "vb")
 ON_TENSORS = (*IN_C, "enkf", "etkf")
 SMOOTHED = ("kf", "ekf", "ukf", "ckf", "iekf", "enkf", "imm", "mmae")
-TIED = ("low-pass", "inversion", "h-infinity", "letkf", "gsf", "rbpf")  # to single states or channels, or to units
-BINARY = {"mhe", "schmidt", "fuzzy", *TIED}  # units of these are powers of two where any are drawn for the others
 
 
 class Step(NamedTuple):
@@ -75,10 +73,9 @@ def units(rng: np.random.Generator, seconds: float) -> str:
     counts: Counter = Counter()
     for name, _ in zip(_names(rng), _until(seconds), strict=False):
         n, m = int(rng.integers(1, 6)), int(rng.integers(1, 5))
-        if name not in TIED:
-            with interpreted():
-                _compare_units(rng, name, n, m)
-            counts["estimates"] += 1
+        with interpreted():
+            _compare_units(rng, name, n, m)
+        counts["estimates"] += 1
         counts[_compare_checks(rng, n)] += 1
     return _line("changes of units", counts)
 
@@ -189,10 +186,10 @@ def _compare_units(rng: np.random.Generator, name: str, n: int, m: int) -> None:
     model, inputs, z = drawn(rng, n, m)
     filter_ = made(rng, name, model)
     states, channels = 10.0 ** rng.uniform(-9.0, 9.0, n), 10.0 ** rng.uniform(-9.0, 9.0, m)
-    if name in BINARY:
-        states, channels = 2.0 ** np.round(np.log2(states)), 2.0 ** np.round(np.log2(channels))
     other = rescaled(model, states, channels)
-    changed = {"low": filter_.low * states, "high": filter_.high * states} if name == "fuzzy" else {}
+    changed: dict = {"low": filter_.low * states, "high": filter_.high * states} if name == "fuzzy" else {}
+    if isinstance(filter_, Inversion):
+        changed = {"reach": None}
     keys = np.array([KEY, (3, 4)])
     before = run(filter_, keys, inputs, z)
     after = run(dataclasses.replace(filter_, model=other, **changed), keys, inputs, z * channels)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.bounds import steady_state
 from thruster_env.plants.affine import linearize
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.likelihood.family import Family
@@ -106,16 +107,12 @@ def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
 
 def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """The gain L (n, m) of the stationary Kalman filter."""
-    from scipy.linalg import solve_discrete_are
-
     try:
-        p = solve_discrete_are(linear.a.T, linear.c.T, q, r)
+        return steady_state(linear.a, linear.c, q, r)[1]
     except np.linalg.LinAlgError as error:
         raise ValueError(
             f"ways by lagged covariances need a model with a stationary filter, but {error}"
         ) from None
-    s = linear.c @ p @ linear.c.T + r
-    return np.linalg.solve(s, linear.c @ p).T
 
 
 def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:
