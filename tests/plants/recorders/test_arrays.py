@@ -8,7 +8,7 @@ from tests.plants.recorders.files import h5py
 from tests.plants.recorders.test_bad_recordings import refused
 from tests.plants.test_logs import MODEL
 from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.logs.recorders import hdf5
+from thruster_env.plants.logs.recorders import process
 from thruster_env.plants.logs.recorders.registry import contents, read
 
 RNG = np.random.default_rng(0)
@@ -137,16 +137,16 @@ def test_where_the_library_ends_its_process_the_file_is_refused(tmp_path, when, 
     """A script that ends as the library does stands for it."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["t"] = np.arange(9.0)
-    text = hdf5.SCRIPT.read_text()
-    place = "    request = json" if when == "at once" else "            for line in sys.stdin:\n"
+    text = process.SCRIPT.read_text()
+    place = "    request = json" if when == "at once" else "    for line in sys.stdin:\n"
     end = "os.kill(os.getpid(), 11)\n"
-    changed = text.replace(place, f"    {end}{place}" if when == "at once" else f"{place}                {end}")
+    changed = text.replace(place, f"    {end}{place}" if when == "at once" else f"{place}        {end}")
     (tmp_path / "script.py").write_text(changed)
-    monkeypatch.setattr(hdf5, "SCRIPT", tmp_path / "script.py")
+    monkeypatch.setattr(process, "SCRIPT", tmp_path / "script.py")
     if when == "at once":
-        refused(tmp_path / "a.h5", r"must be one, but .* is not: the HDF5 library breaks off at it \(SIGSEGV\)")
+        refused(tmp_path / "a.h5", r"must be one, but .* is not: the library that reads it breaks off \(SIGSEGV\)")
     else:
-        assert "breaks off at it (SIGSEGV)" in contents(tmp_path / "a.h5").unread["t"]
+        assert "breaks off (SIGSEGV)" in contents(tmp_path / "a.h5").unread["t"]
 
 
 def test_a_damaged_file_never_ends_this_process(tmp_path):

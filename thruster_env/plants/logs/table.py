@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from errno import EACCES, EISDIR, ENOENT
-from os import PathLike
+from importlib.util import find_spec
+from os import PathLike, strerror
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -19,7 +20,8 @@ import numpy as np
 from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.extras import to_install
 from thruster_env.plants.logs.findings import Remark
-from thruster_env.plants.logs.recorders.topics import Refused, bounded, check_bytes
+from thruster_env.plants.logs.recorders.process import opened
+from thruster_env.plants.logs.recorders.topics import Refused, check_bytes
 from thruster_env.plants.logs.stamps import MISSING as MISSING_TEXT
 from thruster_env.plants.logs.stamps import seconds_of, since_first
 
@@ -198,23 +200,18 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
 
 
 def _read_parquet(path: Path) -> Table:
-    try:
-        from pyarrow import parquet
-    except ImportError:
+    if find_spec("pyarrow") is None:
         raise ValueError(
             f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')}), "
             f"but got {path}"
-        ) from None
-    with _damaged("a Parquet file must be one, but {path} is not", path), bounded("a Parquet file", path):
-        for file in sorted(path.rglob("*.parquet")) if path.is_dir() else [path]:
-            of_file = parquet.read_metadata(file)
-            groups = [of_file.row_group(place) for place in range(of_file.num_row_groups)]
-            parts = [group.column(place) for group in groups for place in range(group.num_columns)]
-            check_bytes(8 * of_file.num_rows * of_file.num_columns, "what a Parquet file holds", path)
-            check_bytes(sum(one.total_uncompressed_size for one in parts), "what a Parquet file holds", path)
-        table = parquet.read_table(path)
-        cells = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
-    _check_header(table.column_names, 1, path)
+        )
+    if not path.exists():
+        raise FileNotFoundError(ENOENT, strerror(ENOENT))
+    with _damaged("a Parquet file must be one, but {path} is not", path), opened("parquet", path) as file:
+        check_bytes(max(8 * file.told["numbers"], file.told["bytes"]), "what a Parquet file holds", path)
+        names = [str(name) for name in file.told["names"]]
+        _check_header(names, 1, path)
+        cells = {name: file.read(number) for number, name in enumerate(names)}
     return _of_arrays(path, cells)
 
 

@@ -200,6 +200,7 @@ def _instances(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[
         else:
             columns[name] = numbers if kind != "a" else numbers.view("<i2").reshape(-1, 32)
     if ticks is None:
+        yield Topic(form.name, None, {}, unread={"": "messages without times"}), offsets
         return
     units = {name: unit for name, unit in zip(form.columns, form.units or (), strict=False) if unit}
     units = {name: UNITS.get(unit, unit) for name, unit in units.items()}

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thruster_env.plants.logs.recorders import topics as limits
 from thruster_env.plants.logs.recorders.arrays import NUMERIC, topics_of
+from thruster_env.plants.logs.recorders.process import Opened, opened
 from thruster_env.plants.logs.recorders.topics import Topic, Wanted, package, reading
 
 KIND = "HDF5 file"
 MAGIC = b"\x89HDF\r\n\x1a\n"
-SCRIPT = Path(__file__).with_name("hdf5_process.py")
 UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
 MISSING = ("_fillvalue", "missing_value")
 
@@ -45,16 +39,20 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """
     if find_spec("h5py") is None:
         package("h5py", KIND, path)  # which says how to install it
-    with reading(KIND, path), _process(path) as process:
-        yield from topics_of(process.datasets, path, wanted, _unit)
+    with reading(KIND, path), opened("hdf5", path) as file:
+        found = {
+            name: one if isinstance(one, str) else Dataset(file, number, one)
+            for number, (name, one) in enumerate(file.told["datasets"].items())
+        }
+        yield from topics_of(found, path, wanted, _unit)
 
 
 class Dataset:
     """A dataset in a file that another process reads."""
 
-    def __init__(self, process: Process, number: int, told: Mapping[str, Any]):
+    def __init__(self, file: Opened, number: int, told: Mapping[str, Any]):
         """Keep what is known of it; nothing is read."""
-        self._process, self._number = process, number
+        self._file, self._number = file, number
         self.shape = tuple(int(one) for one in told["shape"])
         self.dtype = np.dtype(told["dtype"] if told["kind"] in NUMERIC else object)
         self.what = f"of {told['dtype']}"
@@ -62,7 +60,7 @@ class Dataset:
 
     def __getitem__(self, key: Any) -> np.ndarray:
         """Read all of it, in its unit."""
-        stored = self._process.read(self._number)
+        stored = self._file.read(self._number)
         absent = [_number(self.attributes[name]) for name in MISSING if name in self.attributes]
         scale, offset = (_number(self.attributes.get(name)) for name in (SCALE, OFFSET))
         if scale is None and offset is None and not absent:
@@ -71,68 +69,6 @@ class Dataset:
         for one in absent:
             values = np.where(stored == one, np.nan, values)
         return values
-
-
-class Process:
-    """The other process, and the datasets of the file that it has opened."""
-
-    def __init__(self, child: subprocess.Popen, path: Path):
-        """Open a file and list its datasets."""
-        self._child = child
-        request = {"path": str(path.absolute()), "memory": limits.MOST_MEMORY, "bytes": limits.MOST_BYTES}
-        told = self._ask(json.dumps(request))["datasets"]
-        self.datasets: dict[str, Any] = {
-            name: one if isinstance(one, str) else Dataset(self, number, one)
-            for number, (name, one) in enumerate(told.items())
-        }
-
-    def read(self, number: int) -> np.ndarray:
-        """The numbers of a dataset, as they are stored."""
-        told = self._ask(str(number))
-        kind = np.dtype(str(told["dtype"]))
-        if kind.kind not in NUMERIC:
-            raise ValueError(f"numbers of {kind}")
-        values = np.empty(tuple(told["shape"]), kind)
-        left = memoryview(values.reshape(-1)).cast("B")
-        while len(left):
-            count = self._child.stdout.readinto(left)  # type: ignore[union-attr]
-            if not count:
-                raise ValueError(self._end())
-            left = left[count:]
-        return values
-
-    def _ask(self, line: str) -> dict[str, Any]:
-        try:
-            self._child.stdin.write(line.encode() + b"\n")  # type: ignore[union-attr]
-            self._child.stdin.flush()  # type: ignore[union-attr]
-        except BrokenPipeError:
-            raise ValueError(self._end()) from None
-        answer = self._child.stdout.readline()  # type: ignore[union-attr]
-        if not answer.endswith(b"\n"):
-            raise ValueError(self._end())
-        told = json.loads(answer)
-        if "error" in told:
-            raise ValueError(told["error"])
-        return told
-
-    def _end(self) -> str:
-        """Why the other process has ended, in words."""
-        code = self._child.wait()
-        why = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        return f"the HDF5 library breaks off at it ({why})"
-
-
-@contextmanager
-def _process(path: Path) -> Iterator[Process]:
-    """A process that has opened a file."""
-    command = [sys.executable, "-P", str(SCRIPT)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as child:
-        try:
-            yield Process(child, path)
-        finally:
-            child.kill()
 
 
 def _number(value: Any) -> float | int | None:

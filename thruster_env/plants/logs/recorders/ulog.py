@@ -64,11 +64,12 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             parts.append(found.pop(0))
         name = f"{parts[0].name}#{parts[0].multi_id}" if parts[0].multi_id else parts[0].name
         if wants(wanted, name):
-            topics = [_topic(name, data, damage) for data in parts if STAMP in data.data]
-            yield from [joined(topics)] if topics else []
+            yield joined([_topic(name, data, damage) for data in parts])
 
 
 def _topic(name: str, data: Any, damage: str) -> Topic:
+    if STAMP not in data.data:
+        return Topic(name, None, {}, unread={"": "messages without times"})
     kinds = {one.field_name: one.type_str for one in data.field_data}
     return Topic(name, data.data[STAMP] / TICKS, _numbers(data.data, kinds), damage=damage)
 

@@ -1,8 +1,8 @@
-"""A process of its own that reads HDF5 files, for the library in C breaks off at some that are damaged.
+"""A process of its own that reads HDF5 and Parquet, for their libraries break off at some files that are damaged.
 
-Run as a script, it imports nothing of this package. Its input is a line of JSON with the path and limits, then a
-line with the number of a dataset for each that is to be read. Its output is a line of JSON with all datasets, then
-for each request a line with type, shape and size, and the bytes.
+Run as a script, it imports nothing of this package. Its input is a line of JSON with format, path and limits, then
+a line with the number of an array for each that is to be read. Its output is a line of JSON with what is in the
+file, then for each request a line with type and shape, and the bytes; or a line with texts.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import json
 import math
 import os
 import sys
+from collections.abc import Callable
 from typing import Any
 
-import h5py
 import numpy as np
 
 NUMERIC = "biuf"  # NumPy's kinds
+SENT = f"{NUMERIC}mM"  # as bytes; others as texts
 OBJECT, SPARSE = "MATLAB_object_decode", "MATLAB_sparse"  # attributes
 CLASS, EMPTY = "MATLAB_class", "MATLAB_empty"
 REFERENCES = "#refs#"  # where MATLAB keeps what its cells and arrays of structures hold
@@ -37,11 +38,13 @@ class Walk:
     def __init__(self, file: Any, most_bytes: int):
         """Collect all that the file has."""
         self.found: dict[str, tuple[Any, str | None] | str] = {}
-        self._most, self._seen, self._count = most_bytes, {h5py.h5o.get_info(file.id).addr}, 0
+        self._most, self._seen, self._count = most_bytes, {_address(file)}, 0
         self._file = file
         self._members(file, "", 0)
 
     def _members(self, group: Any, name: str, depth: int) -> None:
+        import h5py
+
         for key in group:
             own = f"{name}.{key}" if name else key
             try:
@@ -49,7 +52,7 @@ class Walk:
                     self.found[own] = "a link"
                     continue
                 one = group[key]
-                number = h5py.h5o.get_info(one.id).addr
+                number = _address(one)
                 if number in self._seen or key == REFERENCES:
                     continue
                 self._seen.add(number)
@@ -61,6 +64,8 @@ class Walk:
 
     def _add(self, one: Any, name: str, depth: int, in_structure: bool = False) -> None:
         """Add an object, a group with what is in it."""
+        import h5py
+
         self._count += 1
         if self._count > MOST_OBJECTS:
             raise TooMany(f"it has more than {MOST_OBJECTS} objects")
@@ -73,6 +78,8 @@ class Walk:
             self._dataset(one, name, depth, in_structure)
 
     def _dataset(self, one: Any, name: str, depth: int, in_structure: bool) -> None:
+        import h5py
+
         kind = _text(one.attrs.get(CLASS))
         if one.is_virtual or one.external:
             self.found[name] = "kept in another file"
@@ -100,6 +107,13 @@ class Walk:
             own = f"{name}{{{place}}}" if brackets == "{}" else f"{group}({place}).{field}"
             if reference:
                 self._add(self._file[reference], own, depth + 1)
+
+
+def _address(one: Any) -> int:
+    """Where an object stands in its file."""
+    import h5py
+
+    return h5py.h5o.get_info(one.id).addr
 
 
 class TooMany(ValueError):
@@ -149,10 +163,56 @@ def _limit(memory: int) -> None:
         return
 
 
+Reader = Callable[[int], np.ndarray]
+
+
+def hdf5(request: dict) -> tuple[dict[str, Any], Reader]:
+    """The datasets of an HDF5 file, and what reads one of them."""
+    import h5py
+
+    found = Walk(h5py.File(request["path"], "r"), request["bytes"]).found
+    names, told = [*found], dict[str, Any]()
+    for name, one in found.items():
+        try:
+            told[name] = one if isinstance(one, str) else _described(*one)
+        except Exception as error:
+            told[name] = f"damaged: {_line(error)}"
+
+    def read(number: int) -> np.ndarray:
+        dataset, field = found[names[number]]
+        return dataset[()] if field is None else dataset.fields(field)[()]
+
+    return {"datasets": told}, read
+
+
+def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
+    """Names, rows and bytes of the columns of a Parquet file, or a folder of some, and what reads one of them."""
+    import pyarrow.parquet
+
+    numbers, size, tables = 0, 0, []
+    for file in request["files"]:
+        of_file = pyarrow.parquet.read_metadata(file)
+        groups = [of_file.row_group(place) for place in range(of_file.num_row_groups)]
+        parts = [group.column(place) for group in groups for place in range(group.num_columns)]
+        numbers += of_file.num_rows * of_file.num_columns
+        size += sum(one.total_uncompressed_size for one in parts)
+    names = pyarrow.parquet.read_schema(request["files"][0]).names
+    if request["files"] != [request["path"]] and max(8 * numbers, size) <= request["bytes"]:
+        tables.append(pyarrow.parquet.read_table(request["path"]))  # names of its folders are columns, too
+        names = tables[0].column_names
+
+    def read(number: int) -> np.ndarray:
+        if not tables:
+            tables.append(pyarrow.parquet.read_table(request["path"]))
+        return tables[0].column(number).to_numpy(zero_copy_only=False)
+
+    return {"names": names, "numbers": numbers, "bytes": size}, read
+
+
 def main() -> None:
     """Answer requests until there are no more."""
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # so that nothing the library prints is taken for an answer
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # so that nothing a library prints is taken for an answer
     request = json.loads(sys.stdin.readline())
     _limit(request["memory"])
 
@@ -162,29 +222,22 @@ def main() -> None:
         out.flush()
 
     try:
-        with h5py.File(request["path"], "r") as file:
-            found = Walk(file, request["bytes"]).found
-            names, told = [*found], {}
-            for name, one in found.items():
-                try:
-                    told[name] = one if isinstance(one, str) else _described(*one)
-                except Exception as error:
-                    told[name] = f"damaged: {_line(error)}"
-            answer({"datasets": told})
-            for line in sys.stdin:
-                dataset, field = found[names[int(line)]]
-                try:
-                    values = dataset[()] if field is None else dataset.fields(field)[()]
-                except Exception as error:
-                    answer({"error": _line(error)})
-                    continue
-                values = np.ascontiguousarray(values)
-                answer(
-                    {"dtype": values.dtype.str, "shape": list(values.shape)},
-                    memoryview(values.reshape(-1)).cast("B"),
-                )
+        told, read = {"hdf5": hdf5, "parquet": parquet}[request["format"]](request)
     except Exception as error:
-        answer({"error": _line(error)})
+        answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
+        return
+    answer(told)
+    for line in sys.stdin:
+        try:
+            values = np.ascontiguousarray(read(int(line)))
+            if values.dtype.kind in SENT:
+                told, data = {"dtype": values.dtype.str}, memoryview(values.reshape(-1).view(np.uint8))
+            else:
+                told, data = {"texts": [str(one) for one in values.reshape(-1)]}, memoryview(b"")
+        except Exception as error:
+            answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
+        else:
+            answer({**told, "shape": list(values.shape)}, data)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,163 @@
+"""Recordings that are damaged, put together or packed: as many messages as were written, each field by its name.
+
+The counts are those that the formats' own writers were given. Of a damaged file all are read, or it is refused, or
+(of the logs of autopilots, which a loss of power cuts off anywhere) the damage is said.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from tests.fuzz.files import _damaged
+from thruster_env.plants.logs.recorders.registry import contents, read
+from thruster_env.plants.logs.table import read_table
+from thruster_env.plants.logs.write import write_columns
+
+AUTOPILOTS, BAGS = (".bin", ".ulg"), (".mcap", ".bag", ".db3")
+TABLES = (".npz", ".parquet", ".csv")
+FIELDS = ("x", "y", "z", "w")
+EPOCH = 10**9  # [ns]
+
+
+def message_counts(rng: np.random.Generator, seconds: float) -> str:
+    """Bags and logs of autopilots with bytes zeroed, flipped, doubled or cut off: no message is lost unsaid."""
+    from tests.plants.recorders.test_bad_recordings import write_good
+
+    counts, end = Counter(), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        good = {}
+        for ending in (*AUTOPILOTS, *BAGS):
+            path = write_good(Path(folder) / f"{ending[1:]}{ending}")
+            good[ending] = path.read_bytes(), _by_topic(path)
+        while not counts or time.monotonic() < end:
+            ending = str(rng.choice([*good]))
+            data, written = good[ending]
+            data = _zeroed(rng, data) if rng.random() < 0.5 else _damaged(rng, data) or data
+            path = Path(folder) / f"{counts.total()}{ending}"
+            path.write_bytes(data)
+            try:
+                found = contents(path)
+            except ValueError as error:
+                assert str(error) and "\n" not in str(error), repr(error)
+                counts["refused"] += 1
+                continue
+            finally:
+                path.unlink()
+            same = sorted(_by_topic_of(found).values()) == sorted(written.values())
+            if ending in BAGS:
+                assert same or found.unread, f"{ending}: {_by_topic_of(found)} of {written}"
+            elif not good[ending][0].startswith(data) and sum(_by_topic_of(found).values()) < sum(
+                written.values()
+            ):
+                assert found.damage or found.unread, f"{ending}: {_by_topic_of(found)} of {written}"
+            counts["whole" if same else "said to be damaged"] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
+def two_definitions(rng: np.random.Generator, seconds: float) -> str:
+    """Topics whose fields have other places, and others beside them, in a second definition, in all formats."""
+    kinds, counts, end = ("ros1", "mcap", "sqlite3", ".bin"), Counter(), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        while not counts or time.monotonic() < end:
+            kind = str(rng.choice(kinds))
+            orders = [list(rng.permutation(FIELDS)[: rng.integers(1, 5)]) for _ in range(rng.integers(1, 4))]
+            rows = [rng.normal(size=(int(rng.integers(2, 9)), len(FIELDS))) for _ in orders]
+            path = Path(folder) / f"{counts.total()}"
+            path = _write_dataflash(path, orders, rows) if kind == ".bin" else _write_bag(path, kind, orders, rows)
+            name = "A" if kind == ".bin" else "/m"
+            found = read(path, None)
+            assert set(found) == {f"{name}.{key}" for order in orders for key in order}
+            for place, key in enumerate(FIELDS):
+                expected = [
+                    np.where(key in order, part[:, place], np.nan)
+                    for order, part in zip(orders, rows, strict=True)
+                ]
+                if f"{name}.{key}" in found:
+                    np.testing.assert_array_equal(found[f"{name}.{key}"].values, np.concatenate(expected))
+            counts[kind] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
+def damaged_tables(rng: np.random.Generator, seconds: float) -> str:
+    """CSV, npz and Parquet with bytes zeroed, flipped, doubled or cut off: read, or one line."""
+    counts, end = Counter(), time.monotonic() + seconds
+    columns = {"t": 0.1 * np.arange(60), "voltage": rng.normal(size=60), "tach": np.arange(60.0)}
+    with tempfile.TemporaryDirectory() as folder:
+        good = {}
+        for ending in TABLES:
+            write_columns(Path(folder) / f"good{ending}", columns)
+            good[ending] = (Path(folder) / f"good{ending}").read_bytes()
+        np.savez_compressed(Path(folder) / "packed.npz", **columns)
+        packed = (Path(folder) / "packed.npz").read_bytes()
+        while not counts or time.monotonic() < end:
+            ending = str(rng.choice(TABLES))
+            data = packed if ending == ".npz" and rng.random() < 0.5 else good[ending]
+            path = Path(folder) / f"a{ending}"
+            path.write_bytes(_zeroed(rng, data) if rng.random() < 0.3 else _damaged(rng, data))
+            try:
+                read_table(path)
+                counts["read"] += 1
+            except ValueError as error:
+                assert str(error) and "\n" not in str(error) and "None" not in str(error), repr(error)
+                counts["refused"] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
+def _by_topic(path: Path) -> dict[str, int]:
+    return _by_topic_of(contents(path))
+
+
+def _by_topic_of(found) -> dict[str, int]:
+    return {one.topic: one.samples for one in found.fields}
+
+
+def _zeroed(rng: np.random.Generator, data: bytes) -> bytes:
+    """Zeros in place of some bytes, as of a block that was never written."""
+    place, length = int(rng.integers(len(data))), int(rng.integers(1, 200))
+    return (data[:place] + bytes(length) + data[place + length :])[: len(data)]
+
+
+def _write_dataflash(path: Path, orders: list[list[str]], rows: list[np.ndarray]) -> Path:
+    """Logs put together, each with its own format of message A."""
+    from tests.plants.recorders.files import dataflash
+
+    out, row = b"", 0
+    for order, part in zip(orders, rows, strict=True):
+        places = [FIELDS.index(key) for key in order]
+        messages = [(1, (10_000 * (row + k), *values[places])) for k, values in enumerate(part)]
+        out += dataflash({1: ("A", "Q" + "d" * len(order), ",".join(["TimeUS", *order]))}, messages)
+        row += len(part)
+    path = path.with_suffix(".bin")
+    path.write_bytes(out)
+    return path
+
+
+def _write_bag(path: Path, kind: str, orders: list[list[str]], rows: list[np.ndarray]) -> Path:
+    """A bag whose topic /m has several definitions, in turns."""
+    from rosbags import rosbag1, rosbag2
+
+    if kind == "ros1":
+        path = path.with_suffix(".bag")
+        writer, head = rosbag1.Writer(path), b""
+    else:
+        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
+        writer, head = rosbag2.Writer(path, version=9, storage_plugin=plugin), b"\x00\x01\x00\x00"
+    add: Callable = writer.add_connection
+    row = 0
+    with writer:
+        for part, (order, numbers) in enumerate(zip(orders, rows, strict=True)):
+            text = "".join(f"float64 {key}\n" for key in order)
+            own = {"md5sum": f"{part:032d}"} if kind == "ros1" else {"rihs01": f"RIHS01_{part:064d}"}
+            connection = add("/m", f"a{part}/msg/M", msgdef=text, **own)
+            for values in numbers:
+                body = struct.pack(f"<{len(order)}d", *(values[FIELDS.index(key)] for key in order))
+                writer.write(connection, EPOCH + 10**7 * row, head + body)
+                row += 1
+    return path
