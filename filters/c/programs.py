@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import NamedTuple
 
 import numpy as np
 
+from filters.c.identifiers import is_macro, is_name
 from filters.engine.layout import memory_places
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.page_is_all import check_page_is_all
@@ -32,11 +32,6 @@ from thruster_env.plants.state_space import StateSpaceModel
 NIS = -1  # its place in a row, where machine code has none
 TOLD = frozenset(  # of each filter in C, and by its tests
     "x P innovation S nis log_likelihood channels restarts channel healthy tested alarmed".split()
-)
-KEYWORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long "
-    "main register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
-    "while".split()
 )
 
 
@@ -120,7 +115,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     stages = [one.of_rows for one in stages_of(page, memory, equations)]
     kept = {name: one.shape for name, one in memory.kept.items()}
-    if wrong := [name for name in kept if name in TOLD or not is_name(name)]:
+    if wrong := [name for name in kept if name in TOLD or not is_name(name) or is_macro(name)]:
         raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
     flying = memory.end - places.extras - sum(prod(size) for size in kept.values())
     points = _points_of(stages[2], equations, memory, flying)
@@ -165,11 +160,6 @@ def _of_members(paged: EnsembleFilter) -> FilterPrograms:
 
 def _nis(v: Matrix, s: Matrix) -> Matrix:
     return dot(v, quotient(v, factor(s)))
-
-
-def is_name(text: str) -> bool:
-    """Whether C takes a name."""
-    return bool(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", text, flags=re.ASCII)) and text not in KEYWORDS
 
 
 def _check_traced(name: str, function: Callable, jacobian: Callable | None, others: int, shape: Shape) -> None:

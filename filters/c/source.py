@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from filters.c.cpp import class_of
 from filters.c.ensemble import EnsembleWriter
+from filters.c.identifiers import is_name, is_taken
+from filters.c.log_program import log_program
 from filters.c.monitor import TestsWriter
-from filters.c.programs import is_name, programs_of
+from filters.c.programs import programs_of
 from filters.c.writer import Writer
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor
+
+STAND_IN = "another_name"  # of a filter whose own words are asked for
 
 
 class CFilter(NamedTuple):
@@ -50,6 +55,18 @@ def c_filter(
     if not is_name(name):
         raise ValueError(f"a name in C must be letters, digits and _, and no keyword, but got {name!r}")
     programs = programs_of(filter_)
-    tests = None if monitor is None else TestsWriter(monitor, name, programs.model.m, single)
-    writer = (EnsembleWriter if programs.members else Writer)(name, programs, single, tests)
-    return CFilter(name, writer.header(filter_.name), writer.source())
+
+    def called(name: str) -> CFilter:
+        tests = None if monitor is None else TestsWriter(monitor, name, programs.model.m, single)
+        writer = (EnsembleWriter if programs.members else Writer)(name, programs, single, tests)
+        return CFilter(name, writer.header(filter_.name), writer.source())
+
+    _, *texts = called(STAND_IN)
+    texts.append(class_of(STAND_IN, programs, single=single, tested=monitor is not None))
+    texts.append(log_program(STAND_IN, programs, single=single, tested=monitor is not None))
+    if is_taken(name, texts):
+        raise ValueError(
+            "a name in C must be one that neither its libraries nor the filter's own files use, but got "
+            f"{name!r}: take another one, such as {name}_filter"
+        )
+    return called(name)

@@ -109,6 +109,10 @@ void {name}_update({name} *filter{z});
 
 #include <math.h>
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "compile without -ffast-math, which takes NaN for a number and a quotient for a product"
+#endif
+
 {constants}
 
 {functions}
@@ -260,4 +264,4 @@ def _indented(text: str) -> str:
 
 def _plain(text: str) -> str:
     """Text for a comment."""
-    return text.encode("ascii", "replace").decode().replace("*/", "* /")
+    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("/*", "/ *")

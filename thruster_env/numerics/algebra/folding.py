@@ -47,6 +47,23 @@ _OF_CONSTANTS: dict[str, Callable] = {
 }
 
 
+UNDEFINED = frozenset(("/", "sqrt", "log", "pow", "fmod", "tan", "exp", "sinh", "cosh"))
+"""Operations that make NaN or infinity of usual numbers."""
+
+
+def _may_have_no_value(a: Number) -> bool:
+    """Whether a number may be NaN or infinite where what it is made of is finite: zero times that is not zero."""
+    waiting, known = [a], {a.place}
+    while waiting:
+        one = waiting.pop()
+        if one.operation in UNDEFINED:
+            return True
+        new = [other for other in one.of if other.place not in known]
+        known |= {other.place for other in new}
+        waiting += new
+    return False
+
+
 def _is(a: Number, operation: str) -> bool:
     """Whether an operation made a number that may be taken apart."""
     return a.operation == operation and a.place not in a.graph.whole
@@ -87,7 +104,7 @@ def product(a: Number, b: Number) -> Number:
         return a.graph.constant(a.value * b.value)
     for one, other in ((a, b), (b, a)):
         if one.value is not None:
-            if one.value == 0.0:
+            if one.value == 0.0 and not (a.graph.exact and _may_have_no_value(other)):
                 return one
             if abs(one.value) == 1.0:
                 return other if one.value > 0 else negative(other)
