@@ -72,14 +72,19 @@ class Traced:
             raise TypeError("a function has no value at any point where its graph could be compared with it")
 
     def _given(self, x, *others) -> list:
-        """Arguments in the form in which the model takes them."""
+        """Arguments in the form in which the model takes them, components as Python's floats.
+
+        NumPy's booleans add up to one: of its floats (x > 0) + (y > 0) were 1 where Python and machine code say 2.
+        """
         *u, c = others
         for one in (*x, *c):  # along which slopes are taken
             if isinstance(one, Number):
                 one.graph.whole.add(one.place)
-        plain = [one if is_array(len(one)) else tuple(one) for one in (x, *u)]
+        plain = [one if is_array(len(one)) else tuple(one.tolist()) for one in (x, *u)]
         form = self._shape.form
-        return [*plain, c if constants_are_array(form) else tuple(c) if isinstance(form, int) else form(*c)]
+        if constants_are_array(form):
+            return [*plain, c]
+        return [*plain, tuple(c.tolist()) if isinstance(form, int) else form(*c.tolist())]
 
     def _value(self, x, *others):
         given = self._given(x, *others)

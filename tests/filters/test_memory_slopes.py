@@ -261,3 +261,22 @@ def test_slopes_along_numbers_that_are_made_of_others_are_found():
     jacobian = values_of(numbers, np.array([[0.7], [0.2], [3.0]])).reshape(found.shape)
     expected = [[-1, 0], [0, -1], [0, 1], [0, 3], [-1, 0], [0, -1]]
     np.testing.assert_array_equal(jacobian, expected)
+
+
+def test_conditions_that_are_added_are_traced():
+    """Of NumPy's floats, which the comparison with Python was made of, two that hold were 1 and not 2."""
+    model = StateSpaceModel(
+        transition=lambda x, u, c: ((x[0] > 0.05) + (x[1] > 0.05) + c[0] * (x[0] > -2.0), x[1]),
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[1.0, 1.0],
+        measurement_noise_cov=[1.0],
+        prior_mean=[0.7, 0.2],
+        prior_cov=[1.0, 1.0],
+        inputs=1,
+        constants=(0.5,),
+    )
+    graph = Graph()
+    numbers = np.array([graph.given(Place("numbers", k)) for k in range(4)])
+    value = Traced(model.transition, None, 2, model.shape).parts[0](numbers[:2], numbers[2:3], numbers[3:])
+    found = values_of([graph.number(one) for one in value], np.array([[0.7], [0.2], [0.0], [0.5]]))
+    np.testing.assert_array_equal(found.ravel(), [2.5, 0.2])
