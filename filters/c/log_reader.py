@@ -14,7 +14,7 @@ static int varies[COLUMNS];
 static double first_time, shortest, longest;
 static char time_text[40];
 static long samples_of_rows;
-static int is_wrong;
+static int is_wrong, is_bare;
 
 /* Say why a line is refused. */
 static int refuse(const char *rule, const char *got)
@@ -374,6 +374,7 @@ static int take_time(void)
                 *letter = (char)lower(*letter);
             }
             if (!is_used && is_among(base, is_date ? date_names : time_names)) {
+                is_bare = unit[0] == '\0';
                 return take(TIME, k, unit);
             }
         }
@@ -523,6 +524,10 @@ static int read_row(long row)
         }
         if (isnan(numbers[TIME])) {
             return refuse("every row must have a time", "");
+        }
+        double since = row > 0 ? numbers[TIME] - first_time : 0.0;
+        if (is_bare && (fabs(numbers[TIME]) > 4.1e9 || (row > 0 && since >= 100.0 * (double)row))) {
+            return refuse("times must be in seconds, or their column say its unit", cells[column_of[TIME]]);
         }
         if (!is_on_grid(row, numbers[TIME])) {
             return refuse("times must be one step apart, to a twentieth of a step", cells[column_of[TIME]]);

@@ -427,6 +427,7 @@ def log_of(model, inputs, z):
     return "\r\n".join(rows) + "\r\n"
 
 
+SECONDS = "times must be in seconds, or their column say its unit"
 STEP = "times must be one step apart, to a twentieth of a step"
 
 
@@ -469,6 +470,8 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
         (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.03\n", f"line 4: {STEP}, but got '.03'\n"),
         (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.01\n", f"line 4: {STEP}, but got '.01'\n"),
         (["u", "z"], "u,z,t\n1,2,0\n1,3,-.01\n4,5,.01\n", f"line 3: {STEP}, but got '-.01'\n"),
+        (["u", "z"], "u,z,timestamp\n1,2,0\n1,3,10000\n4,5,20000\n", f"line 3: {SECONDS}, but got '10000'\n"),
+        (["u", "z"], "u,z,t\n1,2,1700000000000\n1,3,1\n", f"line 2: {SECONDS}, but got '1700000000000'\n"),
         (["u", "z"], "u,z,t\n1,2,0\n1,3,\n4,5,.01\n", "line 3: every row must have a time, but got ''\n"),
         (
             ["u_uA", "z"],

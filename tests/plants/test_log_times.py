@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from filters.logs.alarms import episode_sentence
 from filters.logs.columns import columns_of
@@ -66,3 +67,63 @@ def test_an_alarm_says_when_it_was():
         "z_1: a bias of +0.3 rad/s since 1700000001 s, found at 1700000001.23 s "
         "(2023-11-14 22:13:21.230 UTC) (cusum)"
     )
+
+
+K = np.arange(60)
+JITTER = np.random.default_rng(1).integers(-20, 20, 60)
+SEC = 1_700_000_000
+
+
+def run_of(header, stamps):
+    """A run of 60 rows with these stamps."""
+    return {header: stamps, "force": np.sign(np.sin(K / 9.0)), "speed": np.sin(K / 7.0)}
+
+
+@pytest.mark.parametrize(
+    ("header", "stamps", "dt", "start", "unit"),
+    [
+        ("timestamp", SEC * 10**9 + 5_000_000 * K, 0.005, SEC, "ns"),  # EuRoC's, ROS's
+        ("timestamp", 4000 * K + 123_456, 0.004, 0.123456, "us"),  # PX4's
+        ("timestamp", 10_000 * K + 1_234_567_890 + JITTER, None, None, "us"),
+        ("timestamp", 20_000_000 * K, 0.02, 0.0, "ns"),
+        ("Time", SEC * 10**6 + 7812 * K, 0.007812, SEC, "us"),  # APDM's
+        ("t", SEC * 10**3 + 10 * K, 0.01, SEC, "ms"),
+        ("time", 10_000 * K, 0.01, 0.0, "us"),
+        ("t", 10_000_000 * K, 0.01, 0.0, "ns"),
+        ("t", SEC + 10 * K, 10.0, SEC, ""),
+        ("timestamp", SEC + 0.01 * K, 0.01, SEC, ""),
+        ("timestamp", 900 * K, 900.0, 0.0, ""),
+        ("t", 3600 * K, 3600.0, 0.0, ""),
+        ("t", 100 * K, 100.0, 0.0, ""),
+        ("t", 0.25 * K, 0.25, 0.0, ""),
+        ("t_s", 10_000 * K, 10_000.0, 0.0, ""),
+        ("time_us", 10_000 * K, 0.01, 0.0, ""),
+    ],
+)
+def test_stamps_without_a_unit_are_in_the_one_that_is_possible(header, stamps, dt, start, unit, tmp_path):
+    log = read_log(run_of(header, stamps), MODEL)
+    taken = [one.sentence for one in log.findings if one.kind == "clock"]
+    assert len(taken) == bool(unit) and all(f"are taken as {unit}" in one for one in taken)
+    if dt is None:
+        dt, start = 0.01, 1234.56789
+    assert (log.dt, log.start) == (pytest.approx(dt, rel=1e-5), pytest.approx(start, rel=1e-8))
+    assert log.steps == 59
+    (tmp_path / "run.csv").write_text(
+        f"#{header},force,speed\n"
+        + "".join(
+            f"{one!r},{u},{z}\n"
+            for one, u, z in zip(stamps.tolist(), *list(run_of("t", K).values())[1:], strict=True)
+        )
+    )
+    assert read_log(tmp_path / "run.csv", MODEL).digest == log.digest
+    savemat(tmp_path / "run.mat", run_of(header, stamps))
+    if header != "timestamp":
+        assert read_log(tmp_path / "run.mat", MODEL).dt == log.dt
+
+
+@pytest.mark.parametrize(("header", "step"), [("timestamp", 10**6), ("t", 2000), ("time", 10**6), ("t", 10**11)])
+def test_stamps_that_may_be_in_several_units_are_refused(header, step):
+    with pytest.raises(ValueError, match=rf"^times must be in seconds, .*\(use --column 'time={header}\[us\]'"):
+        read_log(run_of(header, step * K), MODEL)
+    assert read_log(run_of(header, step * K), MODEL, {"time": f"{header}[us]"}).dt == pytest.approx(step * 1e-6)
+    assert read_log(run_of(header, step * K), MODEL, {"time": f"{header}[s]"}).dt == step

@@ -21,14 +21,14 @@ from thruster_env.plants.logs.columns import (
     find_wanted,
     quantities_of,
 )
-from thruster_env.plants.logs.findings import Recording
+from thruster_env.plants.logs.findings import CLOCK, Recording, Remark
 from thruster_env.plants.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
 from thruster_env.plants.logs.log import FEWEST_STEPS, Log
 from thruster_env.plants.logs.own_stamps import at_own_stamps
 from thruster_env.plants.logs.recorders.merged import Recorded
 from thruster_env.plants.logs.recorders.registry import check_stamps, format_of
 from thruster_env.plants.logs.stale_inputs import stale_inputs
-from thruster_env.plants.logs.stamps import follows
+from thruster_env.plants.logs.stamps import follows, in_seconds
 from thruster_env.plants.logs.table import Table, read_table, table_of
 from thruster_env.plants.logs.units import converted
 from thruster_env.plants.state_space import StateSpaceModel
@@ -120,7 +120,7 @@ def read_log(
         table = read_table(path) if is_file else table_of(path, name)
         found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
     file = table.file
-    of_file, start = _grid(table, found.get(TIME), said.dt, file, grid)
+    of_file, start, taken = _grid(table, found.get(TIME), said.dt, file, grid)
     dt = of_file.dt
     offsets = _offsets(said.clock_offset, wanted, found, of_file, file)
     samples, source, parts = {}, {}, {}
@@ -158,7 +158,11 @@ def read_log(
         if one.kind == INPUT
     }
     end = float(of_file.times[-1]) if marks is not None else of_file.dt * (of_file.rows - 1)
-    remarks = (*table.remarks, *stale_inputs(driven, end, dt, start))
+    remarks = (
+        *([Remark(CLOCK, "", taken)] if taken else []),
+        *table.remarks,
+        *stale_inputs(driven, end, dt, start),
+    )
     referred = {
         one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
     }
@@ -221,8 +225,8 @@ def _described(path: Path) -> Description:
     return Description(**content)
 
 
-def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid: bool) -> tuple[Grid, float]:
-    """The grid of a file's rows, or its sample time with their own times, and the stamp of the first one [s]."""
+def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid: bool) -> tuple[Grid, float, str]:
+    """The grid of a file's rows, or its sample time with their own times; the first stamp [s]; how it was read."""
     count = len(table.lines)
     if dt is not None:
         dt = positive("dt", dt)
@@ -239,11 +243,11 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
                 f"columns={{'time': 'HEADER'}}) or a sample time (--dt, dt=), but "
                 f"{file} has {listed(table.names)}"
             )
-        return Grid(dt, count, dt * np.arange(count), False), 0.0
-    stamps = table.dates(column.header)
+        return Grid(dt, count, dt * np.arange(count), False), 0.0, ""
+    stamps, taken = table.dates(column.header), ""
     if stamps is None:
         where = f"column {column.header!r} of {file}"
-        stamps = converted(table.numbers(column.header), column.unit, SECOND, where)
+        stamps, taken = in_seconds(table.numbers(column.header), column.unit, column.header, where)
     if np.isnan(stamps).any():
         row = int(np.argmax(np.isnan(stamps)))
         raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
@@ -267,7 +271,7 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     found = grid_of(stamps, dt, table.clock)
     if not grid:
         found = Grid(found.dt, found.rows, stamps - stamps[0], True)
-    return found, float(stamps[0])
+    return found, float(stamps[0]), taken
 
 
 def _offsets(

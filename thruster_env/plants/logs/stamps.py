@@ -8,8 +8,15 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from thruster_env.plants.logs.units import converted, parted
+
 MISSING = "nan"
 SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
+SECOND = "s"
+TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
+STAMP_NAMES = ("timestamp", "stamp")
+SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
+MOST_SECONDS = 86400.0  # [s], of stamps in seconds
 MOST_DIGITS = 17  # of a float64
 
 
@@ -74,3 +81,49 @@ def date_text(seconds: float) -> str:
     if not SINCE_1970[0] <= seconds <= SINCE_1970[1]:
         return ""
     return f" ({datetime.fromtimestamp(seconds, UTC).isoformat(' ', 'milliseconds').removesuffix('+00:00')} UTC)"
+
+
+def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
+    """The unit of stamps whose column names none, and what was taken, in words; empty for seconds.
+
+    Stamps in ms, us or ns since 1970 are dates from 1989 to 2099 with a sample time of at most 5 s. Others are in
+    seconds if these make a sample time below 1000 s (100 s in a column `timestamp`), or of whole minutes up to a
+    day, or if they are not whole. What is left is in the only unit that makes a sample time from 0.1 ms to 5 s; a
+    column `timestamp`, as of PX4 and ROS, is never in ms.
+
+    Args:
+        stamps: (rows,), NaN where there is none.
+        header: of the column, without a unit.
+        where: the column, for messages.
+
+    Raises:
+        ValueError: if they are not in seconds, and may be in several units.
+    """
+    known = stamps[np.isfinite(stamps)]
+    steps = np.diff(known)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return SECOND, ""
+    step, is_stamp, middle = float(np.median(steps)), header.lower() in STAMP_NAMES, float(np.median(known))
+    for unit, ticks in TICKS.items():
+        if SINCE_1970[0] * ticks <= middle <= SINCE_1970[1] * ticks and step <= LONGEST_STEP * ticks:
+            first = date_text(float(known[0]) / ticks).strip(" ()")
+            return unit, f"times in {where} are taken as {unit} since 1970: the first is {first}"
+    is_whole, is_minutes = bool((known == np.round(known)).all()), not (steps % 60.0).any()
+    if step <= MOST_SECONDS and (not is_whole or step < (100 if is_stamp else 1000) or is_minutes):
+        return SECOND, ""
+    low, high = SHORTEST_STEP, LONGEST_STEP
+    some = [(unit, ticks) for unit, ticks in TICKS.items() if not (is_stamp and unit == "ms")]
+    units = [unit for unit, ticks in some if is_whole and low * ticks <= step <= high * ticks]
+    as_seconds = f"{step:.4g} s" if step < MOST_SECONDS else f"{step / MOST_SECONDS:.3g} days"
+    if len(units) != 1:
+        rule = "times must be in seconds, or their column say its unit"
+        way = f"use --column 'time={header}[us]', or [ns], [ms], [s]"
+        raise ValueError(f"{rule}, but the sample time in {where} would be {as_seconds} ({way})")
+    return units[0], f"times in {where} are taken as {units[0]}: in s the sample time would be {as_seconds}"
+
+
+def in_seconds(stamps: np.ndarray, unit: str | None, header: str, where: str) -> tuple[np.ndarray, str]:
+    """Stamps (rows,) of a column in a unit, None for what `unit_of` finds; and what that took, in words."""
+    unit, taken = (unit, "") if unit is not None else unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
+    return converted(stamps, unit, SECOND, where), taken

@@ -171,7 +171,7 @@ def _read_csv(path: Path) -> Table:
         except csv.Error as error:
             raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
     (line, header), *rows = numbered
-    header[0] = header[0].removeprefix("#").strip()  # headers are comments to some programs
+    header[0] = header[0].lstrip("#%").strip()  # headers are comments to some programs
     _check_header(header, line, path)
     for line, row in rows:
         if len(row) != len(header):

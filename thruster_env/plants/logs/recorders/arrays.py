@@ -11,11 +11,11 @@ import numpy as np
 
 from thruster_env.plants.logs.columns import TIME_NAMES
 from thruster_env.plants.logs.recorders.topics import MOST_COLUMNS, Refused, Topic, Wanted, check_bytes, columns_of
-from thruster_env.plants.logs.units import converted, parted
+from thruster_env.plants.logs.stamps import in_seconds
+from thruster_env.plants.logs.units import parted
 
 NUMERIC = "biuf"  # NumPy's kinds
 FEWEST = 2  # samples; what has fewer is a constant
-SECOND = "s"
 
 
 def topics_of(
@@ -40,7 +40,7 @@ def topics_of(
     for name, size in sizes.items():
         if size is not None and size[1] == 1 and _is_time(name):
             vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
-    known: dict[str, np.ndarray] = {}
+    known: dict[str, tuple[np.ndarray | None, str]] = {}
     if wanted is None:
         within = {name[:place] for name in found for place, letter in enumerate(name) if letter in "({"}
         refused = {name: why for name, one in found.items() if (why := _why_not(one)) and name not in within}
@@ -79,10 +79,12 @@ def topics_of(
             whose = found[clock]
             times = _read(clock, whose, path).astype(np.float64)
             where = f"{clock!r} of {path}"
-            known = {clock: converted(times, unit(whose) or parted(clock)[1], SECOND, where)}
-        yield Topic(
-            group, known[clock] if clock is not None else None, fields, dict.fromkeys(fields, said) if said else {}
-        )
+            try:
+                known = {clock: in_seconds(times, unit(whose) or parted(clock)[1], clock, where)}
+            except ValueError:  # of an unknown unit: fields have no times then
+                known = {clock: (None, "")}
+        own, taken = known[clock] if clock is not None else (None, "")
+        yield Topic(group, own, fields, dict.fromkeys(fields, said) if said else {}, taken=taken)
 
 
 def _why_not(one: Any) -> str:

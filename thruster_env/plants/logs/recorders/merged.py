@@ -12,7 +12,7 @@ from thruster_env.plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, W
 from thruster_env.plants.logs.findings import CLOCK, OUTSIDE, Remark
 from thruster_env.plants.logs.recorders.one_clock import HEADER, RECEIPT, Choice, chosen_clock
 from thruster_env.plants.logs.recorders.registry import Format, Samples, check_stamps, read
-from thruster_env.plants.logs.stamps import follows, time_text
+from thruster_env.plants.logs.stamps import SECOND, follows, time_text
 from thruster_env.plants.logs.table import Table
 from thruster_env.plants.logs.units import parted
 
@@ -98,9 +98,11 @@ class Recorded:
         for name in (found[key].header for key in found if key.startswith(f"{INPUT}:")):
             cells[name][0] = some[name].values[_times(some[name]) <= stamps[0]][-1]
         rows = range(1, len(stamps) + 1)
-        is_clock, remarks = np.isin(stamps, clock), [*_of_choice(choice), *_not_used(found, some, clock)]
+        taken = [Remark(CLOCK, "", one) for one in dict.fromkeys(one.taken for one in some.values()) if one]
+        is_clock = np.isin(stamps, clock)
+        remarks = [*taken, *_of_choice(choice), *_not_used(found, some, clock)]
         table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(some), remarks)
-        return table, {**found, TIME: Column(STAMP, None)}
+        return table, {**found, TIME: Column(STAMP, SECOND)}
 
 
 KINDS = (INPUT, MEASUREMENT)

@@ -14,8 +14,9 @@ from thruster_env.plants.logs.recorders import bag_counts, bags, dataflash, hdf5
 from thruster_env.plants.logs.recorders.bag_files import METADATA
 from thruster_env.plants.logs.recorders.one_clock import RECEIPT, STAMPS, Clocked, chosen_clock
 from thruster_env.plants.logs.recorders.topics import Reader, Topic, Wanted, unreadable
+from thruster_env.plants.logs.stamps import in_seconds
 from thruster_env.plants.logs.table import SUFFIXES, Table, read_table
-from thruster_env.plants.logs.units import converted, parted
+from thruster_env.plants.logs.units import parted
 
 BINS = 8  # of the course of a field
 
@@ -52,6 +53,7 @@ class Samples(NamedTuple):
     damage: str = ""  # what of the file is not read because it is damaged, in words
     clock: str = ""  # "header" or "receipt" in a bag
     received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
+    taken: str = ""  # how times without a unit were read, in words
 
     @property
     def clocked(self) -> Clocked:
@@ -156,7 +158,9 @@ def _of_table(table: Table) -> Contents:
         try:
             dates = table.dates(clock.header)
             where = f"column {clock.header!r} of {table.file}"
-            times = converted(table.numbers(clock.header), clock.unit, "s", where) if dates is None else dates
+            times = dates
+            if dates is None:
+                times = in_seconds(table.numbers(clock.header), clock.unit, clock.header, where)[0]
         except ValueError:  # the column is listed, or why it is not
             times = None
     found, unread = list[Field](), dict[str, str]()
@@ -211,7 +215,7 @@ def _samples(topic: Topic) -> Iterator[tuple[str, Samples]]:
     """Column and samples of each field of a topic."""
     for name, values in topic.values.items():
         unit = topic.units.get(name, "")
-        yield topic.column(name), Samples(topic.times, values, unit, topic.damage, topic.clock, topic.received)
+        yield topic.column(name), Samples(topic.times, values, unit, topic.damage, *topic[6:])
 
 
 def _known(path: str | Path) -> Format:
