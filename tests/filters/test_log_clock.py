@@ -9,14 +9,20 @@ import pytest
 
 from filters import make_filter
 from filters.logs.alarms import alarms_of
+from filters.logs.clock import by_the_clock
 from filters.logs.estimate import estimate
 from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
 from thruster_env.logged import logged_model
 from thruster_env.model import thruster_model
 from thruster_env.plants.continuous import in_discrete_time
+from thruster_env.plants.logs.grid import Series
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.own_stamps import at_own_stamps
 from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.replay import ReplayEnv
+from thruster_env.plants.steps import in_steps
 from tuning.identification.family import ModelFamily
 from tuning.problems.log_problem import LogProblem
 
@@ -140,3 +146,42 @@ def test_alarms_and_isolation_work_on_own_stamps():
 def test_what_needs_a_grid_says_so(call, rule):
     with pytest.raises(ValueError, match=rule):
         call(table(0.01 * np.arange(30)))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("rate", [100, 1000, 8])
+def test_a_log_of_stamps_since_1970_is_the_log_of_times_since_zero(rate):
+    """Stamps that float64 rounds divide no step."""
+    times, found = np.arange(60) / rate, []
+    for start in (0.0, 1.7e9):
+        data = table(times) | {"time_s": start + times}
+        found.append(estimate(data, "ekf", thruster_model(dt=1.0 / rate), grid=False, dt=1.0 / rate))
+        inputs, measurements = in_steps(found[-1].log)
+        assert len(inputs) == 59 and len(measurements) == 60
+        np.testing.assert_allclose(inputs[:, 1], 1.0, rtol=1e-3)
+    np.testing.assert_allclose(found[1].means, found[0].means, rtol=1e-2, atol=1e-3)
+
+
+def test_two_channels_a_rounding_apart_share_a_row():
+    ulp, start = np.spacing(1.7e9), 1.7e9
+    times = 0.01 * np.arange(5)
+    series = {
+        "u": Series(times, np.ones(5)),
+        "z": Series(times + ulp * np.array([0, 1, -1, 1, 0]), np.arange(5.0)),
+    }
+    for since, rows in ((start, 5), (0.0, 8)):
+        stamps, columns = at_own_stamps(series, ["u"], {}, 0.01, float(times[-1]), since)
+        assert len(stamps) == rows == len(columns["z"])
+
+
+def test_a_log_whose_clock_was_set_is_refused_where_steps_are_counted():
+    log = Log(
+        "jump.csv", 0.01, np.zeros((3, 1)), np.zeros((4, 1)), (Quantity("u", "u"),), (Quantity("z", "z"),),
+        stamps=np.array([0.0, 0.01, 0.02, 1.7e9]),
+    )  # fmt: skip
+    for use in (
+        lambda: in_steps(log),
+        lambda: by_the_clock(make_filter("ekf", thruster_model()), np.zeros(2), log, None),
+    ):
+        with pytest.raises(ValueError, match="at most 1000000 steps of 0.01 s apart"):
+            use()
