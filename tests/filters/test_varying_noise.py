@@ -15,6 +15,7 @@ from tests.filters.test_session import cart
 from tests.fuzz import unequal_steps
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
 from tests.models import plane_model, simulated, small
+from tests.slow import slow_but
 from thruster_env.plants.affine import affine_model
 from thruster_env.plants.steps import in_any_steps
 
@@ -332,3 +333,44 @@ def test_of_two_constants_that_may_be_the_sample_time_none_is_taken():
     for use in (lambda: make_filter("ekf", model).session().set_dt(0.2), lambda: make_filter("ekf", model).live()):
         with pytest.raises(ValueError, match="a model with one of the constants dt and substep, but got both"):
             use()
+
+
+OTHERS = {
+    "process_noise_cov": np.array([[0.05, 0.01], [0.01, 0.02]]),
+    "measurement_noise_cov": np.array([[0.2, 0.05], [0.05, 0.3]]),
+    "prior_mean": np.array([0.3, -0.2]),
+    "prior_cov": np.array([[2.0, 0.3], [0.3, 0.5]]),
+}
+WITHOUT_TENSORS = {
+    "mhe",
+    "rhf",
+    "pf",
+    "apf",
+    "rbpf",
+    "gsf",
+    "imm",
+    "mmae",
+    "fuzzy",
+    "open-loop",
+    "low-pass",
+    "inversion",
+}
+ON_TENSORS = [name for name in FILTERS if name not in WITHOUT_TENSORS]
+
+
+@pytest.mark.parametrize(
+    "name", slow_but(ON_TENSORS, {"ekf", "kf-steady", "h-infinity", "vb", "sage-husa", "etkf"})
+)
+def test_tensors_with_other_numbers_are_the_filter_of_a_model_with_them_or_are_refused(name):
+    inputs, z, *_ = drawn(count=3)
+    tensors, follow = torch(made(name, moving())), made(name, moving()).follows_from
+    for number, value in OTHERS.items():
+        other = tensors.replace(**{number: value})
+        if any(number in names for names in follow.values()):
+            with pytest.raises(ValueError, match=f"{number} of '{name}' on tensors must be the model's"):
+                other.run(inputs[None], z[None])
+            continue
+        expected = run(made(name, moving().replace(**{number: value})), None, inputs[None], z[None])
+        found = other.run(inputs[None], z[None])
+        np.testing.assert_allclose(found.means, expected.means, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(found.log_likelihoods, expected.log_likelihoods, rtol=1e-9, atol=1e-10)
