@@ -38,7 +38,7 @@ def likelihood(
     is formed once a step. Sigma-point filters carry the slope of P's root, too; it is NaN where P is singular and
     a parameter makes it regular.
     F = df/dx and H = dh/dx depend on the parameters through m. Of functions that can be traced, which is
-    arithmetic without decisions, their derivatives along dm are exact; of others they are central differences
+    arithmetic with a few decisions, their derivatives along dm are exact; of others they are central differences
     of the model's Jacobians, of large models along each component of x.
 
     Args:

@@ -89,7 +89,7 @@ def far_from_zero(rng: np.random.Generator, seconds: float) -> str:
         for _ in _until(seconds):
             name, unit = str(rng.choice(LINEARISING)), 10.0 ** rng.uniform(-9.0, 9.0)
             away = rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(0.0, 9.0)
-            known = rng.random() < 0.3 and name != "mhe"
+            known = rng.random() < 0.3
             noise = [0.0 if known else 1e-3, 10.0 ** rng.uniform(-4.0, -2.0)]
             prior = [0.0 if known else 1.0, 0.1]
 

@@ -58,8 +58,10 @@ class StateSpaceModel:
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
         inputs: number p of inputs; as many as `input_quantities` if None, or one.
         constants: a NamedTuple (or tuple) of floats that is passed to every function.
-        transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
-        observe_jacobian: dh/dx(x, c); central differences if None.
+        transition_jacobian: df/dx(x, u, c) of one application, finite at the prior mean. If None it follows from f
+            exactly, where f consists of arithmetic, functions of `math` or numpy and a few branches, or else by
+            central differences.
+        observe_jacobian: dh/dx(x, c), in the same way.
         analytic: whether f and h are analytic functions that take complex numbers: Jacobians that are None are
             then found by complex steps, exactly (`derivatives.complex_step`).
         substeps: number of applications of `transition` per step.
