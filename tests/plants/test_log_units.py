@@ -23,6 +23,10 @@ from thruster_env.plants.logs.units import converted, parted
         ("x_1", "x_1", None),
         ("force_x", "force_x", None),
         ("m_s", "m", "s"),
+        ("U_uV", "U", "uV"),
+        ("p_hPa", "p", "hPa"),
+        ("torque_mNm", "torque", "mNm"),
+        ("acc_mg", "acc", "mg"),
     ],
 )
 def test_a_header_tells_its_unit(header, base, unit):
@@ -51,6 +55,17 @@ def test_units_are_converted(tmp_path):
     ("unit", "wanted", "factor"),
     [
         ("mV", "V", 1e-3),
+        ("g", "m/s^2", 9.80665),
+        ("mg", "m/s^2", 9.80665e-3),
+        ("g_0", "m/s^2", 9.80665),
+        ("g0", "m/s^2", 9.80665),
+        ("mg_0", "m/s/s", 9.80665e-3),
+        ("m/s^2", "g", 1 / 9.80665),
+        ("m/s/s", "m/s^2", 1.0),
+        ("m/s2", "mm/s^2", 1e3),
+        ("g", "kg", 1e-3),
+        ("mg", "kg", 1e-6),
+        ("g", "g_0", 1.0),
         ("ms", "s", 1e-3),
         ("µA", "A", 1e-6),
         ("min", "s", 60.0),

@@ -5,7 +5,9 @@ import pytest
 
 from tests.plants.recorders.files import dataflash, h5py, write_ulog
 from tests.plants.test_logs import MODEL
+from thruster_env.plants.affine import affine_model
 from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.recorders.registry import fields
 from thruster_env.plants.logs.write import write_columns
 
 COLUMNS = {"V_s": "cmd.output[0]", "tach": "motor.speed"}
@@ -125,3 +127,38 @@ def test_arrays_with_times_beside_them_have_clocks_of_their_own(tmp_path):
     np.testing.assert_array_equal(again.inputs, log.inputs)
     whole = read_log(tmp_path / "a.h5", MODEL, {"V_s": "motor.n", "tach": "motor.n", "time": "motor.t_ms"})
     assert (whole.dt, whole.steps) == (0.01, 99)
+
+
+@pytest.mark.parametrize(
+    ("field", "unit", "wanted", "factor"),
+    [
+        ("gyro_rad[2]", "rad/s", "rad/s", 1.0),
+        ("gyro_rad[0]", "rad/s", "rad/min", 60.0),
+        ("voltage_v", "V", "mV", 1e3),
+        ("voltage_v", "V", "", 1.0),
+        ("baro_pressure_pa", "Pa", "kPa", 1e-3),
+        ("accelerometer_m_s2[1]", "", "m/s^2", 1.0),
+        ("accelerometer_m_s2[1]", "", "g_0", 1 / 9.80665),
+    ],
+)
+def test_fields_of_px4_have_their_units(field, unit, wanted, factor, tmp_path):
+    name, ticks, values = field.partition("[")[0], 10_000 * np.arange(50), np.sin(np.arange(50.0))
+    kind = "double[3]" if "[" in field else "double"
+    write_ulog(tmp_path / "a.ulg", [("a", 0, f"{kind} {name};double u;", {"timestamp": ticks, field: values})])
+    model = affine_model(
+        **{"a": [[1.0]], "b": [[1.0]], "c": [[1.0]], "process_noise_cov": [1.0], "measurement_noise_cov": [1.0]},
+        **{"prior_mean": [0.0], "prior_cov": [1.0], "measurements": [("reading", "r", wanted)]},
+    )
+    log = read_log(tmp_path / "a.ulg", model, {"u_1": "a.u", "r": f"a.{field}"})
+    np.testing.assert_allclose(log.measurements[:, 0], factor * values, rtol=1e-12)
+    listed = {one.name: one.unit for one in fields(tmp_path / "a.ulg")}
+    assert listed[f"a.{field}"] == unit
+
+
+def test_a_unit_of_another_kind_is_refused_with_the_way_to_name_one(tmp_path):
+    columns = {"V_s": "cmd.output[0]", "tach": "motor.speed[rad]"}
+    ticks, values = 10_000 * np.arange(50), np.sin(np.arange(50.0))
+    with pytest.raises(
+        ValueError, match=r"converts to rad/s, but got 'rad' \(name another in brackets: .*\[rad/s\]\)"
+    ):
+        ulog_of(tmp_path / "a.ulg", (ticks, values), (ticks, values), columns=columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -48,9 +48,11 @@ class Recorded:
         self.is_timed = TIME in given  # by a vector for all fields, in place of those beside them
         while True:
             said = {name: unit for name, one in self.samples.items() if (unit := _unit(name, one)) is not None}
+            own = {name: one.unit for name, one in self.samples.items() if one.unit}
             said |= units
             try:
-                return find_columns(wanted, [*self.samples], given, said, str(self.path), needs_time)
+                found = find_columns(wanted, [*self.samples], given, said, str(self.path), needs_time)
+                return found if self.form.has_units else _without_units(found, wanted, own)
             except ValueError:
                 if self.is_whole:
                     raise
@@ -132,6 +134,17 @@ def _not_used(found: Mapping[str, Column], some: Mapping[str, Samples], clock: n
             )
             remarks.append(Remark(OUTSIDE, key, f"{said} the log from {ends[2]} to {ends[3]} s"))
     return remarks
+
+
+def _without_units(
+    found: Mapping[str, Column], wanted: Sequence[Wanted], known: Mapping[str, str]
+) -> dict[str, Column]:
+    """The columns, without a unit that is only known of a field for a quantity of a model that has none."""
+    plain = {one.key for one in wanted if not one.quantity.unit}
+    return {
+        key: one._replace(unit=None) if key in plain and one.unit == known.get(one.header) else one
+        for key, one in found.items()
+    }
 
 
 def _unit(name: str, one: Samples) -> str | None:

@@ -29,11 +29,12 @@ class Format(NamedTuple):
     magic: bytes  # the first bytes of a file
     topics: Reader
     has_stamps: bool = True  # whether each topic has times of its own, whatever its fields are called
+    has_units: bool = True  # whether units are in the file, and not only known of its messages
     has_receipt: bool = False  # whether messages have times of reception beside those of headers
 
 
 FORMATS = (
-    Format(ulog.KIND, (".ulg", ".ulog"), ulog.MAGIC, ulog.topics),
+    Format(ulog.KIND, (".ulg", ".ulog"), ulog.MAGIC, ulog.topics, has_units=False),
     Format(dataflash.KIND, (".bin",), dataflash.MAGIC, dataflash.topics),
     Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics, has_receipt=True),
     Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics, has_receipt=True),

@@ -26,15 +26,23 @@ KIND = "ULog"
 MAGIC = b"ULog\x01\x12\x35"
 STAMP = "timestamp"
 TICKS = 1e6  # a second
+UNITS = {  # of fields of PX4's messages whose names have none that headers have, or another one
+    **{"gyro_rad": "rad/s", "discharged_mah": "mA*h", "magnetometer_ga": "gauss"},
+    **dict.fromkeys(("voltage_v", "voltage_filtered_v", "voltage5v_v", "esc_voltage"), "V"),
+    **dict.fromkeys(("current_a", "current_filtered_a", "current_average_a", "esc_current"), "A"),
+    **dict.fromkeys(("baro_pressure_pa", "differential_pressure_pa", "differential_pressure_filtered_pa"), "Pa"),
+    **dict.fromkeys(("baro_temp_celcius", "air_temperature_celsius", "esc_temperature"), "degC"),
+}
 START = 16  # bytes before the first message
 FORMAT, SUBSCRIPTION = b"FA"
 KINDS = b"ABCDFILMOPQRS"  # of messages
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
-    """The topics of a ULog: times are `timestamp`/10^6, [s] since the autopilot's start; a ULog has no units.
+    """The topics of a ULog: times are `timestamp`/10^6, [s] since the autopilot's start.
 
-    Instance 1 of a topic is TOPIC#1. What a loss of power cut off in the middle of the data is read up to there.
+    A ULog has no units: they are in the names of fields, or those of PX4's messages. Instance 1 of a topic is
+    TOPIC#1. What a loss of power cut off in the middle of the data is read up to there.
 
     Args:
         path: of the file.
@@ -43,7 +51,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     Raises:
         ValueError: if it is no ULog.
 
-    Source: PX4, "ULog File Format".
+    Sources: PX4, "ULog File Format"; PX4, "uORB Message Reference" (units).
     """
     check_bytes(path.stat().st_size, "a ULog", path)
     core = package("pyulog.core", KIND, path)
@@ -71,7 +79,10 @@ def _topic(name: str, data: Any, damage: str) -> Topic:
     if STAMP not in data.data:
         return Topic(name, None, {}, unread={"": "messages without times"})
     kinds = {one.field_name: one.type_str for one in data.field_data}
-    return Topic(name, data.data[STAMP] / TICKS, _numbers(data.data, kinds), damage=damage)
+    numbers = _numbers(data.data, kinds)
+    known = {field: UNITS.get(field.rpartition(".")[2].partition("[")[0], "") for field in numbers}
+    units = {field: unit for field, unit in known.items() if unit}
+    return Topic(name, data.data[STAMP] / TICKS, numbers, units, damage=damage)
 
 
 def _check_definitions(content: bytes, path: Path) -> int:
