@@ -44,8 +44,8 @@ class MovingHorizonFilter(Filter):
     vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
     R itself. A step that costs more than it gains is halved.
 
-    Each step of the window keeps its dt, Q and R. A second measurement at the same time is one more step,
-    to which nothing moves; it counts among the L.
+    Each step of the window keeps its dt, Q and R. Measurements of one time share a step; a second
+    reading of a channel is one more step, to which nothing moves, and counts among the L.
 
     `Belief.extras` holds the number of steps, m, P, and of each step u, x, z, multipliers, Q, R and the model's
     constants; `window` reads x.

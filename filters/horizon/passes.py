@@ -1,7 +1,7 @@
 """Kernels of moving-horizon estimation: passes of a smoother over a window, until its states settle.
 
-Each step of a window keeps the Q, R and constants that acted then. Of two measurements at the same time the second
-has a step of its own, to which nothing moves.
+Each step of a window keeps the Q, R and constants that acted then. Measurements of one time share a step; a second
+reading of a channel has one of its own, to which nothing moves.
 """
 
 from __future__ import annotations
@@ -243,21 +243,37 @@ def horizon_kernels(
             settled = k + 1 == iterations + more or (k + 1 >= iterations and wrong == 0)
 
     @inlined
+    def take(row, z, numbers):
+        """Keep a measurement beside those of the same time, of which its errors are independent."""
+        newest = steps + (int(row[number]) - 1) * end
+        is_first, fits = True, True
+        for i in range(m):
+            if row[newest + kept.z + i] < math.inf:
+                is_first = False
+                fits = fits and z[i] != z[i]
+        if is_first:
+            keep_sight(row, numbers, int(row[number]) - 1)
+        else:
+            for i in range(constants):
+                fits = fits and row[newest + kept.seen_by + i] == numbers[constants_place + i]
+            if not fits:
+                repeat_step(row, numbers, int(row[number]))
+                newest = steps + (int(row[number]) - 1) * end
+        for i in range(m):
+            if z[i] == z[i]:
+                row[newest + kept.z + i] = z[i]
+                for j in range(m):
+                    joint = numbers[r_place + i * m + j] if z[j] == z[j] else 0.0
+                    row[newest + kept.R + i * m + j] = row[newest + kept.R + j * m + i] = joint
+
+    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         tell(row, z, numbers)
         if anything_measured(z):
-            last = steps + (int(row[number]) - 1) * end + kept.z
-            for i in range(m):
-                if row[last + i] < math.inf:
-                    repeat_step(row, numbers, int(row[number]))
-                    break
+            take(row, z, numbers)
         count = int(row[number])
         newest = steps + (count - 1) * end
-        if anything_measured(z):
-            keep_sight(row, numbers, count - 1)
-            for i in range(m):
-                row[newest + kept.z + i] = z[i] if z[i] == z[i] else math.inf
         if has_bounds or anything_measured(z):
             settle(row, numbers, count)
             for i in range(n):

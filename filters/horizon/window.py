@@ -67,7 +67,7 @@ class Kept(NamedTuple):
     seen_by: int  # (c,), the model's constants at z
     Q: int  # (n, n), from this step to the next one
     moved_by: int  # (c,), constants of that motion
-    substeps: int  # of it; none to a second measurement at the same time
+    substeps: int  # of it; none to a second reading at the same time
     end: int
 
 

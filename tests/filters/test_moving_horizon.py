@@ -340,3 +340,22 @@ def test_a_window_is_no_mode_of_a_filter_that_mixes_estimates():
     found = run(make_filter("mmae", line_model(), modes=modes, mode_filter="mhe"), KEYS, inputs, measurements)
     expected = run(make_filter("mhe", line_model()), KEYS, inputs, measurements)
     np.testing.assert_allclose(found.means, expected.means, rtol=1e-9)
+
+
+@pytest.mark.parametrize("loss", ["quadratic", "huber", "student"])
+def test_sensors_that_are_read_one_after_the_other_share_a_step(loss):
+    """With a diagonal R the window is that of both at once, and as long."""
+    inputs, measurements = curved_data()
+    model = curved_model().replace(measurement_noise_cov=np.diag(R))
+    filter_ = MovingHorizonFilter(model=model, horizon=4, iterations=40, loss=loss, threshold=K)
+    both = one_by_one = filter_.init()
+    for k, z in enumerate(measurements):
+        if k:
+            both, one_by_one = (filter_.predict(one, inputs[k - 1]) for one in (both, one_by_one))
+        both, _ = filter_.update(both, z)
+        for i in (1, 0):
+            alone = np.where(np.arange(2) == i, z, np.nan)
+            one_by_one, _ = filter_.update(one_by_one, alone)
+        assert len(filter_.window(one_by_one)) == min(k + 1, 4)
+    np.testing.assert_allclose(filter_.window(one_by_one), filter_.window(both), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(one_by_one.cov, both.cov, rtol=1e-6)
