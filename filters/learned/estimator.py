@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
-from thruster_env.numerics.checks import at_least, one_of
+from thruster_env.numerics.checks import as_floats, at_least, one_of
 from thruster_env.numerics.torch_threads import one_thread
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -163,7 +163,7 @@ class LearnedEstimator(nn.Module):
 
     def run(self, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Output:
         """All estimates of trajectories at once: keys (B, 2), inputs (B, K, p), measurements (B, K + 1, m)."""
-        u, z = (torch.tensor(one, dtype=torch.float64) for one in (inputs, measurements))
+        u, z = (torch.tensor(as_floats(one), dtype=torch.float64) for one in (inputs, measurements))
         with torch.no_grad(), one_thread():
             track = self.begin(keys, z[:, 0])
             tracks = [track]
@@ -174,7 +174,7 @@ class LearnedEstimator(nn.Module):
         return Output(*(None if part[0] is None else torch.stack(part, 1).numpy() for part in parts))
 
     def _row(self, values) -> Tensor:
-        return torch.tensor(np.array(values), dtype=torch.float64)[None]
+        return torch.tensor(as_floats(values), dtype=torch.float64)[None]
 
     def _output(self) -> Output:
         assert self._track is not None

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from filters.pages.traced import MOST, Traced
 from filters.tensors.graphs import order_of, values_of
@@ -19,6 +20,8 @@ from filters.tensors.stages import Equation
 from thruster_env.numerics.algebra.graphs import Graph, Number
 from thruster_env.numerics.sources import is_array
 from thruster_env.plants.shape import Shape, constants_are_array
+
+POINTS = 64  # at which functions of tensors are compared with those of floats
 
 
 def sizes_of(others: int, shape: Shape) -> tuple[int, ...]:
@@ -58,12 +61,42 @@ class OfGraph:
         return stacked(values_of(wanted, order, given, parts[0][0]), parts)
 
 
+ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
+LEAVING = frozenset(
+    "tolist numpy __array__".split()
+)  # torch: a function of tensors may do so and give derivatives
+
+
+class _NoNumberAsked(TorchFunctionMode):
+    """Within this context no batch of tensors is asked for a number, and none that has derivatives for a float."""
+
+    def __init__(self, asking: frozenset[str]):
+        """Take the names of what asks for one."""
+        super().__init__()
+        self._asking = asking
+
+    def __torch_function__(self, function, types, arguments=(), named=None):
+        name = getattr(function, "__name__", "")
+        if name in self._asking:
+            asked = arguments[0]
+            if asked.numel() > 1 or asked.requires_grad and name != "__bool__":
+                raise TypeError(
+                    f"a tensor was asked for one number ({name.strip('_')}), which holds for no batch and loses "
+                    "derivatives; torch's functions and torch.where take tensors"
+                )
+        return function(*arguments, **(named or {}))
+
+
 class Called:
     """An equation whose function takes tensors (...,) in the places of floats."""
 
-    def __init__(self, name: str, function: Callable, jacobian: Callable | None, shape: Shape):
-        """Take the function and its Jacobian, as a model has them."""
+    def __init__(
+        self, name: str, function: Callable, jacobian: Callable | None, shape: Shape, of_floats: bool = False
+    ):
+        """Take the function and its Jacobian, as a model has them; `of_floats` if it is meant for floats."""
         self._name, self._function, self._jacobian, self._shape = name, function, jacobian, shape
+        self._unproven = {self._function, self._entries}  # functions that have not yet been called with a batch
+        self._of_floats = of_floats
 
     def _value(self, x: Tensor, *others: Tensor) -> Tensor:
         return self._called(self._function, _components(x, *others))
@@ -93,6 +126,9 @@ class Called:
         u = [tuple(one.expand_as(x[0]) for one in part) for part in u]  # so that they can be stacked with x
         states, *inputs = (torch.stack(part) if is_array(len(part)) else part for part in (x, *u))
         try:
+            if function in self._unproven:
+                self._unproven.remove(function)
+                self._prove(function, parts)
             return stacked(function(states, *inputs, self._constants(c)), parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise ValueError(
@@ -100,11 +136,54 @@ class Called:
                 f"{type(error).__name__}: {str(error).splitlines()[0]}"
             ) from error
 
-    def _constants(self, c: tuple[Tensor, ...]):
+    def _prove(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> None:
+        """Raise TypeError if a function asks a state for a number: for one trajectory it would be answered."""
+        *given, c = parts
+        size = sum(map(len, given))
+        values = torch.as_tensor(np.sin(np.outer(np.arange(1.0, size + 1.0), 0.1 + np.arange(POINTS))))
+        values = (values * torch.logspace(-1.0, 1.0, POINTS)).to(c[0] if c else given[0][0])
+        rows = list(values.unbind(0))
+        *arguments, constants = [*_split(rows, [*map(len, given)]), self._constants(c)]
+        try:
+            with _NoNumberAsked(ASKING | LEAVING if self._of_floats else ASKING):
+                found = [*function(*arguments, constants)]
+        except TypeError as error:
+            if "asked for one number" in str(error):
+                raise
+            return
+        except Exception:  # other limits of a function are its own: it may be meant for one trajectory
+            return
+        if self._of_floats and function is self._function and all(one.numel() == 1 for one in c):
+            self._compare(found, values, [*map(len, given)], [float(one) for one in c])
+
+    def _compare(self, found: list, values: Tensor, sizes: list[int], c: list[float]) -> None:
+        """Raise TypeError unless tensors (rows of points) have the values of floats, where these are finite."""
+        for k, point in enumerate(values.double().T.tolist()):
+            arguments = _split(point, sizes)
+            try:
+                expected = np.array(self._function(*arguments, self._constants(c)), dtype=np.float64)
+            except (ArithmeticError, ValueError):
+                continue
+            tensors = np.array([float(one.expand(POINTS)[k]) if isinstance(one, Tensor) else one for one in found])
+            if np.isfinite(expected).all() and not np.allclose(tensors, expected, rtol=1e-4, atol=1e-5):
+                raise TypeError("of tensors it has other values than of floats: a sum of comparisons is no number")
+
+    def _constants(self, c: Sequence):
         form = self._shape.form
         if constants_are_array(form):
-            return torch.stack(c)
-        return c if isinstance(form, int) else form(*c)
+            return torch.stack(c) if isinstance(c[0], Tensor) else np.array(c)
+        return tuple(c) if isinstance(form, int) else form(*c)
+
+
+def _split(values: list, sizes: Sequence[int]) -> list:
+    """Values as the arguments of a function, of so many components, as a model's function takes them."""
+    found, first = [], 0
+    for size in sizes:
+        part = values[first : first + size]
+        stack: Callable = torch.stack if part and isinstance(part[0], Tensor) else np.array
+        found.append(stack(part) if is_array(size) else tuple(part))
+        first += size
+    return found
 
 
 def _components(*arguments: Tensor) -> list[tuple[Tensor, ...]]:
@@ -148,4 +227,4 @@ def equation_of(
     try:
         return OfGraph(*of_model, others, shape)
     except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
-        return Called(name, *of_model, shape)
+        return Called(name, *of_model, shape, of_floats=True)

@@ -17,10 +17,10 @@ from filters.pages.page_filter import with_page
 from filters.tensors.algebra import root, where, wrapped_where
 from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovation
 from filters.tensors.equations import equation_of
-from filters.tensors.likelihood import compiled_likelihood
+from filters.tensors.likelihood import as_numbers, compiled_likelihood
 from filters.tensors.stages import Draw, EnsembleStages, Stages, normals_of
 from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.checks import one_of, short_repr
 from thruster_env.numerics.streams import filter_keys
 
 DIMENSIONS = {
@@ -289,9 +289,9 @@ class TensorFilter:
         """A value as a tensor (..., *shape) of the filter's dtype and on its device."""
         like = self.prior_mean
         try:
-            found = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+            found = torch.as_tensor(as_numbers(value), dtype=like.dtype, device=like.device)
         except (TypeError, ValueError, RuntimeError):
-            raise ValueError(f"{name} must be a tensor of numbers, but got {value!r}") from None
+            raise ValueError(f"{name} must be a tensor of numbers, but got {short_repr(value)}") from None
         if found.shape[found.ndim - len(shape) :] != shape:
             wanted = ", ".join(("...", *map(str, shape)))
             raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(found.shape)}")

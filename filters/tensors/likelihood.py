@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from filters.filter import Filter
 from filters.likelihood import likelihood
+from thruster_env.numerics.checks import as_floats
 from thruster_env.numerics.sources import lower_pairs
 
 
@@ -24,11 +25,18 @@ def compiled_likelihood(filter_: Filter, inputs: Any, measurements: Any, q: Tens
         q: Q, (n, n).
         r: R, (m, m).
     """
-    z = np.asarray(torch.as_tensor(measurements).detach().cpu(), dtype=np.float64)
+    z = np.asarray(torch.as_tensor(as_numbers(measurements)).detach().cpu(), dtype=np.float64)
     if inputs is None:
         inputs = np.zeros((len(z), z.shape[1] - 1, 0))
-    u = np.asarray(torch.as_tensor(inputs).detach().cpu(), dtype=np.float64)
+    u = np.asarray(torch.as_tensor(as_numbers(inputs)).detach().cpu(), dtype=np.float64)
     return _Likelihood.apply(filter_, u, z, q, r)
+
+
+def as_numbers(value: Any) -> Any:
+    """A tensor, or a list of such, as it is; else an array of floats, NaN where something is missing."""
+    if isinstance(value, Tensor) or isinstance(value, (list, tuple)) and any(isinstance(a, Tensor) for a in value):
+        return value
+    return np.ascontiguousarray(as_floats(value))
 
 
 class _Likelihood(torch.autograd.Function):

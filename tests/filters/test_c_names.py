@@ -11,7 +11,7 @@ from filters.c.source import c_filter
 from filters.monitoring.monitor import monitor_of
 from tests.models import scalar_model
 
-TAKEN = """exp R advance NAN new class double_t correct settle filter x u z t0 i P prior_mean line values show math
+TAKEN = """exp R advance NAN new class double_t correct settle filter x u z t0 i P prior_mean line math
 board is_lost update reset Real told states INFINITY isnan expf y0 gamma M_PI INT8_MAX NULL printf remove index
 string time COLUMNS uint32_t become_prior true template namespace operator x_t hypotl stdin""".split()
 FREE = ["ekf", "EKF", "tank", "torque", "stroke", "member", "R_", "a", "test", "draw", "philox", "EKF_2", "expo"]

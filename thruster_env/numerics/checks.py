@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from functools import lru_cache
-from types import NoneType
 
 import numpy as np
 
@@ -31,20 +30,41 @@ def short_repr(value) -> str:
 def as_floats(value) -> np.ndarray:
     """Return value as a float64 array, NaN and infinity included; raise ValueError unless it is real numbers.
 
-    Text that looks like a number is none, and neither are None and complex numbers. What a masked array masks is
-    missing, NaN.
+    Text that looks like a number is none, and neither are complex numbers. What is missing in an array is NaN:
+    what a masked array masks, alone or in a list, None and pandas.NA.
     """
     try:
-        if isinstance(value, np.ma.MaskedArray):
-            value = np.ma.asarray(value, dtype=np.float64).filled(np.nan) if value.dtype.kind in "biuf" else None
-        array = np.asarray(value)
-        if array.dtype == object and any(isinstance(entry, (str, bytes, NoneType)) for entry in array.flat):
-            raise TypeError
+        array = np.asarray(_unmasked(value))
+        if array.dtype == object:
+            array = _with_missing_as_nan(array)
         if array.dtype.kind not in "biufO":
             raise TypeError
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last of tensors, and of endless lists
         raise ValueError(f"an array must be one of numbers, but got {short_repr(value)}") from None
+
+
+def _unmasked(value):
+    """A value without its masks: what they hide is NaN."""
+    if isinstance(value, np.ma.MaskedArray):
+        if value.dtype.kind == "O":
+            return value.filled(math.nan)
+        return np.ma.asarray(value, dtype=np.float64).filled(np.nan) if value.dtype.kind in "biuf" else None
+    if isinstance(value, (list, tuple)) and any(
+        isinstance(one, (list, tuple, np.ma.MaskedArray)) for one in value
+    ):
+        return [_unmasked(one) for one in value]
+    return value
+
+
+def _with_missing_as_nan(array: np.ndarray) -> np.ndarray:
+    """An array of objects whose entries None and pandas.NA are NaN; TypeError if some are text, or it is None."""
+    entries = [
+        math.nan if one is None or type(one).__name__ == "NAType" else one for one in array.ravel().tolist()
+    ]
+    if not array.ndim or any(isinstance(one, (str, bytes)) for one in entries):
+        raise TypeError
+    return np.array(entries, dtype=object).reshape(array.shape)
 
 
 def finite(name: str, value) -> float:
