@@ -63,7 +63,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             formats = _formats(reader, index, offsets, content, path)
         if not any(len(offsets[kind]) for kind, (one, *_) in formats.items() if one.form.name not in FORMATS):
             raise ValueError("it holds no messages but those that describe others")
-    damage = _damage(formats, offsets, len(content))
+    damage = _damage(formats, offsets, content)
     names = None if wanted is None else {one.partition(".")[0].partition("#")[0] for one in wanted}
     some = [(one.form.name, kind, one) for kind, each in formats.items() for one in each]
     for name, group in groupby(sorted(some, key=lambda one: one[0]), lambda one: one[0]):
@@ -129,7 +129,7 @@ def _units(
     form = index.formats.get(kind)
     if form is None or not {"UnitIds", "MultIds"} <= set(form.colhash):
         return []
-    found = []
+    found: list[tuple[int, int, Callable[[Any], None]]] = []
     for place in offsets[kind].tolist():
         body = content[place + HEADER : place + form.len].tobytes()
         if len(body) + HEADER < form.len:
@@ -149,8 +149,10 @@ def _text(part: bytes) -> str:
     return part.partition(b"\0")[0].decode("ascii", "replace")
 
 
-def _damage(formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.ndarray], size: int) -> str:
-    """What of a log is not read, in words; a few bytes at the end that are no message are the rest of a page."""
+def _damage(
+    formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.ndarray], content: np.ndarray
+) -> str:
+    """What of a log is not read, in words; a few bytes of 0 or 255 at its end are the rest of a page."""
     begins = [np.empty(0, np.int64)]
     ends = [np.empty(0, np.int64)]
     for kind, each in formats.items():
@@ -163,7 +165,9 @@ def _damage(formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.nd
     if not len(begin):
         return ""
     holes = np.append(begin[0], begin[1:] - end[:-1])
-    lost, places, after = int(holes[holes > 0].sum()), int((holes > 0).sum()), size - int(end[-1])
+    lost, places, after = int(holes[holes > 0].sum()), int((holes > 0).sum()), len(content) - int(end[-1])
+    rest = set(content[len(content) - after :].tolist()) if 0 < after < LONGEST else set()
+    is_rest = rest in (set(), {0}, {255})
     nameless = sum(len(one) for kind, one in enumerate(offsets) if kind not in formats)
     some = [f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"] * (lost > 0)
     unlike = (
@@ -175,7 +179,7 @@ def _damage(formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.nd
     some += [f"the format of {name!r} is not as long as its messages" for name in unlike]
     some += [f"{nameless} messages of the log have no format"] * (nameless > 0)
     some += ["the log is cut off: its last message is not whole"] * (after < 0)
-    some += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST)
+    some += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST or not is_rest)
     return ", and ".join(some)
 
 

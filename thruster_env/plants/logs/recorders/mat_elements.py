@@ -57,7 +57,7 @@ def arrays_of(path: Path) -> dict[str, Any]:
                 data = _unpacked(file, count, order, total, path)
             else:
                 check_bytes(total + count, WHOLE, path)
-                data = tag + file.read(count)
+                data = bytearray(tag + file.read(count))
             total += len(data)
             for element in _elements(data, 0, len(data), order):
                 _add(data, element, order, "", found, path)

@@ -45,7 +45,7 @@ class Opened:
         if kind.kind not in KINDS:
             raise ValueError(f"numbers of {kind}")
         values = np.empty(shape, kind)
-        left = memoryview(values.reshape(-1).view(np.uint8))
+        left = values.reshape(-1).view(np.uint8).data
         while len(left):
             count = self._child.stdout.readinto(left)  # type: ignore[union-attr]
             if not count:

@@ -179,7 +179,10 @@ def hdf5(request: dict) -> tuple[dict[str, Any], Reader]:
             told[name] = f"damaged: {_line(error)}"
 
     def read(number: int) -> np.ndarray:
-        dataset, field = found[names[number]]
+        one = found[names[number]]
+        if isinstance(one, str):
+            raise ValueError(one)
+        dataset, field = one
         return dataset[()] if field is None else dataset.fields(field)[()]
 
     return {"datasets": told}, read
@@ -231,7 +234,7 @@ def main() -> None:
         try:
             values = np.ascontiguousarray(read(int(line)))
             if values.dtype.kind in SENT:
-                told, data = {"dtype": values.dtype.str}, memoryview(values.reshape(-1).view(np.uint8))
+                told, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
             else:
                 told, data = {"texts": [str(one) for one in values.reshape(-1)]}, memoryview(b"")
         except Exception as error:

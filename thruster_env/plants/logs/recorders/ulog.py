@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,10 @@ UNITS = {  # of fields of PX4's messages whose names have none that headers have
     **dict.fromkeys(("baro_pressure_pa", "differential_pressure_pa", "differential_pressure_filtered_pa"), "Pa"),
     **dict.fromkeys(("baro_temp_celcius", "air_temperature_celsius", "esc_temperature"), "degC"),
 }
-START = 16  # bytes before the first message
+START, HEADER = 16, 3  # bytes before the first message, and before the body of each
+LONGEST = 10_000  # bytes of a message of a kind that is not known
+SEVERAL = 4  # messages that follow one another: none begin by chance
+APPENDED = struct.pack("<HB", 40, ord("B")) + bytes(8) + b"\1"  # flags of a log to which data were appended
 FORMAT, SUBSCRIPTION = b"FA"
 KINDS = b"ABCDFILMOPQRS"  # of messages
 
@@ -42,7 +46,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The topics of a ULog: times are `timestamp`/10^6, [s] since the autopilot's start.
 
     A ULog has no units: they are in the names of fields, or those of PX4's messages. Instance 1 of a topic is
-    TOPIC#1. What a loss of power cut off in the middle of the data is read up to there.
+    TOPIC#1. What a loss of power cut off is read up to there, and what is damaged around that.
 
     Args:
         path: of the file.
@@ -57,15 +61,23 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     core = package("pyulog.core", KIND, path)
     names = None if wanted is None else sorted({one.partition(".")[0].partition("#")[0] for one in wanted})
     with reading(KIND, path), silent():
-        with path.open("rb") as file:
-            _check_formats(core.ULog(file, parse_header_only=True).message_formats)
-        end = _check_definitions(path.read_bytes(), path)
-        with path.open("rb") as file:
-            log = core.ULog(file, names)
-            found = log.data_list
+        content = path.read_bytes()
+        parts = _whole_parts(content)
+        _check_definitions(content, parts, path)
+        size = len(content)
+        lost = size - START - sum(end - begin for begin, end in parts)
+        if lost:  # where bytes are left out, the places of what was appended are no longer right
+            content = b"".join([content[:START], *(content[begin:end] for begin, end in parts)])
+            content = content.replace(APPENDED, APPENDED[:-1] + b"\0", 1)
+        _check_formats(core.ULog(BytesIO(content), parse_header_only=True).message_formats)
+        log = core.ULog(BytesIO(content), names)
+        found = log.data_list
         if not found and wanted is None:
             raise ValueError("it holds no data")
-    damage = _damage(end, path.stat().st_size, log.file_corruption)
+    places = 1 + len(parts) - (not parts or parts[0][0] == START) - (not parts or parts[-1][1] == size)
+    damage = f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"
+    if not lost:
+        damage = "some messages of the log are not as long as their formats say" if log.file_corruption else ""
     while found:
         parts = [found.pop(0)]
         while found and (found[0].name, found[0].multi_id) == (parts[0].name, parts[0].multi_id):
@@ -85,39 +97,71 @@ def _topic(name: str, data: Any, damage: str) -> Topic:
     return Topic(name, data.data[STAMP] / TICKS, numbers, units, damage=damage)
 
 
-def _check_definitions(content: bytes, path: Path) -> int:
-    """Where the messages of a ULog end that follow one another without damage [bytes].
+def _whole_parts(content: bytes) -> list[tuple[int, int]]:
+    """Begin and end of the parts of a ULog in which messages follow one another; damage and a cut lie between.
 
-    Raises:
-        Refused: for a format that is defined twice, or a number that stands for two topics: the package keeps the
-            last one, and drops what belongs to the first.
+    The package goes through damaged parts byte by byte, and reads what the next bytes say each time.
     """
-    place, formats, subscribed = START, dict[bytes, bytes](), set[int]()
-    while place + 3 <= len(content):
-        count, kind = struct.unpack_from("<HB", content, place)
-        if place + 3 + count > len(content) or kind not in KINDS:
-            break
-        if kind == FORMAT:
-            name, _, text = content[place + 3 : place + 3 + count].partition(b":")
-            if formats.setdefault(name, text) != text:
-                what = name[:80].decode("ascii", "replace")
-                raise Refused(f"a ULog must define a format once, but {path} defines {what!r} twice")
-        elif kind == SUBSCRIPTION and count > 3:
-            number = int.from_bytes(content[place + 4 : place + 6], "little")
-            if number in subscribed:
-                what = content[place + 6 : place + 3 + count][:80].decode("ascii", "replace")
-                rule = "a ULog must give each subscription its own number"
-                raise Refused(f"{rule}, but {path} gives {number} again, to {what!r}")
-            subscribed.add(number)
-        place += 3 + count
-    return place
+    parts, place = [], START
+    while place < len(content):
+        begin = place
+        while (after := _after(content, place)) is not None:
+            place = after
+        if place > begin:
+            parts.append((begin, place))
+        place = next((one for one in range(place + 1, len(content)) if _begins(content, one)), len(content))
+    return parts
 
 
-def _damage(end: int, size: int, is_corrupt: bool) -> str:
-    """What of a file is damaged, in words."""
-    if is_corrupt:
-        return f"the log is damaged from byte {end} on, and some messages there are not read"
-    return f"the log is cut off: its last {size - end} bytes are no whole message" if end < size else ""
+def _after(content: bytes, place: int) -> int | None:
+    """Where the message ends that begins at a place, None where none does."""
+    if place + HEADER > len(content):
+        return None
+    count, kind = struct.unpack_from("<HB", content, place)
+    end = place + HEADER + count
+    if kind not in KINDS:  # one that is newer than these
+        follows = end + HEADER <= len(content) and content[end + 2] in KINDS
+        return end if kind and 0 < count <= LONGEST and follows else None
+    return end if end <= len(content) else None
+
+
+def _begins(content: bytes, place: int) -> bool:
+    """Whether several messages follow one another from a place on."""
+    if place + HEADER > len(content) or content[place + 2] not in KINDS:
+        return False
+    for _ in range(SEVERAL):
+        after = _after(content, place)
+        if after is None:
+            return False
+        if after == len(content):
+            return True
+        place = after
+    return True
+
+
+def _check_definitions(content: bytes, parts: Sequence[tuple[int, int]], path: Path) -> None:
+    """Raise Refused for a format that is defined twice, or a number that stands for two topics.
+
+    The package keeps the last one, and drops what belongs to the first.
+    """
+    formats, subscribed = dict[bytes, bytes](), set[int]()
+    for place, last in parts:
+        while place < last:
+            count, kind = struct.unpack_from("<HB", content, place)
+            begin, end = place + HEADER, place + HEADER + count
+            if kind == FORMAT:
+                name, _, text = content[begin:end].partition(b":")
+                if formats.setdefault(name, text) != text:
+                    what = name[:80].decode("ascii", "replace")
+                    raise Refused(f"a ULog must define a format once, but {path} defines {what!r} twice")
+            elif kind == SUBSCRIPTION and count > 3:
+                number = int.from_bytes(content[begin + 1 : begin + 3], "little")
+                if number in subscribed:
+                    what = content[begin + 3 : end][:80].decode("ascii", "replace")
+                    rule = "a ULog must give each subscription its own number"
+                    raise Refused(f"{rule}, but {path} gives {number} again, to {what!r}")
+                subscribed.add(number)
+            place = end
 
 
 def _numbers(data: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
