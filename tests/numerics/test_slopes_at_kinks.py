@@ -29,6 +29,7 @@ AT_ZERO = {
     "nested exponentials": (lambda x, y: math.exp(-math.exp(900.0 + x)) + y, (0.0, 1.0)),
     "hyperbolic tangent": (lambda x, y: math.tanh(math.exp(900.0 + x)) + y, (0.0, 1.0)),
     "angle": (lambda x, y: math.atan(math.cosh(900.0 + x)) + y, (0.0, 1.0)),
+    "elevation at the zenith": (lambda x, y: math.asin(1.0 - abs(x)) + math.acos(1.0 - abs(y)), (0.0, 0.0)),
     "power by logarithm": (lambda x, y: math.exp(1.5 * math.log(abs(x))) + y, (0.0, 1.0)),
 }
 
@@ -83,3 +84,11 @@ def test_powers_of_negative_numbers_have_a_slope_along_the_exponent():
     numbers = slopes_of(lambda x, y: x ** (y + 2.0))
     found = values_of(numbers, np.array([[-2.0], [0.0]]))[:3, 0]
     np.testing.assert_allclose(found, [4.0, -4.0, 4.0 * math.log(2.0)])
+
+
+def test_arcs_are_those_of_python_with_their_slopes():
+    numbers = slopes_of(lambda x, y: math.asin(x) + 3.0 * np.arccos(y))[:3]
+    points = np.linspace(-0.999, 0.999, 41) * np.array([[1.0], [-0.9]])
+    (value, by_x, by_y), (x, y) = values_of(numbers, points), points
+    np.testing.assert_allclose(value, np.arcsin(x) + 3.0 * np.arccos(y), rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose([by_x, by_y], [1.0 / np.sqrt(1.0 - x * x), -3.0 / np.sqrt(1.0 - y * y)], rtol=1e-12)

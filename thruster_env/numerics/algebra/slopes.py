@@ -93,7 +93,8 @@ def _of_angle(y, a, b, da, db):
 def _of_length(y, a, b, da, db):
     """Half the slope of the square over the length; 0 at zero, as in between."""
     products = times(da, lambda: a), times(db, lambda: b)
-    return _unless_zero(y, 0.5 * added(*map(_twice, products)) / y)
+    of_square = added(*map(_twice, products))
+    return None if of_square is None else _unless_zero(y, 0.5 * of_square / y)
 
 
 def _twice(slope: Slope) -> Slope:

@@ -28,6 +28,8 @@ from thruster_env.numerics.algebra.graphs import UNARY, Number, arctan2, where
 OTHER_NAMES = {
     "atan": "arctan",
     "atan2": "arctan2",
+    "asin": "arcsin",
+    "acos": "arccos",
     "fabs": "absolute",
     "abs": "absolute",
     "pow": "power",
@@ -128,6 +130,8 @@ FUNCTIONS: dict[str, Callable] = {
     "sign": lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, where(x == x, 0.0, math.nan))),
     "where": where,
     "arctan2": arctan2,
+    "arcsin": lambda x: arctan2(x, ((1.0 - x) * (1.0 + x)).sqrt()),
+    "arccos": lambda x: arctan2(((1.0 - x) * (1.0 + x)).sqrt(), x),
     "maximum": _extreme(_largest),
     "minimum": _extreme(_smallest),
     "fmax": lambda a, b: where(a == a, _largest(a, b), b),
