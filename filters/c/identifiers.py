@@ -74,5 +74,5 @@ def is_taken(name: str, texts: Iterable[str]) -> bool:
 
 
 def _without_comments(text: str) -> str:
-    """A text of C without its comments and strings."""
-    return re.sub(r'/\*.*?\*/|"(?:\\.|[^"\\])*"', " ", text, flags=re.S)
+    """A text of C without its comments, strings and characters, of which one may be a quote."""
+    return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)

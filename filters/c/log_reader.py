@@ -334,27 +334,27 @@ static int take_given(int i, const char *word)
 static int take_own(int i)
 {
     static char base[LONGEST], unit[LONGEST], its[LONGEST];
-    int one = -1;
+    int chosen = -1;
 
     for (int k = 0; k < width; k++) {
         int is_symbol = is_named(titles[k], symbols[i], 0), is_own = strcmp(titles[k], headers[i]) == 0;
         part(titles[k], base, unit);
         if (is_symbol || is_own || (names[i][0] != '\0' && is_named(base, names[i], 1)) ||
             is_named(base, symbols[i], 0)) {
-            if (one >= 0) {
+            if (chosen >= 0) {
                 fprintf(stderr, "line %ld: a column must be there once for %s, but there are %s and %s\n",
-                        line_number, headers[i], titles[one], titles[k]);
+                        line_number, headers[i], titles[chosen], titles[k]);
                 return 0;
             }
-            one = k;
+            chosen = k;
             strcpy(its, is_symbol || is_own ? "" : unit);
         }
     }
-    if (one < 0) {
+    if (chosen < 0) {
         fprintf(stderr, "a log must have a column %s, or its headers be given\n", headers[i]);
         return 0;
     }
-    return take(i, one, its);
+    return take(i, chosen, its);
 }
 
 /* The column of times, if there is one. */
