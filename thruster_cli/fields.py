@@ -100,7 +100,7 @@ def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableT
 def as_json(log: Path, some: Contents) -> dict:
     """The same as data."""
     form = format_of(log)
-    names = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "begin_s", "end_s", "stamps")
+    names: tuple[str, ...] = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "begin_s", "end_s", "stamps")
     names += ("unit", "least", "greatest", "course")
     rows = [dict(zip(names, one, strict=True)) for one in some.fields]
     found = {"log": str(log), "format": form.kind if form else "table", "fields": rows}

@@ -12,7 +12,9 @@ def test_the_columns_of_a_table_that_is_no_thrusters_are_listed(thruster, as_jso
     (tmp_path / "tank.csv").write_text(f"time_s,level [m],valve\n{rows}\n")
     said = thruster("log", "tank.csv").stdout
     (line,) = [one for one in said.splitlines() if "level" in one]
-    assert line.split()[-7:-1] == ["9", "2", "0.5", "m", "0", "8"] and "tank.csv: table, 2 columns" in said
+    assert (
+        line.split()[-9:-1] == ["9", "2", "0.5", "0", "4", "m", "0", "8"] and "tank.csv: table, 2 columns" in said
+    )
     assert "Not read: valve (columns must hold numbers, but got 'off' in line 2" in said
     data = as_json("log", "tank.csv")
     assert [one["name"] for one in data["fields"]] == ["time_s", "level [m]"] and [*data["not_read"]] == ["valve"]

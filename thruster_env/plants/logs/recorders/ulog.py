@@ -79,12 +79,12 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     if not lost:
         damage = "some messages of the log are not as long as their formats say" if log.file_corruption else ""
     while found:
-        parts = [found.pop(0)]
-        while found and (found[0].name, found[0].multi_id) == (parts[0].name, parts[0].multi_id):
-            parts.append(found.pop(0))
-        name = f"{parts[0].name}#{parts[0].multi_id}" if parts[0].multi_id else parts[0].name
+        some = [found.pop(0)]
+        while found and (found[0].name, found[0].multi_id) == (some[0].name, some[0].multi_id):
+            some.append(found.pop(0))
+        name = f"{some[0].name}#{some[0].multi_id}" if some[0].multi_id else some[0].name
         if wants(wanted, name):
-            yield joined([_topic(name, data, damage) for data in parts])
+            yield joined([_topic(name, data, damage) for data in some])
 
 
 def _topic(name: str, data: Any, damage: str) -> Topic:
