@@ -14,6 +14,7 @@ from filters import StateSpaceModel, make_filter, run
 from filters.c.source import c_filter
 from tests.models import simulated
 from thruster_env.numerics.derivatives import jacobian, step_of, stretch
+from thruster_env.plants.affine import linearize
 
 DT = 0.1
 LINEARISING = ("ekf", "iekf", "ekf-robust", "vb", "sage-husa", "fading", "h-infinity", "schmidt", "mhe", "gsf")
@@ -221,3 +222,14 @@ def test_a_jacobian_that_is_not_finite_at_the_prior_mean_is_refused(name):
     with pytest.raises(ValueError, match="observe_jacobian must be finite at the prior mean .* or leave it out"):
         body(**changes, observe_jacobian=NOT_FINITE[name])
     body(**changes, observe_jacobian=lambda x, c: ((0.0, 0.0),))
+
+
+@pytest.mark.parametrize("called", [False, True])
+def test_an_approximation_far_from_zero_is_that_near_zero(called):
+    near, far = (
+        linearize(body(offset, called=called), [offset + 1.0, 0.5], [0.0]).matrices() for offset in (0.0, 5e6)
+    )
+    for k in (0, 1, 3):  # A, B, C
+        np.testing.assert_allclose(far[k], near[k], atol=1e-6)
+    np.testing.assert_allclose(near[0], [[1.0, DT], [0.0, 1.0 - DT * 0.2]], atol=1e-9)
+    np.testing.assert_allclose(near[1], [[0.0], [DT]], atol=1e-9)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 
+from thruster_env.numerics.angles import difference
 from thruster_env.numerics.checks import covariance, vector
-from thruster_env.numerics.derivatives import jacobian
+from thruster_env.numerics.derivatives import step_of, stretch
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.sources import Source, as_value
 from thruster_env.plants.layout import starts_of
@@ -129,9 +129,16 @@ def affine_model(
     )
 
 
-@cache
-def _input_first(transition: Callable) -> Callable:
-    return lambda u, x, c: transition(x, u, c)
+def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray) -> np.ndarray:
+    """df/du of one application of f, (n, p), by central differences; inputs of zero have the scale 1."""
+    of_inputs, c = np.where(u == 0, 1.0, np.abs(u)), model.given_constants
+    far = stretch(model.n + model.inputs)((*x, *u), (*scales, *of_inputs))
+    columns = np.zeros((model.inputs, model.n))
+    for j, unit in enumerate(np.eye(model.inputs)):
+        h = step_of(float(u[j]), float(of_inputs[j]), far)
+        above, below = (model.functions.transition(x, as_value(u + side * unit), c) for side in (h, -h))
+        columns[j] = difference(np.array(above), np.array(below), model.shape.state_angles) / (2.0 * h)
+    return columns.T
 
 
 def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
@@ -154,13 +161,12 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.given_constants
     n, p = model.n, model.inputs
     a, b, point, v = np.eye(n), np.zeros((n, p)), as_value(x), as_value(u)
-    scales, input_scales = as_value(model.scales), as_value(np.where(u == 0, 1.0, np.abs(u)))
+    scales = as_value(model.scales)
     functions = model.functions
     step = transition_slopes(functions, model.shape)
-    by_input = jacobian(_input_first(functions.transition), None, n, p, "state, c", model.shape.state_angles)
     for _ in range(model.substeps):
         f = np.array(step(point, scales, v, c))
-        a, b = f @ a, f @ b + np.array(by_input(v, input_scales, point, c)).reshape(n, p)
+        a, b = f @ a, f @ b + _slopes_by_input(model, point, scales, u)
         point = functions.transition(point, v, c)
     h = np.array(observation_slopes(functions, model.shape)(as_value(x), scales, c))
     return affine_model(
