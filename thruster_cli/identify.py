@@ -159,6 +159,7 @@ def command(
             "--range": range_,
         }
         for_logs |= {"--start": start, "--hold-noise": hold_noise, "--no-grid": reading.no_grid}
+        for_logs |= {"--stamps": reading.stamps}
         for_logs |= {"--held-out": held_out, "--use-all": use_all, "--plot": plot, "--predicted": predicted}
         check_of_table(for_logs)
         of_step = {"columns": reading.column, "clock_offset": reading.clock_offset, "dt": reading.dt}

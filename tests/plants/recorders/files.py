@@ -9,7 +9,7 @@ h5py, *_ = (
     pytest.importorskip(name) for name in ("h5py", "pyulog", "pymavlink", "rosbags")
 )  # the extra recorders
 STRUCT = {"Q": "Q", "f": "f", "d": "d", "c": "h", "C": "H", "L": "i", "B": "B", "h": "h", "n": "4s", "N": "16s"}
-STRUCT |= {"Z": "64s", "a": "64s", "b": "b"}
+STRUCT |= {"Z": "64s", "a": "64s", "b": "b", "H": "H", "I": "I"}
 
 
 def write_ulog(path, topics):

@@ -5,7 +5,7 @@ import pytest
 from scipy.io import savemat
 
 from tests.fuzz.logs import MODEL
-from tests.plants.recorders.files import h5py, stamped, write_bag
+from tests.plants.recorders.files import dataflash, h5py, stamped, write_bag
 from thruster_env.plants.logs.findings import sentences
 from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.logs.recorders.registry import fields
@@ -140,3 +140,13 @@ def test_a_table_whose_input_ends_early_has_a_finding():
     force[1:] = np.nan
     log = read_log({"t": times, "force": force, "speed": SPEED}, MODEL)
     assert log.findings[0].sentence == "u_1 has no sample after the first row: it is held at 1 in all rows"
+
+
+def test_positions_of_old_dataflash_logs_have_the_time_since_start_and_not_that_of_the_week(tmp_path):
+    kinds = {1: ("GPS", "IHfI", "TimeMS,Week,Spd,T"), 2: ("CMD", "If", "TimeMS,F")}
+    rows = [(1, (345_600_000 + 10 * k, 1800, SPEED[k], 5000 + 10 * k)) for k in range(ROWS)]
+    rows += [(2, (5000 + 10 * k, FORCE[k])) for k in range(ROWS)]
+    (tmp_path / "a.bin").write_bytes(dataflash(kinds, rows))
+    log = read_log(tmp_path / "a.bin", MODEL, {"u_1": "CMD.F", "z_1": "GPS.Spd"})
+    np.testing.assert_array_equal(log.inputs[:, 0], FORCE[:-1])
+    assert log.start == 5.0 and not log.findings

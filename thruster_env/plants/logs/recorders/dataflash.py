@@ -25,6 +25,7 @@ from thruster_env.plants.logs.recorders.topics import (
 KIND = "DataFlash log"
 MAGIC = b"\xa3\x95"
 STAMPS = {"TimeUS": 1e6, "TimeMS": 1e3}  # ticks a second
+OF_WEEK = {"T": 1e3}  # of old messages GPS, whose TimeMS counts from the beginning of the week
 HEADER = 3  # bytes before the body of a message
 FMT, DESCRIPTION = 0x80, 89  # the message that describes others, and its bytes
 LONGEST = 528  # bytes at the end that may be no message, the rest of a page
@@ -198,9 +199,10 @@ def _instances(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[
         offsets: of the messages (samples,).
     """
     columns, ticks = {}, None
+    stamps = OF_WEEK if {*OF_WEEK, "Week"} <= {*form.columns} else STAMPS
     for name, kind, numbers in _columns(form, content, offsets):
-        if name in STAMPS and ticks is None:
-            ticks = numbers / STAMPS[name]
+        if name in stamps and ticks is None:
+            ticks = numbers / stamps[name]
         else:
             columns[name] = numbers if kind != "a" else numbers.view("<i2").reshape(-1, 32)
     if ticks is None:
