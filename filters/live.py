@@ -84,6 +84,7 @@ class Live:
         self._late = positive("late", late, zero_allowed=True)
         self._resolution = positive("resolution", resolution, zero_allowed=True)
         self._noise, self._skips = noise, skip_missing
+        self._has_one_q = "Q" in filter_.fixed_noise  # which is that of a step as long as the model's
         self._watch = watch_of(monitor_of(monitor), filter_)
         model = filter_.model
         self._channels = {one.symbol: i for i, one in enumerate(model.measurements)}
@@ -218,10 +219,10 @@ class Live:
         length = (time - self.time) / count
         self._remember(time, u)
         self._set_length(length)
-        if self._noise is None:
-            session.scale_process_noise(length / self._step)
-        else:
+        if self._noise is not None:
             session.set_noise(process_noise_cov=self._noise(length))
+        elif not (self._has_one_q and abs(length - self._step) <= closeness(self._step, exact)):
+            session.scale_process_noise(length / self._step)
         for _ in range(count):
             session.run("predict", u=u)
         self.time, self._held = time, u

@@ -364,3 +364,15 @@ def test_stamps_of_a_coarse_recorder_are_one_within_its_resolution():
     live.predict_to(1.0105, [4.0])  # of the same time
     live.update(1.0115, "thrust", 0.2)
     assert live.time == 1.011
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_a_filter_that_learns_q_takes_steps_as_long_as_the_models_alone(start):
+    live = make_filter("sage-husa", oscillator().at(0.01), process_forgetting_factor=0.99).live()
+    live.start(start)
+    for k in range(1, 40):
+        live.predict_to(start + 0.01 * k, [0.1])
+        live.update(start + 0.01 * k, "position", 0.4)
+    with pytest.raises(ValueError, match="Q and R of the filter 'sage-husa' cannot vary from step to step"):
+        live.predict_to(start + 0.395, [0.1])
