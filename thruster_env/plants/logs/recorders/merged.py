@@ -36,6 +36,7 @@ class Recorded:
         self.path, self.form, self.stamps = Path(path), form, stamps
         names = {name for text in asked for name in (text, text.rpartition("[")[0].strip()) if name}
         self.is_whole, self.is_timed = not form.has_stamps, False
+        self._asked = names
         self.samples = read(path, None if self.is_whole else names)
 
     def columns(
@@ -55,6 +56,7 @@ class Recorded:
                 return found if self.form.has_units else _without_units(found, wanted, own)
             except ValueError:
                 if self.is_whole:
+                    read(self.path, self._asked)  # which says of an array why it is not read
                     raise
             self.samples, self.is_whole = read(self.path, None), True
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,3 +96,5 @@ def opened(form: str, path: Path) -> Iterator[Opened]:
             yield Opened(child, form, path)
         finally:
             child.kill()
+            with suppress(BrokenPipeError):  # of a request that was never read
+                child.stdin.close()  # type: ignore[union-attr]
