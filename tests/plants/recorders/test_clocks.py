@@ -6,6 +6,7 @@ from scipy.io import savemat
 
 from tests.fuzz.logs import MODEL
 from tests.plants.recorders.files import dataflash, h5py, stamped, write_bag
+from thruster_env.plants.affine import affine_model
 from thruster_env.plants.logs.findings import sentences
 from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.logs.recorders.registry import fields
@@ -150,3 +151,18 @@ def test_positions_of_old_dataflash_logs_have_the_time_since_start_and_not_that_
     log = read_log(tmp_path / "a.bin", MODEL, {"u_1": "CMD.F", "z_1": "GPS.Spd"})
     np.testing.assert_array_equal(log.inputs[:, 0], FORCE[:-1])
     assert log.start == 5.0 and not log.findings
+
+
+def test_a_measurement_of_another_clock_is_refused_with_the_times(tmp_path):
+    times = 0.01 * np.arange(ROWS)
+    some = {"a": {"t": times, "force": FORCE, "speed": SPEED}, "b": {"t": times[::2] + 1e4, "flow": SPEED[::2]}}
+    savemat(tmp_path / "a.mat", some)
+    model = affine_model(
+        **{"a": [[0.9]], "b": [[0.5]], "c": [[1.0], [1.0]], "process_noise_cov": [0.01], "prior_mean": [0.0]},
+        **{"measurement_noise_cov": [0.04, 0.04], "prior_cov": [1.0], "measurements": ["speed", "flow"]},
+        input_quantities=["force"],
+    )
+    with pytest.raises(
+        ValueError, match=r"but those of b.flow are from 10000 to 10001.18 s, the log from 0 to 1.19 s"
+    ):
+        read_log(tmp_path / "a.mat", model, {"speed": "a.speed", "flow": "b.flow", "force": "a.force"})

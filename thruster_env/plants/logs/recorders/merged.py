@@ -104,7 +104,7 @@ class Recorded:
         rows = range(1, len(stamps) + 1)
         taken = [Remark(CLOCK, "", one) for one in dict.fromkeys(one.taken for one in some.values()) if one]
         is_clock = np.isin(stamps, clock)
-        remarks = [*taken, *_of_choice(choice), *_not_used(found, some, clock)]
+        remarks = [*taken, *_of_choice(choice), *_not_used(found, some, clock, self.path)]
         table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(some), remarks)
         return table, {**found, TIME: Column(STAMP, SECOND)}
 
@@ -121,20 +121,25 @@ def _of_choice(choice: Choice) -> list[Remark]:
     return [Remark(CLOCK, "", f"{said} (stamps, --stamps {HEADER}|{RECEIPT})")]
 
 
-def _not_used(found: Mapping[str, Column], some: Mapping[str, Samples], clock: np.ndarray) -> list[Remark]:
-    """Channels of which many samples, or all, lie outside the log."""
+def _not_used(
+    found: Mapping[str, Column], some: Mapping[str, Samples], clock: np.ndarray, path: Path
+) -> list[Remark]:
+    """Channels of which many samples, or all, lie outside the log; ValueError for all of a measurement."""
     remarks = []
     for key, column in found.items():
         times = _times(some[column.header])
         outside = int(((times < clock[0]) | (times > clock[-1])).sum())
-        if outside > MANY * len(times):
-            dt = float(np.median(np.diff(clock)))
-            ends = [time_text(one, dt) for one in (times[0], times[-1], clock[0], clock[-1])]
-            count = "all" if outside == len(times) else f"{outside} of {len(times)}"
-            said = (
-                f"{count} samples of {column.header} lie outside the log: they are from {ends[0]} to {ends[1]} s,"
-            )
-            remarks.append(Remark(OUTSIDE, key, f"{said} the log from {ends[2]} to {ends[3]} s"))
+        if outside <= MANY * len(times):
+            continue
+        dt = float(np.median(np.diff(clock)))
+        ends = [time_text(one, dt) for one in (times[0], times[-1], clock[0], clock[-1])]
+        where = f"from {ends[0]} to {ends[1]} s, the log from {ends[2]} to {ends[3]} s"
+        if outside == len(times) and key.startswith(f"{MEASUREMENT}:"):
+            rule = "measurements must have samples in the log"
+            raise ValueError(f"{rule}, but those of {column.header} are {where} ({path})")
+        count = "all" if outside == len(times) else f"{outside} of {len(times)}"
+        said = f"{count} samples of {column.header} lie outside the log: they are {where}"
+        remarks.append(Remark(OUTSIDE, key, said))
     return remarks
 
 
