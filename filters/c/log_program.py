@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from filters.c.log_reader import READER
 from filters.c.programs import FilterPrograms
 from filters.logs.columns import header_of
@@ -183,9 +185,9 @@ def _tables(quantities: tuple[Quantity, ...]) -> str:
     )
 
 
-def _array(name: str, texts) -> str:
+def _array(name: str, texts: Iterable[str]) -> str:
     """An array of texts, some to a line."""
-    lines, line = [], "   "
+    lines, line = list[str](), "   "
     for one in texts:
         word = f' "{_text(one)}",'
         if len(line) + len(word) > 110:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -105,8 +105,8 @@ def estimate(
     Raises:
         ValueError: if an argument is wrong, or the file, the model and the filter do not fit.
     """
-    options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid, "stamps": stamps}
-    env = ReplayEnv(log, model, **options)
+    of_times: dict[str, Any] = {"clock_offset": clock_offset, "dt": dt, "stamps": stamps}
+    env = ReplayEnv(log, model, columns=columns, grid=grid, **of_times)
     filter_ = filter_for(env, filter, None, None if tuned is None else str(tuned), model_arguments, numbers)
     noise = None if env.log.stamps is None else noise_by_rates(env.continuous, filter_.model, env.log.dt)
     return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed, noise=noise)
