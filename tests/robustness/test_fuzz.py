@@ -15,7 +15,13 @@ from tests.slow import slow_but
 
 OF_PROCESSES = "processes.", "checkpoints."  # tests of their own show what these attack
 ATTACKS = [name for name in attacks() if not name.startswith(OF_PROCESSES)]
-SLOW = {"files.journals", "starts.starts_and_effects", "commands.command_lines"}  # wait, compile, start processes
+SLOW = {  # wait, compile, start processes
+    "files.journals",
+    "starts.starts_and_effects",
+    "commands.command_lines",
+    "arithmetic.compiled_arithmetic",
+    "arithmetic.filtered_arithmetic",
+}
 
 
 def test_every_file_has_attacks():
