@@ -5,7 +5,7 @@ from filters.adaptive.sage_husa import SageHusaFilter
 from filters.adaptive.variational import VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model
 from filters.baselines.baselines import Inversion, LowPass, OpenLoop
-from filters.engine.batch import Estimates, run
+from filters.engine.batch import Estimates
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
@@ -32,6 +32,7 @@ from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
+from filters.restarts import Restarts, RestartWarning, restarts_of, run
 from filters.smoothers.modes import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
 from filters.tensors import torch
@@ -75,6 +76,8 @@ __all__ = [
     "RankHistogramFilter",
     "RaoBlackwellisedParticleFilter",
     "RobustExtendedKalmanFilter",
+    "RestartWarning",
+    "Restarts",
     "SageHusaFilter",
     "SchmidtKalmanFilter",
     "SerialSquareRootFilter",
@@ -89,6 +92,7 @@ __all__ = [
     "augmented_model",
     "linearize",
     "make_filter",
+    "restarts_of",
     "run",
     "smooth",
     "smooth_modes",

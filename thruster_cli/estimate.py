@@ -210,6 +210,7 @@ def _as_json(found: LogEstimate, told: LogFindings) -> dict:
         "whiteness_p_value": None if white is None else white.p_value,
         "log_likelihood": told.log_likelihood,
         "divergences": found.divergences,
+        "restarts": found.restarts and found.restarts._asdict(),
         "one_step_ahead": {one.quantity.symbol: one._asdict() for one in told.predictions},
         "references": {one.quantity.symbol: one._asdict() for one in told.references},
         "findings": [asdict(one) for one in log.findings],

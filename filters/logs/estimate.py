@@ -14,6 +14,7 @@ from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.logs.clock import by_the_clock, noise_by_rates
+from filters.restarts import FirstRestart, Restarts
 from filters.smoothers.smooth import smooth
 from filters.wrappers.arguments import filter_for
 from thruster_env.numerics.checks import at_least
@@ -39,6 +40,7 @@ class LogEstimate(NamedTuple):
     divergences: int  # restarts from the prior
     smoothed: bool
     noise: Callable[[float], np.ndarray] | None = None  # Q by the length of a step [s], on a log's own stamps
+    restarts: Restarts | None = None  # the first one, and why; None if there is none
 
     @property
     def model(self) -> StateSpaceModel:
@@ -133,14 +135,15 @@ def estimate_with(
     """
     smoother = smoother or lag is not None
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
+    first = FirstRestart(filter_)
     if log.stamps is not None:
         if smoother:
             raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")
-        found = by_the_clock(filter_, data[0][0], log, noise)
+        found = by_the_clock(filter_, data[0][0], log, noise, first)
     elif isinstance(filter_, ForeignFilter):
         found = run(filter_, *data)
     else:
-        found = _stepped(filter_, *data)
+        found = _stepped(filter_, *data, first)
     means, covs = smooth(filter_, *data, lag) if smoother else (found.means, found.covs)
     likelihoods = found.log_likelihoods[0]
     return LogEstimate(
@@ -154,10 +157,13 @@ def estimate_with(
         int(found.divergences[0]),
         smoother,
         noise,
+        first.told(int(found.divergences[0])),
     )
 
 
-def _stepped(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
+def _stepped(
+    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, first: FirstRestart
+) -> Estimates:
     """What `run` gives of one trajectory, by the steps of a wrapper: the same to the last bit."""
     session, z = Session(filter_), measurements[0]
     session.start(keys[0], z[0])
@@ -166,4 +172,5 @@ def _stepped(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements
         if k:
             session.step(inputs[0, k - 1].tolist(), z[k])
         rows.append(session.told())
+        first.note(session, inputs[0, k - 1] if k else None, z[k])
     return estimates_of(rows, session.divergences)

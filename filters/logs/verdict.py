@@ -18,7 +18,7 @@ def verdict(found: LogEstimate, told: LogFindings) -> list[str]:
     Where a prediction is a thousand times further off than the channel moves, the model blows up between samples,
     and its Q and R are not to blame.
     """
-    said = sentences(found.log.findings)
+    said = sentences(found.log.findings) + ([found.restarts.sentence] if found.restarts else [])
     spoilt = [one for one in found.log.findings if one.kind in SPOILING]
     if any(one.kind == GAP for one in spoilt):
         said.append("At a gap the filter predicts with the last input held.")

@@ -13,6 +13,7 @@ from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.restarts import FirstRestart
 from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import (
     APPENDED,
@@ -46,15 +47,15 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     includes them in the observation, but not in the innovation.
 
     The info dictionary gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m)
-    and `estimate_divergences`, the number of restarts from the prior after an estimate that was not finite. All
-    are in the units of the model. The measurement is `info["measurement"]` if the env reports it (missing where
-    `measurement_valid` is false), otherwise the observation. For a missing measurement, the observation repeats
-    the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
-    replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed through a
-    separate stream; the env's generator is never used. With a monitor info also gains `health`, with `ok`
-    and the `alarms` of the step (`filters.monitoring.Health`). With a smoothing lag it gains `smoothed` (n,) and
-    `smoothed_cov` (n, n): the state so many steps ago, given all measurements up to now; in the first steps the
-    state at the reset.
+    and `estimate_divergences`, the number of restarts from the prior after an estimate that was not finite; after
+    one `estimate_restarts` says which step and states were the first, and the likely cause. All are in the units
+    of the model. The measurement is `info["measurement"]` if the env reports it (missing where `measurement_valid`
+    is false), otherwise the observation. For a missing measurement, the observation repeats the last one (0 at
+    first). The filter predicts with the action clipped to the action space or, if an env replays a log, with
+    `info["recorded_input"]`. The filter's random numbers come from the reset seed through a separate stream; the
+    env's generator is never used. With a monitor info also gains `health`, with `ok` and the `alarms` of the step
+    (`filters.monitoring.Health`). With a smoothing lag it gains `smoothed` (n,) and `smoothed_cov` (n, n): the
+    state so many steps ago, given all measurements up to now; in the first steps the state at the reset.
 
     Args:
         env: any env with Box actions and observations.
@@ -109,6 +110,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._form = one_of("observation", observation, OBSERVATIONS)
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
+        self._split = bool(split.inputs)  # whether some channels are inputs of the model
         actions = check_spaces(env.action_space, env.observation_space, self.filter.model, len(split.inputs))
         n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
@@ -121,7 +123,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._lagged = smoothing_lag is not None
         self._session = WithMeasuredInputs(session, split) if split.inputs else session
         self._channels, self._measurements = split.channels, list(split.measurements)
-        self._watch = watch_of(watches, self.filter)
+        self._watch, self._first = watch_of(watches, self.filter), FirstRestart(self.filter)
         self._generator = filter_generator(None)
         base: Any = env.unwrapped
         if hasattr(base, "overlay"):  # it draws the estimate beside the truth
@@ -142,6 +144,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             raise ValueError(f"a measurement must have the model's {m} entries, but got {short_repr(z)}")
         self._held = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
+        self._first = FirstRestart(self.filter)
+        self._first.note(self._session, None, as_floats(z)[self._measurements])
         if self._watch is not None:
             self._watch.restart()
         return self._observe(observation, z, info), info
@@ -159,6 +163,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if z is None or "measurement_valid" in info or type(z) is MaskedArray:
             z = _measurement(observation, info)
         self._session.step(u, z)
+        known = None if self._split else u
+        self._first.note(self._session, known, z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
 
     def _clipped(self, action) -> Sequence[float]:
@@ -182,6 +188,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
+        if session.divergences:
+            info["estimate_restarts"] = self._first.told(session.divergences).sentence
         if self._lagged:
             info["smoothed"], info["smoothed_cov"] = session.smoothed()
         if self._watch is not None:

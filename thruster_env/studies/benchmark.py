@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters import StateSpaceModel, make_filter, run
+from filters import StateSpaceModel, make_filter
 from filters.consistency.intervals import Interval, mean_interval
+from filters.engine.batch import run
 from thruster_env.numerics.checks import at_least, one_of
 from thruster_env.studies import BENCHMARKS
 from tuning.evaluation.runs import state_errors

@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters import EnsembleKalmanFilter, KalmanFilter, affine_model, run
+from filters import EnsembleKalmanFilter, KalmanFilter, affine_model
 from filters.bounds import riccati_covariances
+from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from thruster_env.linear.published import SAMPLE_TIME

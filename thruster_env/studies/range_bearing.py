@@ -20,8 +20,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from filters import StateSpaceModel, make_filter, run
+from filters import StateSpaceModel, make_filter
 from filters.consistency.intervals import rmse_intervals
+from filters.engine.batch import run
 from thruster_env.plants.quantities import Quantity
 from thruster_env.studies.benchmark import Benchmark, OnRow, Row
 from thruster_env.studies.stone_soup import stone_soup_means

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters import EnsembleKalmanFilter, KalmanFilter, run
+from filters import EnsembleKalmanFilter, KalmanFilter
+from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.plot_styles import TRUTH, plot_style
 from thruster_env.linear.figures import STATES

@@ -17,6 +17,7 @@ from thruster_env.numerics.text_tables import plain_text
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import noise_sentence
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import report
@@ -59,8 +60,11 @@ class FilterComparison:
         return [row.label for row in sorted(self.boards[problem].rows, key=_rank)]
 
     def sentences(self) -> list[str]:
-        """The filters that are significantly better or worse than the first one, on each problem."""
-        return [winners(board) for board in self.boards]
+        """The filters that are significantly better or worse than the first one on each problem, and restarts."""
+        found = []
+        for board in self.boards:
+            found += [winners(board), *restart_sentences({row.label: row.evaluation for row in board.rows})]
+        return found
 
     def to_frame(self) -> pandas.DataFrame:
         """A row for each filter and problem: errors, score and its ratio to the first filter's, consistency, cost.

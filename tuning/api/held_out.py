@@ -17,7 +17,7 @@ from thruster_env.numerics.text_tables import plain_text
 from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import RULE, TUNED, baselines
-from tuning.evaluation.evaluate import Evaluation, check_consistency
+from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
@@ -198,10 +198,11 @@ class HeldOut:
 
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
+        restarts = restart_sentences(self.evaluations)
         if self.is_tuned:
-            return gains(self.comparison, self.problem.seed_word, self.name)
+            return [*gains(self.comparison, self.problem.seed_word, self.name), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
-        return [*truth, scaling_sentence(self.comparison)]
+        return [*truth, scaling_sentence(self.comparison), *restarts]
 
     def _repr_html_(self) -> str:
         truth, rows = self.evaluation.has_truth, []

@@ -23,6 +23,7 @@ from filters.consistency.intervals import (
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
+from filters.restarts import Restarts, restarts_of
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
@@ -59,6 +60,7 @@ class Evaluation(NamedTuple):
     log_score: Interval = NOTHING  # mean of log N(x; x^, P) a scored step, of the states that count
     nees_variance: float = np.nan  # variance over a run's steps, mean over runs, over its expected value, 2 n
     nis_variance: float = np.nan  # the same of the NIS; its expected value is 2 m where nothing is missing
+    restarts: Restarts | None = None  # the first restart, and why; None if there is none
 
     @property
     def has_truth(self) -> bool:
@@ -84,7 +86,25 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
         ValueError: if the scale is not positive, or not one number for each state.
     """
     counted = None if data.states is None else _checked(scale, data.states.shape[-1])
-    return compute_metrics(filter_, metrics_of_all(filter_, data, scale=counted), data, scale)
+    runs = metrics_of_all(filter_, data, scale=counted)
+    return with_restarts(compute_metrics(filter_, runs, data, scale), filter_, runs, data)
+
+
+def with_restarts(found: Evaluation, filter_: Filter, runs: RunMetrics, data: Data) -> Evaluation:
+    """An evaluation with the first restart, and why, if there is one: its run is stepped once more."""
+    lost = np.flatnonzero(runs.divergences).tolist()
+    if not lost:
+        return found
+    one, place = data.one(lost[0]), lost[0]
+    told = restarts_of(filter_, runs.divergences[place], one.filter_keys, one.inputs, one.measurements)
+    assert told is not None  # it has restarted
+    of_all = {"count": found.divergences, "runs": len(lost), "of_runs": len(runs.divergences), "run": place}
+    return found._replace(restarts=told._replace(**of_all))
+
+
+def restart_sentences(evaluations: Mapping[str, Evaluation]) -> list[str]:
+    """Restarts of filters by name, a sentence a filter that restarted."""
+    return [f"{name}: {one.restarts.sentence}" for name, one in evaluations.items() if one.restarts]
 
 
 def values_of(filter_: Filter, data: Data, scale) -> Evaluation:

@@ -11,6 +11,7 @@ from rich.table import Table
 from filters.consistency.intervals import slightly
 from thruster_env.numerics.text_tables import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import belief_sentences, noise_sentence
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
@@ -43,7 +44,8 @@ def report(board: Leaderboard) -> list[RenderableType]:
     noise = noise_sentence(board.rows, "--knows")
     beliefs = belief_sentences(board.rows)
     hint = ["--augment NAME:STD:WALK changes these assumptions."] if beliefs else []
-    return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, f"{winners(board)}\n"]
+    restarts = restart_sentences({row.label: row.evaluation for row in board.rows})
+    return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, *restarts, f"{winners(board)}\n"]
 
 
 def winner(board: Leaderboard) -> int | None:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters import run
 from filters.bounds import path_bound
 from filters.consistency.nees import normalized_squares
+from filters.engine.batch import run
 from filters.filter import Filter
 from filters.wrapped import wrapped_variances
 from thruster_env.numerics.checks import at_least

@@ -1,0 +1,210 @@
+"""Restarts from the prior, in words: how many, the first step and state, and the likely cause."""
+
+from __future__ import annotations
+
+import warnings
+from functools import wraps
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine import batch
+from filters.engine.batch import Estimates, trajectories
+from filters.engine.session import Running, Session
+from filters.filter import Filter
+from thruster_env.numerics.checks import as_floats
+from thruster_env.numerics.sources import as_value
+from thruster_env.plants.shape import observation_slopes, transition_slopes
+from thruster_env.plants.state_space import StateSpaceModel
+
+Found = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
+
+
+class RestartWarning(RuntimeWarning):
+    """A filter restarted from the prior, so that what it knew is lost."""
+
+
+class Restarts(NamedTuple):
+    """Restarts of a filter on B runs: an estimate was not finite, or a variance negative.
+
+    Attributes:
+        count: of all restarts.
+        runs: with any.
+        of_runs: B.
+        run: the first run with any.
+        step: of the first restart in that run.
+        states: symbols of the states that were lost first.
+        cause: the likely one, as an extended Kalman filter meets it at the estimate before.
+    """
+
+    count: int
+    runs: int
+    of_runs: int
+    run: int
+    step: int
+    states: tuple[str, ...]
+    cause: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it in one sentence."""
+        times = "once" if self.count == 1 else f"{self.count} times"
+        among = f" in {self.runs} of {self.of_runs} runs" if self.of_runs > 1 else ""
+        run = f" of run {self.run}" if self.of_runs > 1 else ""
+        states = f" ({', '.join(self.states)})" if self.states else ""
+        return (
+            f"The filter restarted from the prior {times}{among}, first at step {self.step}{run}{states}: "
+            f"{self.cause}."
+        )
+
+
+@wraps(batch.run)
+def run(filter_: Filter, keys=None, inputs=None, measurements=None, **noise) -> Estimates:
+    """`filters.engine.batch.run`, with a `RestartWarning` if the filter restarted."""
+    found = batch.run(filter_, keys, inputs, measurements, **noise)
+    told = restarts_of(filter_, found.divergences, keys, inputs, measurements, **noise)
+    if told is not None:
+        warnings.warn(told.sentence, RestartWarning, stacklevel=2)
+    return found
+
+
+def restarts_of(
+    filter_: Filter,
+    divergences: np.ndarray,
+    keys=None,
+    inputs=None,
+    measurements=None,
+    *,
+    process_noise_covs=None,
+    measurement_noise_covs=None,
+) -> Restarts | None:
+    """The restarts of a filter on runs, by its `divergences` (B,) there; None if it never restarted.
+
+    The other arguments are those of `filters.run`. The first run that restarted is stepped once more.
+    """
+    divergences = np.atleast_1d(divergences)
+    if not divergences.any():
+        return None
+    place, session, first = int(np.flatnonzero(divergences)[0]), Session(filter_), FirstRestart(filter_)
+    keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
+    for k, one in enumerate(z[place]):
+        if measurement_noise_covs is not None:
+            session.set_noise(measurement_noise_cov=measurement_noise_covs[k])
+        if k == 0:
+            session.start(keys[place], one)
+        else:
+            if process_noise_covs is not None:
+                session.set_noise(process_noise_cov=process_noise_covs[k - 1])
+            session.step(inputs[place, k - 1], one)
+        first.note(session, inputs[place, k - 1] if k else None, one)
+        if session.divergences:
+            break
+    runs = int((divergences > 0).sum())
+    return Restarts(int(divergences.sum()), runs, len(divergences), place, *first.found)
+
+
+class FirstRestart:
+    """The first restart of a filter that is stepped by hand: `note` what each step did.
+
+    Attributes:
+        found: the step, symbols of the states that were lost, and the likely cause.
+    """
+
+    def __init__(self, filter_: Filter):
+        """Begin before the first measurement."""
+        self._model, self._step = filter_.model, 0
+        self._before: tuple[np.ndarray, np.ndarray] | None = None
+        self.found: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
+        self._is_open = True
+
+    def note(self, session: Running, u, z) -> None:
+        """Look at a session after a step with input u (p,), None at first or unknown, and measurement z (m,)."""
+        if session.divergences and self._is_open:
+            self._is_open = False
+            if u is None and self._before is not None:
+                states, cause = np.zeros(self._model.n, dtype=bool), "of its inputs some are measured"
+            else:
+                states, cause = likely_cause(self._model, self._before, u, as_floats(z))
+            symbols = (one.symbol for one, lost in zip(self._model.states, states, strict=True) if lost)
+            self.found = self._step, tuple(symbols), cause
+        if self._is_open:
+            self._before, self._step = (session.mean.copy(), session.cov.copy()), self._step + 1
+
+    def told(self, count: int) -> Restarts | None:
+        """So many restarts of one run; None if there were none."""
+        return Restarts(count, 1, 1, 0, *self.found) if count else None
+
+
+def likely_cause(model: StateSpaceModel, before: tuple[np.ndarray, np.ndarray] | None, u, z) -> Found:
+    """Which states were lost in a step, (n,) bool, and why, by the equations of an extended Kalman filter.
+
+    Args:
+        model: the filter's.
+        before: mean (n,) and covariance (n, n) before the step; None for the first measurement of the prior.
+        u: input (p,) of the step.
+        z: measurement (m,) at its end.
+    """
+    x, p = (model.prior_mean, model.prior_cov) if before is None else before
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = None
+        if before is not None:
+            x, p, found = _predicted(model, x, p, u)
+        return found or _updated(model, x, p, z)
+
+
+def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Found | None]:
+    slopes = transition_slopes(model.functions, model.shape)
+    for _ in range(model.substeps):
+        moved = _called(model.transition, model.n, as_value(x), as_value(u), model.constants)
+        if not np.isfinite(moved).all():
+            return x, p, (~np.isfinite(moved), f"f(x, u) is {_kind(moved)}")
+        f = _called(slopes, (model.n, model.n), as_value(x), as_value(model.scales), as_value(u), model.constants)
+        if not np.isfinite(f).all():
+            return x, p, (~np.isfinite(f).all(axis=1), f"F = df/dx is {_kind(f)}")
+        x, p = moved, f @ p @ f.T
+    p = p + model.process_noise_cov
+    return x, p, _flaw_of(p, "prediction")
+
+
+def _updated(model: StateSpaceModel, x, p, z) -> Found:
+    everything = np.ones(model.n, dtype=bool)
+    expected = _called(model.observe, model.m, as_value(x), model.constants)
+    seen = ~np.isnan(z)
+    if not np.isfinite(expected[seen]).all():
+        return everything, f"h(x) is {_kind(expected[seen])}"
+    slopes = observation_slopes(model.functions, model.shape)
+    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), model.constants)[seen]
+    if not np.isfinite(h).all():
+        return ~np.isfinite(h).all(axis=0), f"H = dh/dx is {_kind(h)}"
+    s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(seen, seen)]
+    try:
+        root = np.linalg.cholesky(s)
+    except np.linalg.LinAlgError:
+        return everything, "the innovation's covariance S is not positive definite, by rounding or overflow"
+    half = np.linalg.solve(root, h @ p)
+    flaw = _flaw_of(p - half.T @ half, "update")
+    return flaw or (
+        ~everything,
+        "numbers of the filter itself overflow, or a variance became negative by rounding",
+    )
+
+
+def _flaw_of(p: np.ndarray, when: str) -> Found | None:
+    if not np.isfinite(p).all():
+        return ~np.isfinite(p).all(axis=1), f"the covariance overflows in the {when}"
+    if (np.diag(p) < 0.0).any():
+        return np.diag(p) < 0.0, f"a variance is negative after the {when}, by rounding"
+    return None
+
+
+def _called(function, shape, *arguments) -> np.ndarray:
+    """What a function of the model returns; NaN where it raises."""
+    try:
+        return np.asarray(function(*arguments), dtype=np.float64).reshape(shape)
+    except (ArithmeticError, ValueError, TypeError):
+        return np.full(shape, np.nan)
+
+
+def _kind(values: np.ndarray) -> str:
+    return "NaN" if np.isnan(values).any() else "infinite, it overflows"
