@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from functools import wraps
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from filters.engine import batch
 from filters.engine.batch import Estimates, trajectories
-from filters.engine.session import Running, Session
+from filters.engine.session import Session
 from filters.filter import Filter
 from thruster_env.numerics.checks import as_floats
 from thruster_env.numerics.sources import as_value
@@ -117,7 +117,7 @@ class FirstRestart:
         self.found: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
         self._is_open = True
 
-    def note(self, session: Running, u, z) -> None:
+    def note(self, session: Any, u, z) -> None:
         """Look at a session after a step with input u (p,), None at first or unknown, and measurement z (m,)."""
         if session.divergences and self._is_open:
             self._is_open = False

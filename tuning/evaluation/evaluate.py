@@ -98,8 +98,9 @@ def with_restarts(found: Evaluation, filter_: Filter, runs: RunMetrics, data: Da
     one, place = data.one(lost[0]), lost[0]
     told = restarts_of(filter_, runs.divergences[place], one.filter_keys, one.inputs, one.measurements)
     assert told is not None  # it has restarted
-    of_all = {"count": found.divergences, "runs": len(lost), "of_runs": len(runs.divergences), "run": place}
-    return found._replace(restarts=told._replace(**of_all))
+    return found._replace(
+        restarts=told._replace(count=found.divergences, runs=len(lost), of_runs=len(runs.divergences), run=place)
+    )
 
 
 def restart_sentences(evaluations: Mapping[str, Evaluation]) -> list[str]:
