@@ -61,7 +61,17 @@ def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):  # noqa: F81
     )
     said = thruster("log", "a.ulg").stdout
     (line,) = [one for one in said.splitlines() if "actuator_outputs.output[0]" in one]
-    assert line.split() == ["actuator_outputs.output[0]", "100", "49.75", "1.01", "0", "99", "▁▂▃▄▅▆▇█"]
+    assert line.split() == [
+        "actuator_outputs.output[0]",
+        "100",
+        "49.75",
+        "1.01",
+        "0",
+        "1.99",
+        "0",
+        "99",
+        "▁▂▃▄▅▆▇█",
+    ]
     assert f"{name}.output[1]" in said and "a.ulg: ULog, 6 fields" in said
     data = as_json("log", "a.ulg", "--only", "OUTPUTS.OUT")
     assert data["format"] == "ULog" and [one["name"] for one in data["fields"]] == [
@@ -113,11 +123,15 @@ def test_on_a_terminal_fields_stand_under_their_topics(tmp_path):
     lines = plain_text([as_table(tmp_path / "a.ulg", fields(tmp_path / "a.ulg"), True)], 99).splitlines()
     words = [line.split() for line in lines]
     course = "▁▂▃▄▅▆▇█"
-    ours = [["act", "100", "100", "0.01"], [".output[0]", "0", "0.99", course], [".output[1]", "5", "5"]]
+    ours = [
+        ["act", "100", "100", "0.01", "0", "0.99"],
+        [".output[0]", "0", "0.99", course],
+        [".output[1]", "5", "5"],
+    ]
     place = words.index(ours[0])
     assert words[place : place + 3] == ours and words[place + 3] == ["act#1", *ours[0][1:]]
     alone = plain_text([as_table(tmp_path / "a.h5", fields(tmp_path / "a.h5"), True)], 99)
-    assert ["u", "9", "1", "1", "0", "8", "▁▂▃▄▅▆▇█"] in [line.split() for line in alone.splitlines()]
+    assert ["u", "9", "1", "1", "0", "8", "0", "8", "▁▂▃▄▅▆▇█"] in [line.split() for line in alone.splitlines()]
 
 
 def test_a_sparkline_goes_from_the_least_to_the_greatest():
