@@ -28,7 +28,7 @@ class Restarts(NamedTuple):
     """Restarts of a filter on B runs: an estimate was not finite, or a variance negative.
 
     Attributes:
-        count: of all restarts.
+        times: how often it restarted, in all runs.
         runs: with any.
         of_runs: B.
         run: the first run with any.
@@ -37,7 +37,7 @@ class Restarts(NamedTuple):
         cause: the likely one, as an extended Kalman filter meets it at the estimate before.
     """
 
-    count: int
+    times: int
     runs: int
     of_runs: int
     run: int
@@ -48,7 +48,7 @@ class Restarts(NamedTuple):
     @property
     def sentence(self) -> str:
         """All of it in one sentence."""
-        times = "once" if self.count == 1 else f"{self.count} times"
+        times = "once" if self.times == 1 else f"{self.times} times"
         among = f" in {self.runs} of {self.of_runs} runs" if self.of_runs > 1 else ""
         run = f" of run {self.run}" if self.of_runs > 1 else ""
         states = f" ({', '.join(self.states)})" if self.states else ""
@@ -130,7 +130,7 @@ class FirstRestart:
         if self._is_open:
             self._before, self._step = (session.mean.copy(), session.cov.copy()), self._step + 1
 
-    def told(self, count: int) -> Restarts | None:
+    def restarts(self, count: int) -> Restarts | None:
         """So many restarts of one run; None if there were none."""
         return Restarts(count, 1, 1, 0, *self.found) if count else None
 

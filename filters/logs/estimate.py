@@ -157,7 +157,7 @@ def estimate_with(
         int(found.divergences[0]),
         smoother,
         noise,
-        first.told(int(found.divergences[0])),
+        first.restarts(int(found.divergences[0])),
     )
 
 

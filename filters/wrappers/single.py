@@ -188,8 +188,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
-        if session.divergences:
-            info["estimate_restarts"] = self._first.told(session.divergences).sentence
+        if restarts := self._first.restarts(session.divergences):
+            info["estimate_restarts"] = restarts.sentence
         if self._lagged:
             info["smoothed"], info["smoothed_cov"] = session.smoothed()
         if self._watch is not None:
