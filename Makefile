@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # The versions to install: make CONSTRAINTS=constraints-oldest.txt test, or none, make CONSTRAINTS= test, for the newest.
 CONSTRAINTS := constraints.txt
+# What builds the package, as pyproject.toml asks for it: a venv of Python 3.11 brings an older one.
+BUILD := $(shell sed -n 's/^requires = \["\(setuptools[^"]*\)"\].*/\1/p' pyproject.toml)
 # Python compiles a module when it is first imported; most of torch, scipy and others never are, and it is half of an install.
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile $(addprefix -c ,$(CONSTRAINTS))
 TEST_EXTRAS := rl,render,peers,db,samplers,nuts,parquet,recorders,units,frames,explore,dev,torch,learned
@@ -75,7 +77,7 @@ $(MADE):
 $(BASE): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
 	@rm -f $(BASE) $(TEST) $(BENCH) $(DOCS)
-	@$(PIP) setuptools
+	@$(PIP) '$(BUILD)'
 	@$(PIP) --no-build-isolation -e .
 	@$(TIDY)
 	@touch $(BASE)
@@ -86,7 +88,7 @@ $(DOCS): EXTRAS := $(DOCS_EXTRAS)
 $(TEST) $(BENCH) $(DOCS): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing what tests, benchmarks or the site need into $(VENV) (once, some minutes) ..."
 	@rm -f $(BASE) $@
-	@$(PIP) setuptools
+	@$(PIP) '$(BUILD)'
 	@$(PIP) --no-build-isolation -e ".[$(EXTRAS)]"
 	@$(TIDY)
 	@touch $(BASE) $@

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -189,7 +189,7 @@ def _square(root: np.ndarray) -> np.ndarray:
     return root @ np.swapaxes(root, -1, -2)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition = shape.n, shape.m, functions.transition
     transition_matrix, observation_matrix = (

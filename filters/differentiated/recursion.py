@@ -7,7 +7,7 @@ that it does not matter which of them lie together.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import lru_cache
 from math import prod
 from typing import Any, NamedTuple
 
@@ -54,7 +54,7 @@ def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page 
     return _recursion_of(functions, shape, wanted, page, is_interpreting())
 
 
-@cache
+@lru_cache(maxsize=64)
 @uncollected()
 def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page, interpreting: bool) -> Recursion:
     memory = Memory(shape, page)

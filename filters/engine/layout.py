@@ -8,7 +8,7 @@ model's numbers, behind which a filter has its own, is laid out by `thruster_env
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 from thruster_env.numerics.angles import angle_writer
@@ -44,7 +44,7 @@ def mean_writer(shape: Shape) -> Callable:
     return angle_writer(memory_places(shape.n, shape.m).mean, shape.state_angles)
 
 
-@cache
+@lru_cache(maxsize=64)
 def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
@@ -37,7 +37,7 @@ def row_magnitude(n: int, m: int) -> Callable:
     return source.function(" + ".join(terms))
 
 
-@cache
+@lru_cache(maxsize=64)
 def restart_if_lost(kernels: Kernels) -> Callable:
     """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count."""
     n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise

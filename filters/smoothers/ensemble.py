@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,7 @@ def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
     )
 
 
-@cache
+@lru_cache(maxsize=64)
 def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[Callable, Callable]:
     now, past = (vector_part(n, 2 * n, first) for first in (0, n))
     names: dict[str, Any] = {"now": now, "past": past, "join": joiner(n, n)}

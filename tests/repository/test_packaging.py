@@ -97,3 +97,11 @@ def test_a_wheel_holds_every_file_of_every_package_and_nothing_else(packed):
     assert {f"{package}/py.typed" for package in LAYERS} <= found
     assert sorted(found ^ of_packages) == []
     assert wheel.name.split("-")[:2] == ["thruster_env", __version__]
+
+
+def test_make_installs_the_build_tool_that_the_package_asks_for():
+    """A venv of Python 3.11 brings setuptools 65, which pip leaves as it is unless a version is named."""
+    (wanted,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    command = ["make", "--dry-run", "--always-make", "CONSTRAINTS=", ".venv/.test"]
+    lines = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert any(line.endswith(f"'{wanted}'") and " install " in line for line in lines)

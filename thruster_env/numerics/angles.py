@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,7 @@ def with_breaks(x: np.ndarray, *lines: np.ndarray) -> tuple[np.ndarray, ...]:
     return np.insert(x, jumps, x[jumps]), *(np.insert(line, jumps, np.nan) for line in lines)
 
 
-@cache
+@lru_cache(maxsize=64)
 def kept(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callable:
     """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""
     if not any(angles):

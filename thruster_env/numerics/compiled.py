@@ -33,16 +33,19 @@ FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 OURS = "thruster_env", "auv_env", "filters", "tuning"  # packages whose quotients may be products with reciprocals
 JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divide divmod".split())
 
+MOST_WAITING = 10_000  # functions, above which those that nobody has any more are forgotten
 WITHIN = tuple(f"thruster_env.{name}" for name in ("numerics", "plants", "training", "studies"))  # packages apart
 _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
-_waiting: list[Callable] = []
-_marked: set[Callable] = set()
-_called: set[Callable] = set()  # of these, functions that are called and not inlined
-_apart: set[Callable] = set()  # of these, functions of which there is one copy
-_narrow: set[Callable] = set()  # functions whose vectors are as wide as LLVM prefers
+# Weak references: a model's functions live as long as somebody has them.
+_waiting: list[Callable[[], Callable | None]] = []
+_marked: weakref.WeakSet[Callable] = weakref.WeakSet()
+_called: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions that are called and not inlined
+_apart: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions of which there is one copy
+_narrow: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
+_untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
 
@@ -58,9 +61,11 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
         callees = _callees(function)
         for callee in callees:  # a user's model may call helpers of its own
             inlined(callee)
-        if not into_callers or not _called.isdisjoint(callees):
+        if not into_callers or any(callee in _called for callee in callees):
             _called.add(function)
-        _waiting.append(function)
+        _waiting.append(weakref.ref(function))
+        if len(_waiting) > MOST_WAITING:  # nothing may ever be compiled
+            _waiting[:] = [one for one in _waiting if one() is not None]
     return function
 
 
@@ -89,9 +94,15 @@ def _which() -> Which:
     )
 
 
-def overloaded(function: Callable) -> Callable:
-    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`."""
+def overloaded(function: Callable, teach: Callable[[Callable], None] | None = None) -> Callable:
+    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`.
+
+    `teach(function)`, if there is one, says which; it is called before the next compilation, unless nobody has the
+    function any more.
+    """
     _marked.add(function)
+    if teach is not None:
+        _untaught[function] = teach
     return function
 
 
@@ -133,10 +144,17 @@ def compiled(function: Callable) -> Callable:
     import numba
     from numba.extending import register_jitable
 
-    while _lessons:
-        _lessons.pop()()
+    while _lessons or _untaught:  # a lesson may bring others
+        if _lessons:
+            _lessons.pop()()
+            continue
+        with contextlib.suppress(KeyError):  # the last one has just gone
+            untaught, teach = _untaught.popitem()
+            teach(untaught)
     while _waiting:
-        inner = _waiting.pop()
+        inner = _waiting.pop()()
+        if inner is None:
+            continue
         register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True, fastmath=fastmath_of(inner))(
             inner
         )  # by itself LLVM inlines small ones only
@@ -152,7 +170,8 @@ def fastmath_of(function: Callable) -> set[str]:
     """
     if (function.__module__ or "").partition(".")[0] in OURS:
         return set(FASTMATH)
-    return {"nsz"} if _jumps(function.__code__) else set(FASTMATH - {"arcp"})
+    code = getattr(function, "__code__", None)  # an object that is called has none
+    return {"nsz"} if code is not None and _jumps(code) else set(FASTMATH - {"arcp"})
 
 
 def _jumps(code: types.CodeType) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 from weakref import WeakSet
 
@@ -166,7 +166,7 @@ def _differences_in_loops(
     return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
-@cache
+@lru_cache(maxsize=64)
 def jacobian(
     function: Callable,
     analytic: Callable | None,

@@ -11,7 +11,7 @@ from thruster_env.numerics.written import made_here
 
 __all__ = ["Made", "as_function", "as_made", "makes_functions"]
 
-MOST = 512  # results that are kept for a maker, beyond those that something else holds
+MOST = 128  # results that are kept for a maker, beyond those that something else holds
 
 
 def makes_functions(maker: Callable) -> Callable:

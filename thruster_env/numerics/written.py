@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import linecache
 import sys
+import weakref
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable
 
 from thruster_env.numerics.compiled import inlined
 
+_shown: Counter[str] = Counter()  # files of texts, with the number of functions made of each
 _MAKERS = (__name__, "thruster_env.numerics.sources")  # of which the names do not tell anything
 
 
@@ -30,8 +33,20 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
     names["__name__"] = __name__  # without a module, pickling for numba's cache searches all of them
     body = "".join(f"    {line}\n" for line in (*lines[:-1], f"return {lines[-1]}"))
     text = f"def {name}({arguments}):\n{body}"
-    exec(compile(text, _name_in_tracebacks(name, text), "exec"), names)
-    return inlined(names[name], into_callers=not _loops)
+    file = _name_in_tracebacks(name, text)
+    exec(compile(text, file, "exec"), names)
+    made = inlined(names[name], into_callers=not _loops)
+    _shown[file] += 1
+    weakref.finalize(made, _forget, file).atexit = False
+    return made
+
+
+def _forget(file: str) -> None:
+    """Drop a text of which there is no function any more."""
+    _shown[file] -= 1
+    if not _shown[file]:
+        del _shown[file]
+        linecache.cache.pop(file, None)
 
 
 def _name_in_tracebacks(name: str, text: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +51,7 @@ def starts_of(*lengths: int) -> list[int]:
     return [0, *np.cumsum(lengths).tolist()]
 
 
-@cache
+@lru_cache(maxsize=64)
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
     start = number_places(shape.n, shape.m).constants

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import lru_cache, partial
 
 import gymnasium as gym
 import numpy as np
@@ -108,7 +108,7 @@ def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-@cache
+@lru_cache(maxsize=64)
 def _mover(
     begin: Callable, advance: Callable, measure: Callable, largest: int, interpreting: bool
 ) -> CompiledOrPython:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ def noise_step(n: int, m: int):
     return disturb
 
 
-@cache
+@lru_cache(maxsize=64)
 def truth_steps(functions: Functions, shape: Shape):
     """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
 
@@ -90,7 +90,7 @@ def truth_steps_of(model: StateSpaceModel):
     return truth_steps(model.functions, model.shape)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
     fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
     room = padded(max(n, m), GROUP)

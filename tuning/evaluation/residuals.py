@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -120,7 +120,7 @@ def _is_regular(cov: np.ndarray) -> bool:
     return bool(np.isfinite(cov).all() and correlation_flaws(cov)[0] > LEAST_EIGENVALUE)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
     """The function steps(states, inputs, numbers, expected, seen) that evaluates f and h along true states."""
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe

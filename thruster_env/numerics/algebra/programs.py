@@ -17,11 +17,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from thruster_env.numerics.algebra.graphs import Number, needed_by
-from thruster_env.numerics.compiled import overloaded, when_compiling
+from thruster_env.numerics.compiled import overloaded
 
 ARRAYS = ("rows", "change", "numbers", "move")  # arguments of programs with derivatives
 OF_STEPS = ("rows", "given", "numbers")  # arguments of programs that run a filter
@@ -137,30 +138,41 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
     """
     lines, arguments = program.text, ", ".join(arrays)
     digest = hashlib.sha256("\n".join([str(width), str(scratch), *lines]).encode()).hexdigest()[:24]
-    _TEXTS[digest] = lines
-    names: dict = {"run": _run, "__name__": __name__}  # what the cache of machine code sees is the digest alone
+    # What the cache of machine code sees is the digest alone; the text lives as long as the function.
+    names: dict = {"run": _run, "__name__": __name__, "text": _TEXTS.setdefault(digest, Text(lines))}
     exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
-    work = overloaded(names["work"])
-    when_compiling(lambda: _teach(work, program, width, arrays, scratch))
-    return work
+    return overloaded(names["work"], lambda work: _teach(work, program, width, arrays, scratch))
 
 
-_TEXTS: dict[str, list[str]] = {}
-_IN_PYTHON: dict[str, Callable] = {}
+class Text:
+    """Lines of a program, and what runs them as Python, once somebody has."""
+
+    def __init__(self, lines: list[str]):
+        """Take the lines."""
+        self._lines = lines
+        self._in_python: Callable | None = None
+
+    def in_python(self, kind: Sequence[str]) -> Callable:
+        """The function of arrays of some names."""
+        if self._in_python is None:
+            self._in_python = _in_python(self._lines, kind)
+        return self._in_python
+
+
+_TEXTS: WeakValueDictionary[str, Text] = WeakValueDictionary()
 
 
 def _run(digest: str, width: int, *arrays) -> None:
     """Run a program as Python."""
     kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS)}[len(arrays)]
-    if digest not in _IN_PYTHON:
-        _IN_PYTHON[digest] = _in_python(_TEXTS[digest], kind)
+    work = _TEXTS[digest].in_python(kind)
     if kind is OF_MEMBERS:
         *others, table, draws, size = arrays
         columns = table.shape[1]
-        _IN_PYTHON[digest](*others, table, draws[: len(draws) // columns * columns].reshape(-1, columns), size)
+        work(*others, table, draws[: len(draws) // columns * columns].reshape(-1, columns), size)
         return
     named = zip(kind, arrays, strict=True)
-    _IN_PYTHON[digest](*(a.reshape(-1, width) if width > 1 and name in SIDE_BY_SIDE else a for name, a in named))
+    work(*(a.reshape(-1, width) if width > 1 and name in SIDE_BY_SIDE else a for name, a in named))
 
 
 def _in_python(text: list[str], arrays: Sequence[str] = ARRAYS) -> Callable:
