@@ -165,12 +165,12 @@ class Given(NamedTuple):
     rate: float
 
 
-def that_decides(gain=2.0, rate=1.0, r=0.04):
+def of_floats_alone(gain=2.0, rate=1.0, r=0.04):
     """It cannot be traced: each value of a parameter is another function, along which there are differences."""
 
     def move(x, u, c):
-        if x[0] > 1e9:
-            return (0.0,)
+        if not isinstance(x[0], float):
+            raise TypeError("it asks for a float")
         return (x[0] + DT * (gain * u[0] - rate * x[0]),)
 
     return StateSpaceModel(transition=move, observe=observe, measurement_noise_cov=[r], **REST)
@@ -236,7 +236,7 @@ def test_a_number_in_a_function_that_differs_elsewhere_only_is_refused(as_python
 
 def test_blocks_have_scores_of_their_own_along_parameters_without_derivatives(as_python):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    one, other = (Objective(data, made, coordinates) for made in (of_module, that_decides))
+    one, other = (Objective(data, made, coordinates) for made in (of_module, of_floats_alone))
     assert other.rough == (0, 1)
     at = coordinates.of([2.0, 1.0, 0.04])
     expected, found = one(at), other(at)
@@ -249,7 +249,7 @@ def test_blocks_have_scores_of_their_own_along_parameters_without_derivatives(as
 
 def test_two_parameters_without_derivatives_are_correlated_as_the_log_likelihood_says(as_python):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    objective, at = Objective(data, that_decides, coordinates), coordinates.of([2.0, 1.0, 0.04])
+    objective, at = Objective(data, of_floats_alone, coordinates), coordinates.of([2.0, 1.0, 0.04])
     smooth, step = Objective(data, of_module, coordinates), 1e-3 * np.eye(3)
     of_gradients = np.array([(smooth(at - one).gradient - smooth(at + one).gradient) / 2e-3 for one in step])
     np.testing.assert_allclose(objective(at).information[:2, :2], of_gradients[:2, :2], rtol=2e-2)
