@@ -77,7 +77,7 @@ def test_the_first_step_states_and_cause_are_told(cause):
         found = filters.run(filter_, None, inputs, z)
     told = restarts_of(filter_, found.divergences, None, inputs, z)
     assert told.cause == cause and told.states == states and told.sentence == str(caught[0].message)
-    assert (told.count, told.runs, told.of_runs, told.run) == (found.divergences.sum(), 1, 3, 1)
+    assert (told.times, told.runs, told.of_runs, told.run) == (found.divergences.sum(), 1, 3, 1)
     assert told.step == (3 if cause.startswith(("h", "H")) else 4)
     assert pickle.loads(pickle.dumps(told)) == told
 

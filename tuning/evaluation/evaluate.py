@@ -99,7 +99,7 @@ def with_restarts(found: Evaluation, filter_: Filter, runs: RunMetrics, data: Da
     told = restarts_of(filter_, runs.divergences[place], one.filter_keys, one.inputs, one.measurements)
     assert told is not None  # it has restarted
     return found._replace(
-        restarts=told._replace(count=found.divergences, runs=len(lost), of_runs=len(runs.divergences), run=place)
+        restarts=told._replace(times=found.divergences, runs=len(lost), of_runs=len(runs.divergences), run=place)
     )
 
 
