@@ -171,7 +171,7 @@ class Called:
     def _constants(self, c: Sequence):
         form = self._shape.form
         if constants_are_array(form):
-            return torch.stack(c) if isinstance(c[0], Tensor) else np.array(c)
+            return torch.stack(tuple(c)) if isinstance(c[0], Tensor) else np.array(c)
         return tuple(c) if isinstance(form, int) else form(*c)
 
 
