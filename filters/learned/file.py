@@ -44,6 +44,9 @@ class TrainedEstimator:
             with safe_open(self.path, framework="pt") as file:
                 self.about = json.loads((file.metadata() or {})[DESCRIPTION])
                 self._numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            wrong = [name for name, one in self._numbers.items() if not one.isfinite().all()]
+            if wrong:
+                raise ValueError(f"{', '.join(wrong)} must be finite, but have NaN or infinity")
             if self.about["format"] != FORMAT:
                 raise ValueError(f"its format is not {FORMAT}")
             kind, self._options = str(self.about["kind"]), dict(self.about["options"])
@@ -64,7 +67,8 @@ class TrainedEstimator:
         try:
             made.load_state_dict(self._numbers)
         except RuntimeError as error:
-            raise ValueError(f"{self.path} must have the numbers of a {self.name}, but: {error}") from None
+            said = "; ".join(line.strip() for line in str(error).splitlines()[1:]) or str(error)
+            raise ValueError(f"{self.path} must have the numbers of a {self.name}, but: {said}") from None
         return made
 
     def _check(self, model: StateSpaceModel, needs_model: bool) -> None:

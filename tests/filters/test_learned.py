@@ -350,3 +350,24 @@ def test_unknown_and_wrong_options_are_refused():
         KalmanNet(plane_model(), size=3)
     with pytest.raises(ValueError, match="at most 16 states and measurements, but got 17 and 2"):
         KalmanNet(random_affine(n=17))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(tmp_path, as_python, value):
+    path, estimator = tmp_path / "gain.safetensors", made("gru", width=7)
+    name, numbers = next(iter(estimator.state_dict().items()))
+    numbers.view(-1)[0] = value
+    write_estimator(path, estimator, {})
+    with pytest.raises(ValueError, match=f"{name} must be finite, but have NaN or infinity") as said:
+        read(path)
+    assert "\n" not in str(said.value)
+
+
+def test_numbers_of_other_shapes_are_refused_in_one_line(tmp_path, as_python):
+    path = tmp_path / "gain.safetensors"
+    write_estimator(path, made("gru", width=7), {})
+    found = read(path)
+    found._options["width"] = 5
+    with pytest.raises(ValueError, match="must have the numbers of a gru, but: size mismatch") as said:
+        found(plane_model())
+    assert "\n" not in str(said.value)

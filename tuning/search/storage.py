@@ -129,10 +129,11 @@ def _may_live(process: str | None) -> bool:
     if process is None:
         return False
     host, _, number = process.rpartition(":")
-    return host != os.uname().nodename or _alive(int(number))
+    return host != os.uname().nodename or is_alive(int(number))
 
 
-def _alive(process: int) -> bool:
+def is_alive(process: int) -> bool:
+    """Whether there is a process of this number on this host."""
     if process <= 0:
         return False
     try:

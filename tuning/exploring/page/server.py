@@ -33,6 +33,7 @@ LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
 LEFT_FOR = 6.0  # [s] without an open page, after which the server ends; a page that is loaded anew takes less
 LOOK_EVERY = 500  # [ms]
+MOST_SENT = 2**20  # bytes of a request, which are read before its token is; the page asks by websocket
 HEADERS = {
     "Referrer-Policy": "no-referrer",  # the token stands in the address
     "X-Content-Type-Options": "nosniff",
@@ -106,7 +107,11 @@ class Server:
 
     def __init__(self, page: Callable[[Document], None], *, port: int = 0, ends_when_left: bool = True):
         """Bind the port; `page` fills the document of each tab."""
-        sockets, self.port = bind_sockets(LOOPBACK, port)
+        try:
+            sockets, self.port = bind_sockets(LOOPBACK, port)
+        except OSError as error:
+            rule = "port must be free, or 0 for one that the system chooses"
+            raise ValueError(f"{rule}, but {port} is not: {error.strerror}") from None
         self._sockets, self._page, self._ends = sockets, page, ends_when_left
         self._token = secrets.token_urlsafe(32)
         self.url = f"http://{LOOPBACK}:{self.port}/{self._token}/"
@@ -124,7 +129,7 @@ class Server:
         app.add_transform(Careful)
         app.settings["default_handler_class"] = ErrorHandler
         app.settings["default_handler_args"] = {"status_code": 404}
-        http = HTTPServer(app)
+        http = HTTPServer(app, max_header_size=MOST_SENT, max_body_size=MOST_SENT, max_buffer_size=MOST_SENT)
         http.add_sockets(self._sockets)
         server = BaseServer(self._loop, app, http)
         server.start()

@@ -2,7 +2,10 @@
 
 import asyncio
 import http.client
+import os
 import socket
+import subprocess
+import sys
 from threading import Thread
 
 import pytest
@@ -14,6 +17,7 @@ from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
+from thruster_cli import explore
 from tuning.exploring.page import server as module
 from tuning.exploring.page.server import LOOPBACK, Server
 
@@ -156,3 +160,28 @@ def test_it_ends_when_the_last_page_was_left(monkeypatch):
     assert not thread.is_alive()
     with pytest.raises(OSError):
         socket.create_connection((LOOPBACK, made.port), timeout=5)
+
+
+def test_a_port_in_use_is_named_with_a_way_out(server):
+    with pytest.raises(ValueError, match=f"port must be free, or 0 for one .*, but {server.port} is not: Address"):
+        Server(page, port=server.port)
+
+
+def test_hardly_anything_is_read_before_the_token(server):
+    """A body of 4 MB without a token was read whole, up to 98 MB a connection."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        head = f"POST / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Length: {2**22}\r\n\r\n"
+        connection.sendall(head.encode())
+        answer = connection.recv(1000)
+    assert not answer or answer.startswith(b"HTTP/1.1 4")
+
+
+def test_folders_of_killed_explorers_are_removed_at_the_next_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(explore.tempfile, "gettempdir", lambda: str(tmp_path))
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    names = f"thruster-explore-{dead.pid}-x", f"thruster-explore-{os.getpid()}-x", "thruster-explore-abc", "other"
+    for name in names:
+        (tmp_path / name).mkdir()
+    explore._remove_left_over()
+    assert {one.name for one in tmp_path.iterdir()} == set(names[1:])
