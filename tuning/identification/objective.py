@@ -230,7 +230,8 @@ class Objective:
         if self.starts is not None:
             there &= (np.arange(rows) >= self.starts.counted_from[:, None])[..., None]
         found = np.zeros((count, self.blocks, channels), dtype=np.int64)
-        np.add.at(found, (slice(None), np.arange(rows) * self.blocks // rows), there)
+        for block, rows_of in enumerate(np.arange(rows) * self.blocks // rows == np.arange(self.blocks)[:, None]):
+            found[:, block] = there[:, rows_of].sum(axis=1)
         return found
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
