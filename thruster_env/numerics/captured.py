@@ -100,7 +100,8 @@ class _Copy:
         return copy
 
     def _of_object(self, value: Any) -> Any:
-        copy = object.__new__(type(value))
+        base = types.SimpleNamespace if isinstance(value, types.SimpleNamespace) else object
+        copy = base.__new__(type(value))
         self._copies[id(value)] = value, copy
         vars(copy).update({name: self.of(one) for name, one in vars(value).items()})
         return copy
