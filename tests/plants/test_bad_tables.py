@@ -110,3 +110,12 @@ def test_a_parquet_file_that_lies_of_its_size_ends_in_one_line(tmp_path, monkeyp
     refused(
         tmp_path / "a.parquet", r"a file must take at most 2.5e\+08 bytes of memory, but .* takes more|breaks off"
     )
+
+
+@pytest.mark.parametrize(("stated", "damaged"), [(b"'<f8'", b"'<f4'"), (b"(4000,)", b"(1000,)")])
+def test_an_npz_array_that_holds_more_than_its_header_says_is_refused(tmp_path, stated, damaged):
+    """The check sum of a member is compared at its end, which an array of smaller numbers does not reach."""
+    path = tmp_path / "a.npz"
+    np.savez(path, t=0.1 * np.arange(4000), voltage=np.random.default_rng(0).normal(size=4000))
+    path.write_bytes(path.read_bytes().replace(stated, damaged))
+    refused(path, "'t.npy' holds more than its array")

@@ -236,7 +236,10 @@ def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                 if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > one.file_size:
                     raise ValueError(f"{one.filename!r} ends within its array")
             with archive.open(one) as member:
-                yield one.filename.removesuffix(".npy"), np.lib.format.read_array(member, allow_pickle=False)
+                values = np.lib.format.read_array(member, allow_pickle=False)
+                if member.read(1):  # of another shape or type than is stated; the check sum is at the end
+                    raise ValueError(f"{one.filename!r} holds more than its array")
+                yield one.filename.removesuffix(".npy"), values
 
 
 @contextmanager

@@ -82,6 +82,8 @@ def _unpacked(file: BinaryIO, count: int, order: str, total: int, path: Path) ->
             out += bytes(size)
         if packed.eof or not (data or piece or file.tell() < end):
             break
+    if packed.decompress(piece + file.read(end - file.tell()), 1) or not packed.eof:  # the check sum is at its end
+        raise ValueError("it holds an array that is packed and damaged")
     file.seek(end)
     del out[place:]
     return out
