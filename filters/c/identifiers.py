@@ -22,7 +22,8 @@ HEADERS = frozenset(  # NAME.h would hide them
 MACROS = re.compile(
     "NAN|INFINITY|NULL|EOF|BUFSIZ|FILENAME_MAX|FOPEN_MAX|MB_CUR_MAX|MAXFLOAT|I|DOMAIN|SING|OVERFLOW|UNDERFLOW|PLOSS|"
     "TLOSS|linux|unix|i386|errno|stdin|stdout|stderr|signgam|assert|"
-    "(FP|M|MATH|SEEK|EXIT|RAND|L|P|TMP|SIZE|PTRDIFF|SIG|WCHAR|WINT|FLT|DBL|LDBL|HUGE_VAL|SNAN|_)_?[A-Z0-9_]*|"
+    "P_tmpdir|L_(tmpnam|ctermid|cuserid)|(HUGE_VAL|SNAN)[A-Z0-9]*|"
+    "(FP|M|MATH|SEEK|EXIT|RAND|TMP|SIZE|PTRDIFF|SIG|WCHAR|WINT|FLT|DBL|LDBL)_[A-Z0-9_]*|"
     "(U?INT(PTR|MAX|(_LEAST|_FAST)?(8|16|32|64))|U?CHAR|U?SHRT|U?INT|U?L?LONG)_[A-Z]+"
 )
 OF_MATH = (  # and with an f or l behind them
