@@ -14,7 +14,7 @@ from tests.models import scalar_model
 TAKEN = """exp R advance NAN new class double_t correct settle filter x u z t0 i P prior_mean line math
 board is_lost update reset Real told states INFINITY isnan expf y0 gamma M_PI INT8_MAX NULL printf remove index
 string time COLUMNS uint32_t become_prior true template namespace operator x_t hypotl stdin""".split()
-FREE = ["ekf", "EKF", "tank", "torque", "stroke", "member", "R_", "a", "test", "draw", "philox", "EKF_2", "expo", "L", "MOTOR"]
+FREE = "ekf EKF tank torque stroke member R_ a test draw philox EKF_2 expo L MOTOR".split()
 
 
 @pytest.mark.parametrize("name", TAKEN)
