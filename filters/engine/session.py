@@ -148,7 +148,8 @@ class Session:
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
-        Raises ValueError for a model without such a constant, a filter of several models, or another number.
+        Raises ValueError for a model without such a constant, a filter of several models or of an affine
+        approximation, or another number.
         """
         place, parts = self._dt_place
         self._numbers[place] = positive("dt", dt) / parts
@@ -163,8 +164,13 @@ class Session:
     def _dt_place(self) -> tuple[int, int]:
         """Where the constant lies, and how many of it are a step."""
         self._check_one_model("set_dt")
-        model = self._filter.kernel_model
+        model = self._filter.model
         place, parts = sample_time_place(model, "set_dt")
+        if self._filter.kernel_model.constants is not model.constants:  # A and B, which are those of one dt
+            raise ValueError(
+                f"set_dt needs a filter that evaluates f(x, u) at each step, but {self._name!r} has the A and B "
+                "of one dt: 'ekf' is the Kalman filter at any dt where f and h are affine"
+            )
         return self._noise_places.constants + place, parts
 
     def set_parameter(self, name: str, value: float) -> None:

@@ -12,6 +12,7 @@ from filters.estimators.estimator import steps_alone
 from thruster_env.numerics.global_generators import GlobalGenerators, seeded_copy
 from thruster_env.numerics.modules import said
 from thruster_env.numerics.streams import GLOBAL_GENERATORS, derived_seed
+from thruster_env.plants.diffusion import same_dt
 
 
 class EstimatorSession:
@@ -34,7 +35,7 @@ class EstimatorSession:
                 f"the estimator {filter_.name!r} must have reset(key, z) and step(u, z) to run beside an env, "
                 "but it lacks them"
             )
-        model = filter_.model
+        model, self._filter = filter_.model, filter_
         n, m = model.n, model.m
         self._given = copy.deepcopy(filter_.estimator)
         self._estimator, self.generators = self._given, GlobalGenerators()
@@ -60,6 +61,29 @@ class EstimatorSession:
         z = vector_like("z", z, self._like[1], missing_allowed=True)
         self._steps += 1
         self._take("step", u.copy(), z)
+
+    def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
+        """Raise ValueError for another Q or R: `Filter.fixed_noise`."""
+        self._filter.check_noise(process_noise_cov, measurement_noise_cov)
+
+    def scale_process_noise(self, factor: float) -> None:
+        """Raise ValueError for another Q, unless the factor is 1 to rounding."""
+        if not same_dt(factor, 1.0):
+            self._filter.check_noise(process_noise_cov=factor)
+
+    def set_dt(self, dt: float) -> None:
+        """Raise ValueError: an estimator knows of no dt."""
+        raise self._fixed("dt")
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Raise ValueError: an estimator keeps its numbers to itself."""
+        raise self._fixed(str(name))
+
+    def _fixed(self, name: str) -> ValueError:
+        return ValueError(
+            f"{name} of the estimator {self._filter.name!r} cannot vary from step to step, but got another "
+            f"{name}: make the estimator for a model with it, or take a filter of filters.FILTERS"
+        )
 
     def _take(self, method: str, first, z: np.ndarray) -> None:
         where = f"step {self._steps}"

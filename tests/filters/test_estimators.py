@@ -338,3 +338,24 @@ def test_by_the_command_line(thruster):
     ):
         done = thruster(*arguments)
         assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("use", "rule"),
+    [
+        (lambda one: one.set_noise(process_noise_cov=np.eye(2)), "Q and R of the filter 'mine' cannot vary"),
+        (lambda one: one.set_noise(measurement_noise_cov=[[1.0]]), "Q and R of the filter 'mine' cannot vary"),
+        (lambda one: one.scale_process_noise(2.0), "Q and R of the filter 'mine' cannot vary"),
+        (lambda one: one.set_dt(0.1), "dt of the estimator 'mine' cannot vary from step to step"),
+        (lambda one: one.set_parameter("gain", 2.0), "gain of the estimator 'mine' cannot vary"),
+    ],
+)
+def test_a_session_refuses_what_an_estimator_cannot_be_set_to(use, rule):
+    session = make_filter(Scripted(name="mine"), random_affine(2, 1, 1)).session()
+    session.start((1, 2), [0.0])
+    with pytest.raises(ValueError, match=rule) as error:
+        use(session)
+    assert "\n" not in str(error.value)
+    session.set_noise()
+    session.scale_process_noise(1.0)
+    session.step([0.0], [0.0])  # and nothing has changed

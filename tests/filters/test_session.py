@@ -224,5 +224,5 @@ def test_a_session_takes_another_sample_time_where_the_model_has_it():
     np.testing.assert_array_equal(session.mean, expected.mean)
     with pytest.raises(ValueError, match="dt must be .*positive"):
         session.set_dt(-1.0)
-    with pytest.raises(ValueError, match="needs a model with a constant dt, but got none"):
+    with pytest.raises(ValueError, match=r"a constant dt, but got none: write f\(x, u, c\) with c.dt"):
         made("ekf", of_three_states).session().set_dt(0.1)

@@ -33,7 +33,10 @@ NUMBERS = {
 REFUSED = {
     **{(name, what): "Q and R of the filter" for name in ("kf-steady", "imm", "mmae") for what in ("Q", "R")},
     **{(name, "R"): f"R of the filter '{name}' cannot vary" for name in ("vb", "sage-husa")},
-    **{(name, "dt"): "set_dt needs a model with a constant dt" for name in ("kf", "kf-steady")},
+    **{
+        (name, "dt"): f"'{name}' has the A and B of one dt: 'ekf' is the Kalman filter at any dt"
+        for name in ("kf", "kf-steady")
+    },
     **{(name, "dt"): "set_dt needs a filter with one model" for name in ("imm", "mmae", "fuzzy")},
     **{(name, "factor"): "scale_process_noise needs a filter with one model" for name in ("imm", "mmae", "fuzzy")},
     ("kf-steady", "factor"): "Q and R of the filter 'kf-steady' cannot vary",
@@ -279,7 +282,7 @@ def test_a_smoother_does_not_mind_the_order_of_states_of_which_some_are_known_ex
 
 def test_filters_of_one_affine_model_refuse_steps_of_any_length():
     for name in ("kf", "kf-steady"):
-        with pytest.raises(ValueError, match=f"must know steps of any length, but '{name}' does not"):
+        with pytest.raises(ValueError, match=f"must know steps of any length, but '{name}' does not: 'ekf' does"):
             make_filter(name, in_any_steps(moving()))
     assert not KalmanFilter.any_step
 

@@ -18,7 +18,7 @@ import threading
 import types
 import warnings
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -114,11 +114,27 @@ def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
 
 def _callees(function: Callable) -> list[Callable]:
     """Plain functions that a function has in its closure or calls by a global name."""
+    return [part for part in _values_in(function) if isinstance(part, types.FunctionType)]
+
+
+def _values_in(function: Callable) -> list:
+    """What a function has in its closure or reads by a global name."""
     if not isinstance(function, types.FunctionType):
         return []
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    called = [function.__globals__.get(name) for name in function.__code__.co_names]
-    return [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
+    return [*cells, *(function.__globals__.get(name) for name in function.__code__.co_names)]
+
+
+def _with_callees(functions: Iterable[Callable]) -> Iterator[Callable]:
+    """Functions and all plain functions that they call, each once."""
+    seen: set[Callable] = set()
+    waiting = list(functions)
+    while waiting:
+        function = waiting.pop()
+        if function not in seen:
+            seen.add(function)
+            yield function
+            waiting += _callees(function)
 
 
 @contextlib.contextmanager
@@ -238,15 +254,8 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
     """
     digest = hashlib.sha256()
     packages = {package_of(__name__), package_of(within)}
-    seen: set[Callable] = set()
-    waiting = [function for function in functions if function is not None]
-    while waiting:
-        function = waiting.pop()
-        if function in seen:
-            continue
-        seen.add(function)
+    for function in _with_callees(function for function in functions if function is not None):
         digest.update(code_text(function).encode())
-        waiting += _callees(function)
         package = package_of(function.__module__ or "")
         if package in _packages:
             packages.add(package)
@@ -304,13 +313,45 @@ class CompiledOrPython:
             try:
                 return self._run(*arguments)
             except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
-                warnings.warn(
-                    f"the model runs as Python, slowly, because numba refuses it: {_reason(error)}", stacklevel=3
-                )
+                warnings.warn(_refusal(self._python, error), stacklevel=3)
                 self._run = self._python
             finally:
                 self._proven = True
         return self(*arguments)
+
+
+def _refusal(function: Callable, error: Exception) -> str:
+    """That a function runs as Python, and why: the user's model, this package, or the machine."""
+    text, ours = str(error), []
+    if isinstance(error, (OSError, MemoryError)):
+        return f"the model runs as Python, slowly, because machine code of it could not be made: {text}"
+    for one in _with_callees([function]):
+        where = text.find(hex(id(one)))
+        if (one.__module__ or "").partition(".")[0] in OURS:
+            ours.append((where, one))
+            if any(name in text for name in _objects_called(one)):
+                break
+        elif where >= 0 or getattr(getattr(one, "__code__", None), "co_filename", text) in text:
+            break
+    else:
+        _, broken = max(ours, key=lambda pair: pair[0], default=(0, function))  # the innermost comes last
+        return (
+            f"the model runs as Python, slowly, because numba refuses {_described(broken)}: {_reason(error)}; "
+            "this is a fault of the package and not of the model: please report it"
+        )
+    return f"the model runs as Python, slowly, because numba refuses it: {_reason(error)}"
+
+
+def _objects_called(function: Callable) -> list[str]:
+    """How numba calls the types of a function's callables that are no functions: a user's objects."""
+    kinds = {type(one) for one in _values_in(function) if callable(one)} - {types.FunctionType}
+    return [f"{one.__module__}.{one.__qualname__}" for one in kinds]
+
+
+def _described(function: Callable) -> str:
+    """A function's name and module, or by whom it was written out."""
+    file = function.__code__.co_filename
+    return file.strip("<>") if file.startswith("<") else f"{function.__name__} of {function.__module__}"
 
 
 def _reason(error: Exception) -> str:

@@ -133,4 +133,7 @@ def sample_time_place(model: StateSpaceModel, what: str) -> tuple[int, int]:
     for name, parts in (("dt", 1), ("substep", model.substeps)):
         if name in names:
             return names.index(name), parts
-    raise ValueError(f"{what} {called} a model with a constant dt, but got {', '.join(names) or 'none'}")
+    raise ValueError(
+        f"{what} {called} a model with a constant dt, but got {', '.join(names) or 'none'}: write f(x, u, c) "
+        "with c.dt, for a filter such as 'ekf'"
+    )
