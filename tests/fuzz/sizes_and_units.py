@@ -19,6 +19,7 @@ import numpy as np
 import filters
 from filters import EstimateState, Inversion, make_filter, run, smooth
 from filters.filter import Filter
+from filters.logs.estimate import estimate_with
 from filters.registry import FILTERS
 from tests.filters.test_c import built, estimated
 from tests.fuzz.python_interface import _line, _until
@@ -26,6 +27,9 @@ from tests.models import KEY, random_affine, rescaled, small
 from tests.oracles import kalman_filter
 from thruster_env.numerics.checks import covariance
 from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.affine import AffineModel
+from thruster_env.plants.logs.log import Log
 from thruster_env.plants.model_env import ModelEnv
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -38,6 +42,7 @@ EXACT = {
 }
 IN_C = ("kf", "ekf", "iekf", "ukf", "ckf", "fading", "ekf-robust", "vb")
 ON_TENSORS = (*IN_C, "enkf", "etkf")
+OF_ONE_STEP = ("kf", "kf-steady", "imm", "mmae", "fuzzy")  # refuse another dt
 SMOOTHED = ("kf", "ekf", "ukf", "ckf", "iekf", "enkf", "imm", "mmae")
 
 
@@ -47,6 +52,12 @@ class Step(NamedTuple):
     dt: float
     size: int
     seen: int
+
+
+class Clock(NamedTuple):
+    """The constants of a model of any step length."""
+
+    dt: float
 
 
 def sizes(rng: np.random.Generator, seconds: float) -> str:
@@ -120,6 +131,39 @@ def drawn(rng: np.random.Generator, n: int, m: int) -> tuple[StateSpaceModel, np
     return model, rng.normal(size=(2, 4, 2)), z
 
 
+def timed(model: AffineModel) -> StateSpaceModel:
+    """The same as x + dt (f(x, u) - x), with dt = 1 s among its constants."""
+    (a, b, offset, c, shift), n = model.matrices(), model.n
+    a = a - np.eye(n)
+
+    def transition(x, u, constants):
+        rates = _sums(a, x, _sums(b, u, offset))
+        return tuple(x[i] + constants.dt * rates[i] for i in range(n))
+
+    def observe(x, constants):
+        return tuple(_sums(c, x, shift))
+
+    return StateSpaceModel(
+        transition=transition,
+        observe=observe,
+        process_noise_cov=model.process_noise_cov,
+        measurement_noise_cov=model.measurement_noise_cov,
+        prior_mean=model.prior_mean,
+        prior_cov=model.prior_cov,
+        inputs=model.inputs,
+        constants=Clock(1.0),
+        operating_state=np.zeros(n),
+        operating_input=np.zeros(model.inputs),
+        **model.quantities._asdict(),
+    )
+
+
+def _sums(matrix: np.ndarray, x, more) -> list:
+    """M x + a, number by number, as a model may have it."""
+    rows = zip(matrix.tolist(), list(more), strict=True)
+    return [sum((m * x[j] for j, m in enumerate(row)), one) for row, one in rows]
+
+
 def made(rng: np.random.Generator, name: str, model: StateSpaceModel) -> Filter:
     """A filter by name, of any of its exact forms."""
     chosen = {key: one[rng.integers(len(one))] for key, one in EXACT.get(name, {}).items()}
@@ -168,6 +212,49 @@ def _compare_paths(
         _same(means, found.means[0])
     if rng.random() < 0.2:
         _compare_wrapper(filter_, rng)
+    if rng.random() < 0.3:
+        _compare_log(name, filter_, inputs[0], z[0])
+    if rng.random() < 0.3:
+        _compare_clock(dataclasses.replace(filter_, model=timed(model)), inputs[0], z[0])
+
+
+def _compare_log(name: str, filter_: Filter, inputs: np.ndarray, z: np.ndarray) -> None:
+    """`estimate` of a log on a grid, and its smoother."""
+    keys, log = filter_keys([0]), _log(filter_.model, inputs, z)
+    found, expected = estimate_with(filter_, log), run(filter_, keys, inputs[None], z[None])
+    _same(found.means, expected.means[0])
+    _same(found.covs, expected.covs[0])
+    _same(found.innovations, np.where(np.isnan(z), np.nan, expected.innovations[0]))
+    if filter_.has_covariance:
+        _same(found.log_likelihoods, expected.log_likelihoods[0])
+    if name in SMOOTHED:
+        smoothed = smooth(filter_, keys, inputs[None], z[None])
+        _same(estimate_with(filter_, log, smoother=True).means, smoothed.means[0])
+
+
+def _compare_clock(filter_: Filter, inputs: np.ndarray, z: np.ndarray) -> None:
+    """`live()`, and `estimate` of a log on its own stamps, of the model's dt; or a refusal in one line."""
+    log = _log(filter_.model, inputs, z, stamps=np.arange(len(z), dtype=float))
+    keys = filter_keys([0])
+    try:
+        live = filter_.live()
+    except ValueError as error:
+        assert filter_.name in OF_ONE_STEP and "\n" not in str(error), error
+        return
+    expected, found = run(filter_, keys, inputs[None], z[None]), estimate_with(filter_, log)
+    live.start(100.0, z[0], keys[0])
+    for k, u in enumerate(inputs, 1):
+        live.predict_to(100.0 + k, u)
+        live.update(100.0 + k, None, z[k])
+        _same(live.mean, expected.means[0, k])
+        _same(live.cov, expected.covs[0, k])
+        _same(live.innovation_cov, expected.innovation_covs[0, k])
+    _same(found.means, expected.means[0])
+    _same(found.covs, expected.covs[0])
+
+
+def _log(model: StateSpaceModel, inputs: np.ndarray, z: np.ndarray, **stamps: np.ndarray) -> Log:
+    return Log("log", 1.0, inputs, z, model.input_quantities, model.measurements, **stamps)
 
 
 def _compare_wrapper(filter_: Filter, rng: np.random.Generator) -> None:
