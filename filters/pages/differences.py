@@ -25,10 +25,11 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
         y_c dc = [y(c + h dc) - y(c - h dc)]/2h
         dY = [Y(x + h dx, c + h dc) - Y(x - h dx, c - h dc)]/2h
 
-    the first a function of (x, ..., c, dc, size), with the relative size of dc, the second one of (x, scales,
-    ..., c, dx, dc, size), or without the last two where constants do not move. Large Jacobians of such are
-    differentiated by each component of x, of which there are fewer than directions: then a derivative (columns,
-    rows, columns) and its contraction with dx follow.
+    the first a function of (x, scales, ..., c, dc, size), with the relative size of dc, the second one of (x,
+    scales, ..., c, dx, dc, size), or without the last two where constants do not move. Far from zero steps grow
+    with `stretch`, as a value is rounded there whatever moves. Large Jacobians of such are differentiated by each
+    component of x, of which there are fewer than directions: then a derivative (columns, rows, columns) and its
+    contraction with dx follow.
 
     Args:
         functions: of the model.
@@ -54,7 +55,7 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
 def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], others: str) -> Callable:
     sides = [others.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
     lines = (
-        f"h = {RELATIVE_STEP} / max(size, 1e-300)",
+        f"h = {RELATIVE_STEP} * stretch(x, scales) / max(size, 1e-300)",
         f"above, below = {', '.join(f'value(x, {side})' for side in sides)}",
         "difference(above, below, h)",
     )
@@ -62,8 +63,9 @@ def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, 
         "value": value,
         "shift": _constants_shift(shape),
         "difference": difference_of_values(rows, angles),
+        "stretch": stretch(shape.n),
     }
-    return written_out("by_constants", f"x, {others}, dc, size", *lines, **names)
+    return written_out("by_constants", f"x, scales, {others}, dc, size", *lines, **names)
 
 
 def difference_of_values(rows: int, angles: tuple[bool, ...]) -> Callable:
@@ -100,7 +102,8 @@ def slope_of(
 def _step(count: int) -> Callable:
     """Return `step(x, scales, d, size)`: how far to go along d, and along constants of a relative size."""
     source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
-    source.line("h, far = max(1e-300, size), stretch(x, scales)")
+    source.line("far = stretch(x, scales)")
+    source.line("h = max(1e-300, size / far)")
     for i in source.range(count):
         source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}], far))")
     return source.function(f"{RELATIVE_STEP} / h", step_of=step_of, stretch=stretch(count))

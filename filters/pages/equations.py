@@ -134,7 +134,7 @@ class Equations(PagedModel):
         def of_value(result, arguments, slopes):
             x, *others = arguments
             moved = through(lambda dx: matrix(x, self._scales, *others) @ dx, slopes[0])
-            return plus(moved, by_constants(*arguments, *self._moves) if self._moves else None)
+            return plus(moved, by_constants(x, self._scales, *others, *self._moves) if self._moves else None)
 
         @matrix.derivative
         def of_matrix(result, arguments, slopes):

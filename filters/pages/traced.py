@@ -98,7 +98,7 @@ class Traced:
         value = self._value(x, *others)
         return np.array([_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
 
-    def _by_constants(self, x, *others):
+    def _by_constants(self, x, scales, *others):
         given, (dc, _) = others[: self._others], others[self._others :]
         return _along(self._value(x, *given), (given[-1], dc))
 

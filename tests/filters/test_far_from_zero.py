@@ -12,6 +12,7 @@ import torch
 import filters
 from filters import StateSpaceModel, make_filter, run
 from filters.c.source import c_filter
+from filters.sensitivity import ModelSlopes, sensitivity
 from tests.models import simulated
 from thruster_env.numerics.compiled import interpreted
 from thruster_env.numerics.derivatives import jacobian, step_of, stretch
@@ -236,3 +237,21 @@ def test_an_approximation_far_from_zero_is_that_near_zero(called):
         np.testing.assert_allclose(far[k], near[k], atol=1e-6)
     np.testing.assert_allclose(near[0], [[1.0, DT], [0.0, 1.0 - DT * 0.2]], atol=1e-9)
     np.testing.assert_allclose(near[1], [[0.0], [DT]], atol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_slopes_along_constants_of_called_functions_far_from_zero():
+    def gradient(offset, unit, called):
+        def dragged(x, u, c):
+            ahead = int(x[1] >= 0.0) if called else x[1] >= 0.0
+            drag = c[0] * x[1] * x[1] / unit * (2.0 * ahead - 1.0)
+            return x[0] + DT * c[1] * x[1], x[1] + DT * (u[0] * unit - drag)
+
+        model = body(offset, unit, called, transition=dragged, observe=lambda x, c: (x[0],), constants=(0.2, 1.0))
+        inputs, z = data()
+        by_noise = [np.zeros((2, *shape)) for shape in ((2, 2), (1, 1), (2,), (2, 2))]
+        return sensitivity(model, inputs, offset + z * unit, ModelSlopes(np.eye(2), *by_noise)).gradients.sum(axis=0)
+
+    expected = gradient(0.0, 1.0, called=False)
+    for offset, unit, called in ((5e6, 1.0, False), (0.0, 1.0, True), (5e6, 1.0, True), (-5.0, 1e-6, True)):
+        np.testing.assert_allclose(gradient(offset, unit, called), expected, rtol=0.01)

@@ -12,6 +12,7 @@ import pytest
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.sources import as_value
 from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
 from thruster_env.plants import simulate
@@ -345,6 +346,26 @@ def test_complex_steps_give_an_analytic_model_exact_jacobians(plainly):
             for model in (declared, exact.replace(observe_jacobian=declared.observe_jacobian))
         )
     np.testing.assert_allclose(found.means, wanted.means, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [2, 40])
+def test_a_root_at_zero_has_no_steep_slope_by_a_complex_step(size):
+    def emptied(x, u, c):
+        outflow = [0.1 * np.sqrt(one) for one in np.linalg.solve(np.eye(size), np.array([*x]))]
+        return np.array([one - flow for one, flow in zip(x, outflow, strict=True)])
+
+    model = StateSpaceModel(
+        transition=emptied,
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[0.01] * size,
+        measurement_noise_cov=[0.1],
+        prior_mean=[0.0, 4.0] * (size // 2),
+        prior_cov=[0.1] * size,
+        inputs=0,
+        analytic=True,
+    )
+    slopes = np.array(model.transition_jacobian(as_value(model.prior_mean), (), ()))
+    np.testing.assert_allclose(slopes, np.diag([0.0, 0.975] * (size // 2)), atol=1e-15)
 
 
 def test_a_jacobian_by_complex_steps_follows_its_function_and_a_given_one_stays():

@@ -19,6 +19,7 @@ RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation 
 MOST_SCALES = 1e9  # from zero: steps are at most 0.6 % of a scale
 LEAST_STEP = 2.0**-42  # relative to the number itself, which has 52 bits
 COMPLEX_STEP = 1e-100  # no subtraction, hence no cancellation: it may be this small
+STEEPEST = 1e30  # slope by a complex step: that of a root at zero is 1e50, for it has none
 
 _EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
 
@@ -84,9 +85,16 @@ def _stores(rows: int, entry: Callable) -> list[str]:
     return [f"out[{i}, j] = {entry(i)}" for i in range(rows)]
 
 
+@inlined
+def slope_by_complex_step(y):
+    """Im y / h, or 0 where it is that of a root at zero: the slope of a traced root there (`algebra.slopes`)."""
+    slope = (0j + y).imag / COMPLEX_STEP
+    return 0.0 if abs(slope) > STEEPEST else slope
+
+
 @makes_functions
 def complex_step(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
-    """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, exact to rounding.
+    """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, exact to rounding, 0 for a root at 0.
 
     Args:
         function: an analytic function of a tuple of `columns` components and the arguments, made of arithmetic and
@@ -104,8 +112,9 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
     for j in range(columns):
         point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
         lines.append(f"y{j} = function({point}, {arguments})")
-    source = matrix_of(rows, columns, lambda i, j: f"(0j + y{j}[{i}]).imag / {COMPLEX_STEP}")
-    made = written_out("jacobian", f"x, {arguments}", *lines, source, function=inlined(function))
+    source = matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])")
+    names = {"function": inlined(function), "slope": slope_by_complex_step}
+    made = written_out("jacobian", f"x, {arguments}", *lines, source, **names)
     _EXACT.add(made)
     return made
 
@@ -116,16 +125,15 @@ def _complex_step_in_loops(function: Callable, rows: int, columns: int, argument
     else:
         step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
         point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
-    stores = _stores(rows, lambda i: f"(0j + y[{i}]).imag / {COMPLEX_STEP}")
+    stores = _stores(rows, lambda i: f"slope(y[{i}])")
     body = *point, f"y = function(point, {arguments})", *stores
     lines = (
         f"out = np.empty(({rows}, {columns}))",
         f"for j in range({columns}):",
         *(f"    {line}" for line in body),
     )
-    made = written_out(
-        "jacobian", f"x, {arguments}", *lines, "out", _loops=True, function=inlined(function), np=np
-    )
+    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step, "np": np}
+    made = written_out("jacobian", f"x, {arguments}", *lines, "out", _loops=True, **names)
     _EXACT.add(made)
     return made
 
