@@ -250,7 +250,8 @@ def test_slopes_along_constants_of_called_functions_far_from_zero():
         model = body(offset, unit, called, transition=dragged, observe=lambda x, c: (x[0],), constants=(0.2, 1.0))
         inputs, z = data()
         by_noise = [np.zeros((2, *shape)) for shape in ((2, 2), (1, 1), (2,), (2, 2))]
-        return sensitivity(model, inputs, offset + z * unit, ModelSlopes(np.eye(2), *by_noise)).gradients.sum(axis=0)
+        slopes = ModelSlopes(np.eye(2), *by_noise)
+        return sensitivity(model, inputs, offset + z * unit, slopes).gradients.sum(axis=0)
 
     expected = gradient(0.0, 1.0, called=False)
     for offset, unit, called in ((5e6, 1.0, False), (0.0, 1.0, True), (5e6, 1.0, True), (-5.0, 1e-6, True)):
