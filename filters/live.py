@@ -11,6 +11,7 @@ import numpy as np
 from filters.engine.belief import Belief
 from filters.engine.session import Session
 from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
+from filters.restarts import FirstRestart, Restarts
 from thruster_env.numerics.checks import as_floats, finite, one_of, positive, short_repr
 from thruster_env.plants.stamps import closeness, count_steps, resolution_of
 
@@ -85,7 +86,8 @@ class Live:
         self._resolution = positive("resolution", resolution, zero_allowed=True)
         self._noise, self._skips = noise, skip_missing
         self._has_one_q = "Q" in filter_.fixed_noise  # which is that of a step as long as the model's
-        self._watch = watch_of(monitor_of(monitor), filter_)
+        self._watch, self._first = watch_of(monitor_of(monitor), filter_), FirstRestart(filter_)
+        self._filter = filter_
         model = filter_.model
         self._channels = {one.symbol: i for i, one in enumerate(model.measurements)}
         self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
@@ -93,6 +95,7 @@ class Live:
         self._raised: list[tuple[Alarm, ...]] = []  # by the monitor at each event
         self._held = np.zeros(0)  # the input that acts
         self._length = self._step  # of the last step
+        self._last: np.ndarray | None = None  # the input of a prediction that no update has followed
         self.time = math.nan
         self.health: Health | None = None
 
@@ -121,6 +124,11 @@ class Live:
         """Restarts from the prior, so far."""
         return self._session.divergences
 
+    @property
+    def restarts(self) -> Restarts | None:
+        """The same with the first one's update, states and likely cause; None if there was none."""
+        return self._first.restarts(self.divergences)
+
     def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Copies of mean, covariance and the last innovation with its covariance, and its log-likelihood."""
         return self._session.told()
@@ -131,6 +139,8 @@ class Live:
         given = self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
         self._set_length(self._step)
         self._session.start(key, given)
+        self._first, self._last = FirstRestart(self._filter), None
+        self._first.note(self._session, None, given)
         self._events, self._raised, self.time, self._held = [], [], time, np.zeros(0)
         if self._watch is not None:
             self._watch.restart()
@@ -224,7 +234,9 @@ class Live:
         elif not (self._has_one_q and abs(length - self._step) <= closeness(self._step, exact)):
             session.scale_process_noise(length / self._step)
         for _ in range(count):
+            self._first.hold(session)
             session.run("predict", u=u)
+        self._last = u
         self.time, self._held = time, u
 
     def _set_length(self, length: float) -> None:
@@ -235,6 +247,8 @@ class Live:
         """Update with z (m,); return the alarms of the monitor."""
         self._remember(self.time, z)
         self._session.run("update", z=z)
+        self._first.note(self._session, self._last, z)
+        self._last = None
         if self._watch is None:
             return ()
         self.health = self._watch.step(self.innovation, self.innovation_cov, z)

@@ -12,12 +12,16 @@ from filters.engine import batch
 from filters.engine.batch import Estimates, trajectories
 from filters.engine.session import Session
 from filters.filter import Filter
+from filters.gaussian.multiple_models import MultipleModelFilter
 from thruster_env.numerics.checks import as_floats
 from thruster_env.numerics.sources import as_value
+from thruster_env.plants.layout import number_places
 from thruster_env.plants.shape import observation_slopes, transition_slopes
 from thruster_env.plants.state_space import StateSpaceModel
 
 Found = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
+Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
+UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
 
 
 class RestartWarning(RuntimeWarning):
@@ -112,43 +116,138 @@ class FirstRestart:
 
     def __init__(self, filter_: Filter):
         """Begin before the first measurement."""
-        self._model, self._step = filter_.model, 0
-        self._before: tuple[np.ndarray, np.ndarray] | None = None
+        self._filter, self._step = filter_, 0
+        self._before: list[Moments] | None = None
         self.found: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
         self._is_open = True
 
+    def hold(self, session: Any) -> None:
+        """Keep the belief before a prediction that is not part of a step; `note` comes after the update."""
+        if self._is_open:
+            self._before = _moments(self._filter, session)
+
     def note(self, session: Any, u, z) -> None:
-        """Look at a session after a step with input u (p,), None at first or unknown, and measurement z (m,)."""
+        """Look at a session after a step with input u (p,), None without a prediction, and measurement z (m,)."""
         if session.divergences and self._is_open:
             self._is_open = False
-            if u is None and self._before is not None:
-                states, cause = np.zeros(self._model.n, dtype=bool), "of its inputs some are measured"
-            else:
-                states, cause = likely_cause(self._model, self._before, u, as_floats(z))
-            symbols = (one.symbol for one, lost in zip(self._model.states, states, strict=True) if lost)
-            self.found = self._step, tuple(symbols), cause
+            numbers = getattr(session, "numbers", None)
+            self.found = self._step, *_states_and_cause(self._filter, numbers, self._before, u, as_floats(z))
         if self._is_open:
-            self._before, self._step = (session.mean.copy(), session.cov.copy()), self._step + 1
+            self.hold(session)
+            self._step += 1
 
     def restarts(self, count: int) -> Restarts | None:
         """So many restarts of one run; None if there were none."""
         return Restarts(count, 1, 1, 0, *self.found) if count else None
 
 
-def likely_cause(model: StateSpaceModel, before: tuple[np.ndarray, np.ndarray] | None, u, z) -> Found:
+class FirstRestarts:
+    """The same of N copies of a filter at once."""
+
+    def __init__(self, filter_: Filter, count: int):
+        """Begin before the first measurements."""
+        n = filter_.kernel_model.n
+        self._filter, self._counts, self._steps = filter_, np.zeros(count), np.zeros(count, dtype=int)
+        self._means, self._covs = np.zeros((count, n)), np.zeros((count, n, n))
+        self._found: list[tuple[int, tuple[str, ...], str] | None] = [None] * count
+
+    def start(self, which: np.ndarray) -> None:
+        """Begin anew in some copies, by their indices."""
+        self._counts[which], self._steps[which] = 0.0, 0
+        for i in which:
+            self._found[i] = None
+
+    def note(self, which: np.ndarray, counts: np.ndarray, moments: Moments, u, z) -> np.ndarray | None:
+        """What there is to say of copies that restarted in this step, (N,) of sentences and None; None of none.
+
+        Args:
+            which: copies that made a step, or were started, (N,) bool.
+            counts: of restarts since then, (N,).
+            moments: means (N, n) and covariances (N, n, n) after it, which are kept.
+            u: inputs (N, p).
+            z: measurements (N, m).
+        """
+        lost = np.flatnonzero(which & (counts > self._counts)).tolist()
+        told = np.full(len(counts), None, dtype=object) if lost else None
+        for i in lost:
+            step = int(self._steps[i])
+            before = [(self._means[i], self._covs[i])] if step else None
+            first = self._found[i] or (step, *_states_and_cause(self._filter, None, before, u[i], z[i]))
+            self._found[i] = first
+            told[i] = Restarts(int(counts[i]), 1, 1, 0, *first).sentence
+        self._steps[which] += 1
+        self._counts = np.where(which, counts, self._counts)
+        everywhere, (means, covs) = which.all(), moments
+        self._means = means if everywhere else np.where(which[:, None], means, self._means)
+        self._covs = covs if everywhere else np.where(which[:, None, None], covs, self._covs)
+        return told
+
+
+def _moments(filter_: Filter, session: Any) -> list[Moments]:
+    """Means and covariances of a session's belief, of all modes where it has some."""
+    if isinstance(filter_, MultipleModelFilter) and hasattr(session, "belief"):
+        means, covs, _ = filter_.mode_moments(session.belief())
+        return list(zip(means, covs, strict=True))
+    return [(session.mean.copy(), session.cov.copy())]
+
+
+def _states_and_cause(
+    filter_: Filter, numbers: np.ndarray | None, before: list[Moments] | None, u, z
+) -> tuple[tuple[str, ...], str]:
+    """Symbols of the states that were lost in a step, and why: of the first mode that has a reason, if there are.
+
+    Args:
+        filter_: the filter.
+        numbers: that it read, if they are known.
+        before: moments before the step, of each mode or of all together; None for the first measurement.
+        u: input (p,); None without a prediction.
+        z: measurement (m,).
+    """
+    has_modes = isinstance(filter_, MultipleModelFilter)
+    if has_modes:
+        models = [one.kernel_model for one in filter_.mode_filters]
+    else:
+        models = [_as_set(filter_.kernel_model, numbers)]
+    begun = before if before is None or len(before) == len(models) else before * len(models)
+    for j, model in enumerate(models):
+        states, cause = likely_cause(model, None if begun is None else begun[j], u, z)
+        if cause != UNKNOWN:
+            break
+    symbols = (one.symbol for one, lost in zip(filter_.model.states, states, strict=True) if lost)
+    return tuple(symbols), f"{cause} in modes[{j}]" if has_modes and cause != UNKNOWN else cause
+
+
+def _as_set(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:
+    """The model with the Q, R and constants that a session was set to."""
+    if numbers is None or np.array_equal(numbers[: len(model.numbers)], model.numbers):
+        return model
+    at, n, m, form = number_places(model.n, model.m), model.n, model.m, type(model.constants)
+    constants = numbers[at.constants : at.constants + model.shape.constants].tolist()
+    changes: dict[str, Any] = {
+        "process_noise_cov": numbers[at.q : at.q + n * n].reshape(n, n),
+        "measurement_noise_cov": numbers[at.r : at.r + m * m].reshape(m, m),
+        "constants": form._make(constants) if hasattr(form, "_make") else tuple(constants),
+    }
+    try:
+        return model.replace(**changes)
+    except (ValueError, TypeError):  # constants of another form
+        return model
+
+
+def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Found:
     """Which states were lost in a step, (n,) bool, and why, by the equations of an extended Kalman filter.
 
     Args:
         model: the filter's.
         before: mean (n,) and covariance (n, n) before the step; None for the first measurement of the prior.
-        u: input (p,) of the step.
+        u: input (p,) of the step; None without a prediction.
         z: measurement (m,) at its end.
     """
     x, p = (model.prior_mean, model.prior_cov) if before is None else before
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = None
-        if before is not None:
+        if before is not None and u is not None:
             x, p, found = _predicted(model, x, p, u)
         return found or _updated(model, x, p, z)
 
@@ -184,10 +283,7 @@ def _updated(model: StateSpaceModel, x, p, z) -> Found:
         return everything, "the innovation's covariance S is not positive definite, by rounding or overflow"
     half = np.linalg.solve(root, h @ p)
     flaw = _flaw_of(p - half.T @ half, "update")
-    return flaw or (
-        ~everything,
-        "numbers of the filter itself overflow, or a variance became negative by rounding",
-    )
+    return flaw or (~everything, UNKNOWN)
 
 
 def _flaw_of(p: np.ndarray, when: str) -> Found | None:

@@ -10,7 +10,7 @@ from filters.engine.batch import Estimates, estimates_of
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
-from filters.restarts import FirstRestart
+from filters.restarts import Restarts
 from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
@@ -21,16 +21,14 @@ def by_the_clock(
     key: np.ndarray,
     log: Log,
     noise: Callable[[float], np.ndarray] | None,
-    first: FirstRestart | None = None,
-) -> Estimates:
-    """What `filters.run` gives of one trajectory, of a log on its own stamps.
+) -> tuple[Estimates, Restarts | None]:
+    """What `filters.run` gives of one trajectory, of a log on its own stamps, and its restarts.
 
     Args:
         filter_: of a model whose sample time is one of its constants.
         key: random key (2,).
         log: on its own stamps.
         noise: Q by the length of a step [s]; None for one in proportion to it.
-        first: what notes the first restart, if that is asked for.
 
     Raises:
         ValueError: for a model of one sample time, or another package's estimator.
@@ -40,14 +38,12 @@ def by_the_clock(
     live = Live(filter_, noise=noise, resolution=log.resolution)
     times, z = log.times.tolist(), log.measurements
     live.start(0.0, z[0], key)
-    rows, first = [live.told()], first or FirstRestart(filter_)
-    first.note(live, None, z[0])
+    rows = [live.told()]
     for k, u in enumerate(log.inputs, 1):
         live.predict_to(times[k], u)
         live.update(times[k], None, z[k])
         rows.append(live.told())
-        first.note(live, u, z[k])
-    return estimates_of(rows, live.divergences)
+    return estimates_of(rows, live.divergences), live.restarts
 
 
 def noise_by_rates(

@@ -135,15 +135,14 @@ def estimate_with(
     """
     smoother = smoother or lag is not None
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
-    first = FirstRestart(filter_)
     if log.stamps is not None:
         if smoother:
             raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")
-        found = by_the_clock(filter_, data[0][0], log, noise, first)
+        found, restarts = by_the_clock(filter_, data[0][0], log, noise)
     elif isinstance(filter_, ForeignFilter):
-        found = run(filter_, *data)
+        found, restarts = run(filter_, *data), None
     else:
-        found = _stepped(filter_, *data, first)
+        found, restarts = _stepped(filter_, *data)
     means, covs = smooth(filter_, *data, lag) if smoother else (found.means, found.covs)
     likelihoods = found.log_likelihoods[0]
     return LogEstimate(
@@ -157,15 +156,15 @@ def estimate_with(
         int(found.divergences[0]),
         smoother,
         noise,
-        first.restarts(int(found.divergences[0])),
+        restarts,
     )
 
 
 def _stepped(
-    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, first: FirstRestart
-) -> Estimates:
-    """What `run` gives of one trajectory, by the steps of a wrapper: the same to the last bit."""
-    session, z = Session(filter_), measurements[0]
+    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray
+) -> tuple[Estimates, Restarts | None]:
+    """What `run` gives of one trajectory, by the steps of a wrapper, to the last bit, and its restarts."""
+    session, z, first = Session(filter_), measurements[0], FirstRestart(filter_)
     session.start(keys[0], z[0])
     rows = []
     for k in range(len(z)):
@@ -173,4 +172,4 @@ def _stepped(
             session.step(inputs[0, k - 1].tolist(), z[k])
         rows.append(session.told())
         first.note(session, inputs[0, k - 1] if k else None, z[k])
-    return estimates_of(rows, session.divergences)
+    return estimates_of(rows, session.divergences), first.restarts(session.divergences)

@@ -26,7 +26,12 @@ class WithMeasuredInputs:
     """A session, or the beliefs of all copies, that takes all measurements and uses some of them as inputs.
 
     If such a measurement is missing, the last one is used, and zero before the first.
+
+    Attributes:
+        used: the inputs of the last step, the action and what was measured.
     """
+
+    used: np.ndarray | None = None
 
     def __init__(self, runs, split: Split):
         """Take what runs the filter, a session or beliefs; `start` comes next."""
@@ -53,6 +58,7 @@ class WithMeasuredInputs:
         """Predict with the action and the inputs measured at the step's beginning, and update."""
         last = self._last
         assert last is not None  # `start` comes first
-        self._runs.step(np.concatenate([u, last], axis=-1), z[..., self._measurements], **idle)
+        self.used = np.concatenate([u, last], axis=-1)
+        self._runs.step(self.used, z[..., self._measurements], **idle)
         now = z[..., self._inputs]
         self._last = np.where(np.isnan(now), last, now)

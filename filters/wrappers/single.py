@@ -163,8 +163,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if z is None or "measurement_valid" in info or type(z) is MaskedArray:
             z = _measurement(observation, info)
         self._session.step(u, z)
-        known = None if self._split else u
-        self._first.note(self._session, known, z)
+        if self._split:
+            self._first.note(self._session, self._session.used, as_floats(z)[self._measurements])
+        else:
+            self._first.note(self._session, u, z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
 
     def _clipped(self, action) -> Sequence[float]:

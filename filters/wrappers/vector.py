@@ -17,6 +17,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.restarts import FirstRestarts
 from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
@@ -36,7 +37,8 @@ class EstimateStates(gym.vector.VectorWrapper):
 
     The info dictionary gains, with one row for each copy, `estimate` (N, n), `estimate_cov` (N, n, n),
     `innovation` (N, m), `innovation_cov` (N, m, m) and `estimate_divergences` (N,); with a monitor `health`, an
-    array of N objects; with a smoothing lag `smoothed` (N, n) and `smoothed_cov` (N, n, n).
+    array of N objects; with a smoothing lag `smoothed` (N, n) and `smoothed_cov` (N, n, n). In a step in which
+    copies restart from the prior, and in no other, `estimate_restarts` has a sentence for each of these.
 
     Args:
         env: any vector env with Box actions and observations.
@@ -82,6 +84,7 @@ class EstimateStates(gym.vector.VectorWrapper):
             beliefs = WithSmoother(beliefs, self.filter, smoothing_lag, self.num_envs)
         self._lagged = smoothing_lag is not None
         self._beliefs = WithMeasuredInputs(beliefs, split) if inputs else beliefs
+        self._restarts, self._used = FirstRestarts(self.filter, self.num_envs), np.zeros((self.num_envs, 0))
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
         watches = monitor_of(monitor)
@@ -122,15 +125,20 @@ class EstimateStates(gym.vector.VectorWrapper):
             self._end(u, z, done, info)
             self._start(done, z)
         elif self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
-            self._beliefs.step(u, z, idle=self._done)
+            self._advance(u, z, idle=self._done)
             self._start(self._done, z)
         else:
-            self._beliefs.step(u, z)
+            self._advance(u, z)
         self._done = done
         return self._observe(observations, z, info), rewards, terminated, truncated, info
 
+    def _advance(self, u: np.ndarray, z: np.ndarray, **idle: np.ndarray) -> None:
+        self._beliefs.step(u, z, **idle)
+        self._used = getattr(self._beliefs, "used", u)
+
     def _start(self, mask: np.ndarray, z: np.ndarray) -> None:
         which = np.flatnonzero(mask)
+        self._restarts.start(which)
         self._held[which] = 0.0
         for i in which if self._watches else ():
             self._watches[i].restart()
@@ -146,7 +154,7 @@ class EstimateStates(gym.vector.VectorWrapper):
             observations[i] = final[i]
         final_info = info.setdefault("final_info", {})
         last = np.where(done[:, None], self._measurements(observations, final_info), z)
-        self._beliefs.step(u, last)
+        self._advance(u, last)
         seen = self._observe(observations, last, final_info, done)
         info["final_obs"] = final.copy()
         for i in np.flatnonzero(done):
@@ -181,6 +189,11 @@ class EstimateStates(gym.vector.VectorWrapper):
             added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there)
         info |= added
         info |= {f"_{key}": there for key in added}
+        counts, given = added["estimate_divergences"], z[:, self._measured]
+        restarts = self._restarts.note(there, counts, (mean, cov), self._used, given)
+        if restarts is not None:
+            said = np.array([one is not None for one in restarts])
+            info |= {"estimate_restarts": restarts, "_estimate_restarts": said}
         parts = [mean]
         if self._form == "belief":
             parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))

@@ -129,7 +129,7 @@ def test_alarms_and_isolation_work_on_own_stamps():
             lambda data: estimate(data, "ekf", thruster_model, grid=False, smoother=True),
             "a smoother must run on",
         ),
-        (lambda data: estimate(data, "kf", thruster_model, grid=False), "needs a model with a constant dt"),
+        (lambda data: estimate(data, "kf", thruster_model, grid=False), "'kf' has the A and B of one dt"),
         (
             lambda data: estimate(data, "ekf", logged_model(lag={"thrust": 0.02}), grid=False),
             "a model whose other constants do not follow from dt",

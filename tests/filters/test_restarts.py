@@ -3,7 +3,9 @@
 import math
 import pickle
 import warnings
+from typing import NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -12,10 +14,18 @@ from filters import EstimateState, RestartWarning, StateSpaceModel, make_filter,
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings
 from filters.logs.verdict import verdict
+from filters.wrappers.vector import EstimateStates
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.model_env import ModelEnv
+from thruster_env.plants.split import Split
 from tuning.evaluation.evaluate import evaluate, restart_sentences
 from tuning.problems.data import Data
+
+
+class Clock(NamedTuple):
+    """The constants of a model of any step length."""
+
+    dt: float
 
 
 def model(**changes):
@@ -135,3 +145,119 @@ def test_logs_wrappers_and_evaluations_tell_the_same():
     assert restart_sentences({"ekf": evaluation, "other": evaluation._replace(restarts=None)}) == [
         f"ekf: {evaluation.restarts.sentence}"
     ]
+
+
+def one_env(filter_):
+    """An env whose input drives the second state, with the filter beside it."""
+    return EstimateState(ModelEnv(model(), model, low=-9.0, high=9.0, dt=1.0), filter_)
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+@pytest.mark.parametrize("cause", FAILING)
+@pytest.mark.usefixtures("as_python")
+def test_copies_of_a_vector_env_tell_what_single_ones_do_at_the_steps_where_it_happens(cause, mode):
+    filter_, (inputs, _) = make_filter("ekf", model(**FAILING[cause][1])), data(3, lost=1)
+    envs = gym.vector.SyncVectorEnv(
+        [lambda: ModelEnv(model(), model, low=-9.0, high=9.0, dt=1.0) for _ in range(3)],
+        autoreset_mode=gym.vector.AutoresetMode[mode],
+    )
+    copies, singles = EstimateStates(envs, filter_), [one_env(filter_) for _ in range(3)]
+    _, info = copies.reset(seed=5)
+    assert "estimate_restarts" not in info
+    counts = np.zeros(3)
+    for i, one in enumerate(singles):
+        one.reset(seed=5 + i)
+    for k in range(6):
+        *_, info = copies.step(inputs[:, k])
+        of_singles = [one.step(inputs[i, k])[-1] for i, one in enumerate(singles)]
+        new = [one["estimate_divergences"] > before for one, before in zip(of_singles, counts, strict=True)]
+        counts = np.array([one["estimate_divergences"] for one in of_singles])
+        assert ("estimate_restarts" in info) == any(new)
+        if any(new):
+            np.testing.assert_array_equal(info["_estimate_restarts"], new)
+            expected = [one.get("estimate_restarts") if new[i] else None for i, one in enumerate(of_singles)]
+            assert info["estimate_restarts"].tolist() == expected and cause in expected[1]
+    assert counts[1] and not counts[[0, 2]].any()
+    _, info = copies.reset(seed=5)
+    assert "estimate_restarts" not in info
+
+
+@pytest.mark.parametrize("cause", FAILING)
+@pytest.mark.usefixtures("as_python")
+def test_real_clocks_tell_the_same_and_logs_by_them(cause):
+    states, changes = FAILING[cause]
+    clocked = model(**changes, constants=Clock(1.0), states=model().states)
+    filter_, (inputs, z) = make_filter("ekf", clocked), data()
+    live = filter_.live()
+    live.start(7.0, z[0, 0])
+    for k, u in enumerate(inputs[0], 1):
+        assert k > 3 or live.restarts is None
+        live.predict_to(7.0 + k, u)
+        live.update(7.0 + k, None, z[0, k])
+    step = 3 if cause.startswith(("h", "H")) else 4
+    assert live.restarts.times == live.divergences >= 1
+    assert live.restarts[4:] == (step, states, cause)
+    live.start(0.0, z[0, 0])
+    assert live.restarts is None
+    log = Log("log", 1.0, inputs[0], z[0], clocked.input_quantities, clocked.measurements, stamps=np.arange(7.0))
+    assert estimate_with(filter_, log).restarts[4:] == (step, states, cause)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_noise_and_dt_that_a_session_was_set_to_are_those_of_the_cause():
+    def transition(x, u, c):
+        return 0.9 * x[0], x[1] + u[0] + (math.inf if c.dt > 1.5 else 0.0)
+
+    live = make_filter("ekf", model(transition=transition, constants=Clock(2.0))).live()
+    live.start(0.0)
+    live.predict_to(1.0, [0.0])
+    live.update(1.0, None, [0.0])
+    assert live.restarts is None
+    live.predict_to(3.0, [0.0])
+    live.update(3.0, None, [0.0])
+    assert live.restarts[4:] == (2, ("b",), "f(x, u) is infinite, it overflows")
+
+
+@pytest.mark.usefixtures("as_python")
+def test_measured_inputs_are_known_to_the_cause():
+    def split(self, model):
+        return Split(inputs=(1,), measurements=(0,), channels=2)
+
+    class Copies(gym.vector.SyncVectorEnv):
+        """Copies of it."""
+
+        measured_inputs = split
+
+    class Measuring(ModelEnv):
+        """Two channels, of which the second is an input of the model."""
+
+        def __init__(self):
+            super().__init__(model(), model, low=-9.0, high=9.0, dt=1.0)
+            self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(2,), dtype=np.float32)
+
+        measured_inputs = split
+
+        def reset(self, **given):
+            observation, info = super().reset(**given)
+            info["measurement"] = np.array([0.0, 4.0])
+            return np.zeros(2, dtype=np.float32), info
+
+        def step(self, action):
+            *_, info = super().step(action)
+            info["measurement"] = np.array([0.0, 4.0])
+            return np.zeros(2, dtype=np.float32), 0.0, False, False, info
+
+    def transition(x, u, c):
+        return 0.9 * x[0], x[1] + u[1] if x[1] < 5.0 else math.nan
+
+    filter_ = make_filter("ekf", model(transition=transition, inputs=2))
+    single, copies = (
+        EstimateState(Measuring(), filter_),
+        EstimateStates(Copies([Measuring, Measuring]), filter_),
+    )
+    told = []
+    for env, action in ((single, [0.0]), (copies, np.zeros((2, 1)))):
+        env.reset(seed=0)
+        infos = [env.step(action)[-1] for _ in range(4)]
+        told.append(next(one["estimate_restarts"] for one in infos if "estimate_restarts" in one))
+    assert "(b): f(x, u) is NaN." in told[0] and told[1].tolist() == [told[0]] * 2

@@ -183,7 +183,7 @@ def _log(rng, of: LinearModel, kind: str, given: str) -> None:
     log = Log(
         "log", of.dt, u, z, model.input_quantities, model.measurements, start=start, stamps=stamps - stamps[0]
     )
-    found = by_the_clock(filter_, np.zeros(2), log, None)
+    found = by_the_clock(filter_, np.zeros(2), log, None)[0]
     hand, length = KalmanByHand(of), of.dt
     hand.update(z[0], of.dt, of.r)
     for k in range(steps):

@@ -98,7 +98,7 @@ def test_rows_with_step_ratios_have_the_numbers_of_live(name, make, request):
     log, u, z = rows_of(model)
     assert len(u[0]) > log.steps and u[0, :, 1].max() <= 1.0 + 1e-6
     assert u[0, :, 1].sum() * DT == pytest.approx(log.times[-1])
-    expected = by_the_clock(make_filter(name, model), filter_keys([0])[0], log, None)
+    expected = by_the_clock(make_filter(name, model), filter_keys([0])[0], log, None)[0]
     found = run(make_filter(name, in_any_steps(model, DT)), filter_keys([0]), u, z)
     ends = np.isin(np.concatenate([[0.0], np.cumsum(u[0, :, 1]) * DT]).round(9), log.times.round(9))
     assert ends.sum() == log.steps + 1
@@ -112,7 +112,7 @@ def test_rows_with_step_ratios_have_the_numbers_of_live(name, make, request):
         for slope, direction in zip(slopes[0], q_slopes, strict=True):
             ends = [model.replace(process_noise_cov=Q + sign * 1e-7 * direction) for sign in (1, -1)]
             above, below = (
-                by_the_clock(make_filter(name, one), filter_keys([0])[0], log, None).log_likelihoods.sum()
+                by_the_clock(make_filter(name, one), filter_keys([0])[0], log, None)[0].log_likelihoods.sum()
                 for one in ends
             )
             assert slope == pytest.approx((above - below) / 2e-7, rel=1e-5, abs=1e-3)
