@@ -86,7 +86,7 @@ UNTRACEABLE = {
     "table": lambda x, y: [1.0, 2.0][x],
     "dictionary": lambda x, y: {}.get(x, y),
     "int": lambda x, y: int(x) * y,
-    "float array": lambda x, y: np.array([x, y], dtype=float).sum(),
+    "array of integers": lambda x, y: np.array([x, y], dtype=int).sum(),
     "equality": lambda x, y: 1.0 if (x, y) == (1.0, 2.0) else 2.0,
     "library": lambda x, y: math.gamma(x),
     "linear algebra": lambda x, y: np.linalg.solve([[x, y], [y, x]], [1.0, 2.0])[0],

@@ -48,7 +48,14 @@ def dead_zone(x, y):
     return np.clip(x, -0.5, 0.5), (0.0 if -0.2 < y < 0.2 else y)
 
 
-FUNCTIONS = [drag, nested, in_loop, of_truth, dead_zone]
+def of_floats(x, y):
+    out = np.array([x, y], dtype=float)
+    out[:1] += np.asarray([y * y], np.float64)
+    gain = np.linalg.inv(np.array([[2.0, 0.0], [0.0, 4.0]], dtype="float64"))
+    return gain @ out + (out > 0.3).astype(float) * (float(x) if isinstance(1.0, float) else 0.0)
+
+
+FUNCTIONS = [drag, nested, in_loop, of_truth, dead_zone, of_floats]
 
 
 def graph_of(function):

@@ -370,4 +370,7 @@ def _reason(error: Exception) -> str:
     telling = [
         line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
     ]
-    return telling[0] if telling else type(error).__name__
+    reason = telling[0] if telling else type(error).__name__
+    calls = [line.removeprefix(">>>").strip() for line in lines if line.startswith(">>>")]
+    unmatched = reason.lower().startswith(("no match", "raised from"))  # where only the call itself is telling
+    return f"it has no {calls[0]}" if unmatched and calls else reason

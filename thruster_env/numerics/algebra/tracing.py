@@ -157,7 +157,6 @@ FUNCTIONS: dict[str, Callable] = {
     "less_equal": operator.le,
     "equal": operator.eq,
     "not_equal": operator.ne,
-    "float64": lambda x: +x,
 }
 """In place of functions of `math` and NumPy, by NumPy's names, where they get a Number."""
 
@@ -168,13 +167,44 @@ OF_MATH: dict[str, Callable] = {
 }
 """In place of functions of `math` that NumPy has otherwise, or has not."""
 
-ARRAYS: dict[str, Callable] = {"zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0)}
+
+class _OfFloats(type):
+    def __instancecheck__(cls, value) -> bool:
+        return isinstance(value, float | Number)
+
+
+class _Float(metaclass=_OfFloats):
+    """In place of `float`: a Number stays one, and `values.astype(float)` an array of Numbers."""
+
+    def __new__(cls, value=0.0):
+        return +value if isinstance(value, Number) else float(value)
+
+
+def _array_of(make: Callable) -> Callable:
+    """In place of NumPy's array and asarray: one of floats holds Numbers, if it gets such."""
+
+    def function(value, dtype=None, **named):
+        if dtype is _Float or dtype is not None and np.dtype(dtype) == np.float64:
+            dtype = object if _has_numbers(value) else np.float64
+        return make(value, dtype=dtype, **named)
+
+    return function
+
+
+ARRAYS: dict[str, Callable] = {
+    "array": _array_of(np.array),
+    "asarray": _array_of(np.asarray),
+    "zeros": _filled(0.0),
+    "empty": _filled(0.0),
+    "ones": _filled(1.0),
+    "float64": _Float,
+}
 """In place of functions of NumPy, whatever they get."""
 
 BUILTINS = {
     "max": _largest,
     "min": _smallest,
-    "float": lambda x: +x if isinstance(x, Number) else float(x),
+    "float": _Float,
     "bool": _condition,
     "pow": pow,
 }
@@ -193,7 +223,8 @@ def _in_place_of(module: types.ModuleType, name: str):
         if module is math or not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
             return ours(*arguments, **named)
         of_arrays = np.frompyfunc(lambda *entries: ours(*entries, **named), len(arguments), 1)
-        return of_arrays(*(np.asarray(one, dtype=object) for one in arguments))
+        with np.errstate(all="ignore"):  # of NaN among constants
+            return of_arrays(*(np.asarray(one, dtype=object) for one in arguments))
 
     return function
 
