@@ -66,10 +66,15 @@ class Restarts(NamedTuple):
 def run(filter_: Filter, keys=None, inputs=None, measurements=None, **noise) -> Estimates:
     """`filters.engine.batch.run`, with a `RestartWarning` if the filter restarted."""
     found = batch.run(filter_, keys, inputs, measurements, **noise)
-    told = restarts_of(filter_, found.divergences, keys, inputs, measurements, **noise)
-    if told is not None:
-        warnings.warn(told.sentence, RestartWarning, stacklevel=2)
+    warn_of_restarts(filter_, found.divergences, keys, inputs, measurements, **noise)
     return found
+
+
+def warn_of_restarts(filter_: Filter, divergences: np.ndarray, keys, inputs, measurements, **noise) -> None:
+    """Warn, for the function that called the caller, with what `restarts_of` says, if it says anything."""
+    told = restarts_of(filter_, divergences, keys, inputs, measurements, **noise)
+    if told is not None:
+        warnings.warn(told.sentence, RestartWarning, stacklevel=3)
 
 
 def restarts_of(
@@ -168,7 +173,7 @@ class FirstRestarts:
             z: measurements (N, m).
         """
         lost = np.flatnonzero(which & (counts > self._counts)).tolist()
-        told = np.full(len(counts), None, dtype=object) if lost else None
+        told = np.full(len(counts), None, dtype=object)
         for i in lost:
             step = int(self._steps[i])
             before = [(self._means[i], self._covs[i])] if step else None
@@ -180,7 +185,7 @@ class FirstRestarts:
         everywhere, (means, covs) = which.all(), moments
         self._means = means if everywhere else np.where(which[:, None], means, self._means)
         self._covs = covs if everywhere else np.where(which[:, None, None], covs, self._covs)
-        return told
+        return told if lost else None
 
 
 def _moments(filter_: Filter, session: Any) -> list[Moments]:
@@ -203,18 +208,15 @@ def _states_and_cause(
         u: input (p,); None without a prediction.
         z: measurement (m,).
     """
-    has_modes = isinstance(filter_, MultipleModelFilter)
-    if has_modes:
-        models = [one.kernel_model for one in filter_.mode_filters]
-    else:
-        models = [_as_set(filter_.kernel_model, numbers)]
+    modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
+    models = [one.kernel_model for one in modes] or [_as_set(filter_.kernel_model, numbers)]
     begun = before if before is None or len(before) == len(models) else before * len(models)
     for j, model in enumerate(models):
         states, cause = likely_cause(model, None if begun is None else begun[j], u, z)
         if cause != UNKNOWN:
             break
     symbols = (one.symbol for one, lost in zip(filter_.model.states, states, strict=True) if lost)
-    return tuple(symbols), f"{cause} in modes[{j}]" if has_modes and cause != UNKNOWN else cause
+    return tuple(symbols), f"{cause} in modes[{j}]" if modes and cause != UNKNOWN else cause
 
 
 def _as_set(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:

@@ -93,7 +93,11 @@ def mode_kernels(
     def update(memory, z, numbers, size):
         row, _, _ = memory
         recall(row)
+        for j in range(count):
+            row[lost] -= row[first + j * stride + lost]
         update_all(memory, z, numbers)
+        for j in range(count):
+            row[lost] += row[first + j * stride + lost]  # a mode that begins anew counts
         of_innovations(row, probabilities, innovation)
         row[level] = 0.0
         if anything_measured(z):

@@ -15,7 +15,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.logs.clock import by_the_clock, noise_by_rates
 from filters.restarts import FirstRestart, Restarts
-from filters.smoothers.smooth import smooth
+from filters.smoothers.smooth import smoothed
 from filters.wrappers.arguments import filter_for
 from thruster_env.numerics.checks import at_least
 from thruster_env.numerics.streams import filter_keys
@@ -143,7 +143,7 @@ def estimate_with(
         found, restarts = run(filter_, *data), None
     else:
         found, restarts = _stepped(filter_, *data)
-    means, covs = smooth(filter_, *data, lag) if smoother else (found.means, found.covs)
+    means, covs = smoothed(filter_, *data, lag)[0] if smoother else (found.means, found.covs)
     likelihoods = found.log_likelihoods[0]
     return LogEstimate(
         log,

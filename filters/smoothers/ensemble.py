@@ -30,8 +30,8 @@ def smooth_ensembles(
     measurements: np.ndarray,
     lag: int,
     noise: tuple[np.ndarray, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Means (B, K + 1, n) and covariances of an ensemble filter's members given `lag` later measurements.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means (B, K + 1, n) and covariances of an ensemble given `lag` later measurements, and restarts (B,).
 
     The analysis of measurement k is repeated for each pair (x_k, x_l) of the members now and at an earlier step l
     >= k - lag, for a state of twice the size whose first half is measured. The members of step l so get the
@@ -54,7 +54,7 @@ def smooth_ensembles(
     analyse_pair = analysis_of(filter_.plain_page, paired.model.functions, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
-    means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))
+    out = np.empty((count, times, n)), np.empty((count, times, n, n)), np.zeros(count)
     smooth = _smoother(kernels, analyse_pair, is_interpreting())
 
     def part(first: int, last: int) -> None:
@@ -62,10 +62,10 @@ def smooth_ensembles(
         history = np.zeros((times * n, now[1].shape[1]))
         numbers = filter_.numbers, paired.numbers
         data = keys, inputs, measurements, *noise
-        smooth(now, pair, history, size, data, numbers, lag, means, covs, first, last)
+        smooth(now, pair, history, size, data, numbers, lag, out, first, last)
 
     spread(part, count)
-    return means, covs
+    return out
 
 
 def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
@@ -111,9 +111,10 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
             for j in range(target.shape[1]):
                 target[at + i, j] = source[first + i, j]
 
-    def smooth(now, pair, history, size, data, numbers, lag, means, covs, first, last):
+    def smooth(now, pair, history, size, data, numbers, lag, out, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         keys, inputs, measurements, qs, rs = data
+        means, covs, restarts = out
         row, table, _ = now
         pair_row, pair_table, _ = pair
         own_parameters, pair_numbers = numbers
@@ -144,6 +145,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                 restart(now, own_parameters, size)
                 copy(history, k * n, table, 0)
                 if row[divergences] > 0.0:
+                    restarts[b] += 1.0
                     oldest, row[divergences] = k, 0.0
                 pair_row[pair_step] = row[step]
                 for past in range(max(oldest, k - lag), k):

@@ -84,11 +84,15 @@ def merged(weights, means, covs, angles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray, ...]:
-    """Means (B, K + 1, M, n), covariances, log probabilities of the modes, and which steps are restarts."""
+    """Means (B, K + 1, M, n), covariances, log probabilities of the modes, restarts of all, and their number.
+
+    A step in which all modes begin anew is such a restart, (B, K + 1) bool; the number (B,) is that of the filter,
+    which counts a mode that begins anew alone, too.
+    """
     (count, times, _), n, modes = z.shape, filter_.model.n, len(filter_.mode_filters)
     means, covs = np.empty((count, times, modes, n)), np.empty((count, times, modes, n, n))
     logs, divergences = np.empty((count, times, modes)), np.zeros((count, times))
-    session = Session(filter_)
+    session, prior = Session(filter_), filter_.mode_moments(filter_.init())
     for b in range(count):
         for k in range(times):
             if k:
@@ -97,4 +101,6 @@ def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray,
                 session.start(keys[b], z[b, 0])
             means[b, k], covs[b, k], logs[b, k] = filter_.mode_moments(session.belief())
             divergences[b, k] = session.divergences
-    return means, covs, logs, np.diff(divergences, axis=1, prepend=divergences[:, :1]) > 0
+    more = np.diff(divergences, axis=1, prepend=divergences[:, :1]) > 0
+    anew = (means == prior[0]).all((2, 3)) & (covs == prior[1]).all((2, 3, 4)) & (logs == prior[2]).all(2)
+    return means, covs, logs, more & anew, divergences[:, -1]

@@ -24,6 +24,7 @@ import numpy as np
 from filters.engine.batch import trajectories
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
+from filters.restarts import warn_of_restarts
 from filters.smoothers.backwards import passes
 from filters.smoothers.mode_steps import complete, filtered, merged, told, weights_of
 from filters.smoothers.relations import relation_of
@@ -60,11 +61,23 @@ def smooth_modes(
     Raises:
         ValueError: as `filters.smooth`.
     """
+    found, divergences = smoothed_modes(filter_, keys, inputs, measurements)
+    warn_of_restarts(filter_, divergences, keys, inputs, measurements)
+    return found
+
+
+def smoothed_modes(
+    filter_: MultipleModelFilter,
+    keys: np.ndarray | None,
+    inputs: np.ndarray | None,
+    measurements: np.ndarray | None,
+) -> tuple[SmoothedModes, np.ndarray]:
+    """What `smooth_modes` gives, and the filter's restarts on the way forwards, (B,), without a warning."""
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     relations = [relation_of(one, "a mode of a smoother") for one in filter_.mode_filters]
     kinds = [one for one in filter_.mode_filters if isinstance(one, PageFilter)]
     steps = [passes(one, relation) for one, relation in zip(kinds, relations, strict=True)]
-    means, covs, logs, restarted = filtered(filter_, keys, inputs, measurements)
+    means, covs, logs, restarted, divergences = filtered(filter_, keys, inputs, measurements)
     mu, angles = np.exp(logs), filter_.model.shape.state_angles
     with np.errstate(divide="ignore"):
         log_transition = np.log(filter_.transition_matrix)
@@ -94,4 +107,4 @@ def smooth_modes(
         complete(filter_, now, x, p)
         found.probabilities[:, k] = now
         found.means[:, k], found.covs[:, k] = merged(now, x, p, angles)
-    return found
+    return found, divergences

@@ -13,9 +13,10 @@ from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
+from filters.restarts import warn_of_restarts
 from filters.smoothers.backwards import smooth_backwards
 from filters.smoothers.ensemble import smooth_ensembles
-from filters.smoothers.modes import smooth_modes
+from filters.smoothers.modes import smoothed_modes
 from filters.smoothers.relations import relation_of
 from thruster_env.numerics.checks import at_least
 
@@ -71,7 +72,7 @@ def smooth(
         measurement_noise_covs: R of every measurement, (K + 1, m, m), likewise.
 
     Returns:
-        `Smoothed`, which does not depend on the number of cores.
+        `Smoothed`, which does not depend on the number of cores; a `RestartWarning` if the filter restarted.
 
     Raises:
         ValueError: if shapes do not fit, an input is not finite, or there is no smoother for the filter.
@@ -80,17 +81,35 @@ def smooth(
     "Unscented Rauch-Tung-Striebel smoother"; Evensen, van Leeuwen (2000), "An ensemble Kalman smoother for
     nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
     """
+    covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
+    found, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
+    warn_of_restarts(filter_, divergences, keys, inputs, measurements, **covs)
+    return found
+
+
+def smoothed(
+    filter_: Filter,
+    keys: np.ndarray | None,
+    inputs: np.ndarray | None,
+    measurements: np.ndarray | None,
+    lag: int | None = None,
+    *,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
+) -> tuple[Smoothed, np.ndarray]:
+    """What `smooth` gives, and the filter's restarts on the way forwards, (B,), without a warning."""
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     steps = inputs.shape[1]
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
     noise = noise_rows(filter_, steps + 1, process_noise_covs, measurement_noise_covs)
     if isinstance(filter_, EnsembleFilter):
-        return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag, noise))
+        *found, divergences = smooth_ensembles(filter_, keys, inputs, measurements, lag, noise)
+        return Smoothed(*found), divergences
     if isinstance(filter_, MultipleModelFilter):
         if lag < steps:
             raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
-        found = smooth_modes(filter_, keys, inputs, measurements)
-        return Smoothed(found.means, found.covs)
+        of_modes, divergences = smoothed_modes(filter_, keys, inputs, measurements)
+        return Smoothed(of_modes.means, of_modes.covs), divergences
     bounds, by = filter_.model.bounds, filter_.model.bounded_by
     if bounds:
         filter_ = dataclasses.replace(filter_, model=filter_.model.replace(bounds=()))
@@ -99,4 +118,4 @@ def smooth(
     covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
     estimates = run(filter_, keys, inputs, measurements, **covs)
     free = smooth_backwards(filter_, relation, estimates, inputs, lag, noise[0])
-    return Smoothed(*(constrained(*free, bounds, by) if bounds else free))
+    return Smoothed(*(constrained(*free, bounds, by) if bounds else free)), estimates.divergences

@@ -1,8 +1,10 @@
 """Restarts are told: how many, the first step and states, and the likely cause, on every path."""
 
+import json
 import math
 import pickle
 import warnings
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -19,7 +21,13 @@ from thruster_env.plants.logs.log import Log
 from thruster_env.plants.model_env import ModelEnv
 from thruster_env.plants.split import Split
 from tuning.evaluation.evaluate import evaluate, restart_sentences
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.summary import summarised, summary
 from tuning.problems.data import Data
+from tuning.problems.runs_problem import RunsProblem
+from tuning.reporting.page import html_page
+from tuning.reporting.parts import held_out_section
+from tuning.reporting.sketchbook import Sketchbook
 
 
 class Clock(NamedTuple):
@@ -261,3 +269,63 @@ def test_measured_inputs_are_known_to_the_cause():
         infos = [env.step(action)[-1] for _ in range(4)]
         told.append(next(one["estimate_restarts"] for one in infos if "estimate_restarts" in one))
     assert "(b): f(x, u) is NaN." in told[0] and told[1].tolist() == [told[0]] * 2
+
+
+@pytest.mark.usefixtures("as_python")
+def test_reports_tell_them_also_of_stored_evaluations():
+    filter_, (inputs, z) = make_filter("ekf", model(**FAILING["F = df/dx is NaN"][1])), data(2, lost=1)
+    runs = [(u, 0.1 + rows + i) for i in range(3) for u, rows in zip(inputs, z, strict=True)]
+    problem = RunsProblem(runs, filter_.model, first_scored_step=1, held_out=[0, 1])
+    found = evaluate(filter_, Data((0, 1), inputs, z, np.zeros((2, 2)), 1), None)
+    stored = summarised(json.loads(json.dumps(summary(found))), problem)
+    assert stored.restarts == found.restarts and stored.divergences == found.divergences
+    quiet = found._replace(restarts=None)
+    assert "restarts" not in summary(quiet) and summarised(summary(quiet), problem).restarts is None
+    comparison = Comparison(quiet, found, None, bound=np.full(2, np.nan), seeds=range(1, 2))
+    subject = SimpleNamespace(plan=SimpleNamespace(scenarios=[problem]), choice=SimpleNamespace(name="ekf"))
+    section = held_out_section(Sketchbook("p"), subject, [comparison])
+    page = html_page("ekf", "advice", [section])
+    assert f"tuned: {found.restarts.sentence}" in page and page.count("restarted from the prior") == 1
+
+
+@pytest.mark.parametrize("name", ["imm", "mmae"])
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("cause", FAILING)
+@pytest.mark.usefixtures("as_python")
+def test_a_mode_that_begins_anew_counts_and_is_named(cause, place, name):
+    states, changes = FAILING[cause]
+    modes = [model(), model()]
+    modes[place] = model(**changes)
+    filter_, (inputs, z) = make_filter(name, model(), modes=modes, mode_filter="ekf"), data(2, lost=1)
+    with pytest.warns(RestartWarning, match="in 1 of 2 runs"):
+        found = filters.run(filter_, None, inputs, z)
+    assert np.isfinite(found.means).all()
+    told = restarts_of(filter_, found.divergences, None, inputs, z)
+    assert told[4:] == (3 if cause.startswith(("h", "H")) else 4, states, f"{cause} in modes[{place}]")
+    session = filter_.session()
+    session.start((0, 0), np.full(1, np.nan))
+    for u in inputs[1]:  # where nothing is measured, too
+        session.step(u, np.full(1, np.nan))
+    assert (session.divergences > 0) == (not cause.startswith(("h", "H")))
+
+
+SMOOTHED = {"ekf": {}, "ukf": {}, "enkf": {"ensemble_size": 20}, "imm": {"mode_filter": "ekf"}}
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+@pytest.mark.parametrize("name", SMOOTHED)
+@pytest.mark.usefixtures("as_python")
+def test_a_smoother_warns_as_the_filter_does(name, lag):
+    failing, numbers = model(transition=lost_f), SMOOTHED[name]
+    numbers = numbers if name != "imm" else {**numbers, "modes": [failing, model()]}
+    filter_, (inputs, z) = make_filter(name, failing, **numbers), data(2, lost=1)
+    with pytest.warns(RestartWarning) as of_run:
+        filters.run(filter_, None, inputs, z)
+    if name == "imm":
+        with pytest.warns(RestartWarning) as caught:
+            filters.smooth_modes(filter_, None, inputs, z)
+    else:
+        with pytest.warns(RestartWarning) as caught:
+            filters.smooth(filter_, None, inputs, z, lag)
+    assert [str(one.message) for one in caught] == [str(one.message) for one in of_run]
+    assert caught[0].filename == __file__

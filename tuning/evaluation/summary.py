@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from filters.consistency.intervals import Interval
+from filters.restarts import Restarts
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.problems.problem import Problem
@@ -25,6 +26,7 @@ def summary(evaluation: Evaluation) -> dict:
         "log_score": numbers(evaluation.log_score),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
+        **({"restarts": evaluation.restarts._asdict()} if evaluation.restarts else {}),
     }
 
 
@@ -59,6 +61,7 @@ def summarised(
         log_likelihood=likelihood,
         log_likelihoods=np.array([likelihood]),
         divergences=int(data["divergences"]),
+        restarts=_restarts(data.get("restarts")),
         mean_squares=np.array([[value.value**2 for value in rmse]]),
         log_score=as_interval(data.get("log_score")),
         scale=np.array([math.nan] * len(rmse) if problem.scale is None else problem.scale, dtype=np.float64),
@@ -73,6 +76,14 @@ def numbers(value: Interval) -> list[float] | None:
 def as_interval(data) -> Interval:
     """An interval from plain numbers."""
     return NOTHING if data is None else Interval(*map(float, data))
+
+
+def _restarts(data: Mapping | None) -> Restarts | None:
+    """Restarts from plain numbers; None of a file that says nothing of them."""
+    if data is None:
+        return None
+    counts = {name: int(data[name]) for name in ("times", "runs", "of_runs", "run", "step")}
+    return Restarts(**counts, states=tuple(map(str, data["states"])), cause=str(data["cause"]))
 
 
 def _number(value) -> float:

@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import confidence, rounded
-from tuning.evaluation.evaluate import Evaluation
+from tuning.evaluation.evaluate import Evaluation, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
@@ -73,14 +73,17 @@ def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[C
     """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
     parts: list[Part] = []
     for scenario, comparison in zip(subject.plan.scenarios, comparisons, strict=True):
+        restarts = restart_sentences(comparison.evaluations)
         if not comparison.tuned.has_truth:
             parts += [Words([without_truth(scenario.name)]), errors_table(scenario, comparison)]
+            parts += [Words(restarts)] if restarts else []
             continue
         where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
         bound = ", and the bound" if isfinite(comparison.bound).any() else ""
         name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
-        said = scaling_sentence(comparison)
-        parts += [errors_table(scenario, comparison), *([Words([said])] if said else [])]
+        scaling = scaling_sentence(comparison)
+        said = [*([scaling] if scaling else []), *restarts]
+        parts += [errors_table(scenario, comparison), *([Words(said)] if said else [])]
         caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
         parts.append(book.picture(draw_comparison(comparison, place, name), caption, of_comparison(comparison)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
