@@ -14,6 +14,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from thruster_cli.printing import printed_whole
+
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
     "Tune and evaluate a filter": ("tune", "explore", "ways", "evaluate", "report", "verify", "export", "compare"),
@@ -26,7 +28,25 @@ MARKUP: Final = "markdown"
 LOADING = "loading ..."
 
 
-class Commands(TyperGroup):
+class Command(TyperCommand):
+    """A command whose help Ctrl-C does not cut."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """Print the help."""
+        with printed_whole():
+            super().format_help(ctx, formatter)
+
+
+class Group(TyperGroup):
+    """A group of commands whose help Ctrl-C does not cut."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """Print the help."""
+        with printed_whole():
+            super().format_help(ctx, formatter)
+
+
+class Commands(Group):
     """The group of commands, each of the module of its name: a `command`, or an `app` of further ones."""
 
     _listing = False
@@ -64,7 +84,7 @@ class Commands(TyperGroup):
             if hasattr(module, "app"):
                 alone = module.app
             else:
-                alone.command(name)(module.command)
+                alone.command(name, cls=Command)(module.command)
             self._made[name] = get_command(alone)
             self._made[name].name = name
         return self._made[name]

@@ -18,6 +18,7 @@ from thruster_cli.options import (
     JsonOption,
 )
 from thruster_cli.output import check_picture, check_targets, console, emit, table
+from thruster_cli.printing import printed_whole
 from thruster_env.plants.logs.findings import sentences
 from thruster_env.plants.logs.log import Log
 from tuning.logs.read import read_named
@@ -65,9 +66,10 @@ def command(
         check_targets((), json, read=(log,))
         some = found_in(log, only, reading.stamps)
         shown, said = as_table(log, some.fields, console.is_terminal), remarks(some)
-        emit([shown, *said] if console.is_terminal else [], as_json(log, some), json)
-        if isinstance(shown, str) and json != "-":
-            typer.echo("\n".join([shown, *said]))
+        with printed_whole():
+            emit([shown, *said] if console.is_terminal else [], as_json(log, some), json)
+            if isinstance(shown, str) and json != "-":
+                typer.echo("\n".join([shown, *said]))
         return
     if plot is not None:
         check_picture(plot, "--plot")

@@ -1,7 +1,8 @@
 """The `thruster` command: how it starts, and how it ends in every case.
 
 Exit codes: 0 done; 1 a file whose metrics do not hold (`verify`); 2 the request cannot be carried out, one line
-says why; 130 Ctrl-C; 141 nobody reads the output any more, as a shell reports of other programs.
+says why; 130 Ctrl-C, which does not cut what is being printed; 141 nobody reads the output any more, as a shell
+reports of other programs.
 
 No package is imported before Ctrl-C has its one line.
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from _signal import SIGINT, getsignal, signal  # `signal` itself takes milliseconds, in which Ctrl-C may come
+from _signal import SIG_IGN, SIGINT, getsignal, signal  # `signal` itself takes milliseconds: Ctrl-C may come
 
 INTERRUPTED, BROKEN_PIPE = 130, 141
 
@@ -26,6 +27,8 @@ def run() -> None:
         main()
     except KeyboardInterrupt:  # between two lines of `main`
         leave()
+    finally:
+        _shut_down()
 
 
 def main() -> None:
@@ -152,6 +155,20 @@ def _leave_full_disks_to_the_main_thread() -> None:
             before(arguments)
 
     threading.excepthook = say
+
+
+def _shut_down() -> None:
+    """Do the first steps of Python's end, in its order, and ignore Ctrl-C in those that follow.
+
+    Python gives up its handlers before it clears its modules; Ctrl-C would then end the process by the signal,
+    after all is printed. A signal that is ignored stays so.
+    """
+    import atexit
+    import threading
+
+    threading._shutdown()  # type: ignore[attr-defined]  # waits for threads
+    atexit._run_exitfuncs()
+    signal(SIGINT, SIG_IGN)
 
 
 def _as_one_line(

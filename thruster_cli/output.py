@@ -15,6 +15,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
+from thruster_cli.printing import printed_whole
 from thruster_env.numerics.compiled import tell_when_compiling
 from thruster_env.numerics.files import check_not_read, check_target, write_whole
 from thruster_env.numerics.progress import listening
@@ -33,13 +34,16 @@ progress_console = Console(stderr=True, markup=False, highlight=False)
 def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
     """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
     if json_target == "-":
-        sys.stdout.write(as_text(data))
+        with printed_whole():
+            sys.stdout.write(as_text(data))
+            sys.stdout.flush()
         return
     _check_json(json_target)
     if json_target is not None:  # first: there may be nobody left who reads what is printed
         write_whole(json_target, as_text(data))
-    for part in parts:
-        console.print(part)
+    with printed_whole():
+        for part in parts:
+            console.print(part)
 
 
 def _check_json(target: str | None) -> None:

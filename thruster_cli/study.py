@@ -16,12 +16,13 @@ from rich.progress import (
 )
 
 from thruster_cli import recordings, users, ways_study
+from thruster_cli.app import Command, Group
 from thruster_cli.options import OUTPUT, RUNS, JsonOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 
 RESULTS = Path("out") / "comparison"
 
-app = typer.Typer(help="Long comparisons.", no_args_is_help=True)
+app = typer.Typer(cls=Group, help="Long comparisons.", no_args_is_help=True)
 
 
 @app.callback()
@@ -29,12 +30,12 @@ def _callback() -> None:
     pass
 
 
-app.command("recordings")(recordings.command)
-app.command("users")(users.command)
-app.command("ways")(ways_study.command)
+app.command("recordings", cls=Command)(recordings.command)
+app.command("users", cls=Command)(users.command)
+app.command("ways", cls=Command)(ways_study.command)
 
 
-@app.command("policies")
+@app.command("policies", cls=Command)
 def policies(
     quick: Annotated[
         bool,

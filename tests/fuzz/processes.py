@@ -37,13 +37,36 @@ def ctrl_c_at_random_moments(rng: np.random.Generator, seconds: float) -> str:
                 process.send_signal(signal.SIGINT)
             what = f"{command!r} interrupted after {waits.tolist()} s"
             _, errors = _end(process, what)
-            allowed = (0, 130, -signal.SIGINT)  # the last: as Python ends, when it has put the handler away
-            assert process.returncode in allowed, f"{what}: exit code {process.returncode}: {errors}"
+            assert process.returncode in (0, 130), f"{what}: exit code {process.returncode}: {errors}"
             _no_traceback(errors, what)
             if process.returncode == 130 and not command.startswith("tune"):
                 assert errors.splitlines()[-1] == "thruster: interrupted", f"{what}: {errors}"
             tried, interrupted = tried + 1, interrupted + (process.returncode == 130)
     return f"Ctrl-C: {tried} commands, {interrupted} of them interrupted, 0 tracebacks"
+
+
+def ctrl_c_in_the_last_moments(rng: np.random.Generator, seconds: float) -> str:
+    """Interrupt commands at their output or shortly before: it is whole or missing, the exit code 0 or 130."""
+    deadline, tried, interrupted = time.monotonic() + seconds, 0, 0
+    outputs: dict[str, list[bytes]] = {}
+    while time.monotonic() < deadline or not tried:
+        command = str(rng.choice(["filters", "filters --json -", "ways", "filters --help"]))
+        at_output, wait = bool(rng.integers(2)), float(rng.uniform(0.0, 0.2))
+        what = f"{command!r} interrupted {wait} s after its {'first output' if at_output else 'packages'}"
+        line, pipe = [sys.executable, "-c", READY, *command.split()], subprocess.PIPE
+        process = subprocess.Popen(line, stdout=pipe, stderr=pipe, bufsize=0)
+        first = process.stdout.read(1) if command not in outputs or at_output else b""
+        if command in outputs:
+            time.sleep(wait if at_output else 5.0 * wait)
+            process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=LIMIT_SECONDS)
+        output = (first + out).rstrip()  # a help's last, empty line is printed apart
+        outputs.setdefault(command, [b"", output])
+        _no_traceback(errors.decode(), what)
+        assert process.returncode in (0, 130), f"{what}: exit code {process.returncode}"
+        assert output in outputs[command][process.returncode == 0 :], f"{what}: its output is cut"
+        tried, interrupted = tried + 1, interrupted + (process.returncode == 130)
+    return f"last moments: {tried} commands, {interrupted} of them interrupted, no output cut"
 
 
 def kills_and_damaged_journals(rng: np.random.Generator, seconds: float) -> str:

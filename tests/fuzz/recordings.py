@@ -85,6 +85,39 @@ def two_definitions(rng: np.random.Generator, seconds: float) -> str:
     return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
 
 
+def transforms_of_bags(rng: np.random.Generator, seconds: float) -> str:
+    """Transforms of random frames in bags of all kinds: of each pair the numbers and stamps that were written."""
+    from tests.plants.recorders.test_transforms import FIELDS as NUMBERS
+    from tests.plants.recorders.test_transforms import write_transforms
+
+    frames = ["map", "odom", "base_link", "r1.arm", "imu[0]", "Größe"]
+    counts, end = Counter(), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        while not counts or time.monotonic() < end:
+            kind, path = str(rng.choice(["ros1", "mcap", "sqlite3"])), Path(folder) / f"{counts.total()}"
+            expected: dict[str, list[tuple[int, np.ndarray]]] = {}
+            messages = []
+            for k in range(rng.integers(1, 20)):
+                topic, array = str(rng.choice(["/tf", "/tf_static", "/r/tf"])), []
+                for _ in range(rng.integers(0, 4)):
+                    parent, child = rng.choice(frames, 2)
+                    stamp, numbers = EPOCH + int(rng.integers(10**10)), rng.normal(size=7)
+                    array.append((str(parent), str(child), stamp, numbers))
+                    expected.setdefault(f"{topic}/{parent}/{child}", []).append((stamp, numbers))
+                messages.append((topic, EPOCH + k, array))
+            write_transforms(path, messages, kind)
+            found = read(path, None)
+            assert set(found) == {f"{pair}.{field}" for pair in expected for field in NUMBERS}
+            for pair, rows in expected.items():
+                rows.sort(key=lambda row: row[0])
+                for place, field in enumerate(NUMBERS):
+                    one = found[f"{pair}.{field}"]
+                    np.testing.assert_array_equal(one.values, [numbers[place] for _, numbers in rows])
+                    np.testing.assert_allclose(one.times, [(stamp - EPOCH) / 1e9 for stamp, _ in rows], atol=1e-9)
+            counts[kind] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
 def damaged_tables(rng: np.random.Generator, seconds: float) -> str:
     """CSV, npz and Parquet with bytes zeroed, flipped, doubled or cut off: read, or one line."""
     counts, end = Counter(), time.monotonic() + seconds

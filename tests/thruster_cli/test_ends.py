@@ -1,11 +1,14 @@
 """How a command ends: Ctrl-C at any moment, outputs that take nothing, characters that a terminal lacks."""
 
 import errno
+import fcntl
 import io
 import os
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 
 import pytest
@@ -35,6 +38,27 @@ event.register("numba:compile", Moment())
 AT_THE_END = """
 import atexit, os, signal
 atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))
+"""
+AT_FIRST_OUTPUT = """
+import os, signal, sys
+class Moment(type(sys.stdout)):
+    sent = False
+    def write(self, text):
+        half = len(text) // 2
+        count = super().write(text[:half])
+        self.flush()
+        if not self.sent:
+            self.sent = True
+            os.kill(os.getpid(), signal.SIGINT)
+        return count + super().write(text[half:])
+sys.stdout = Moment(sys.stdout.buffer, encoding="utf-8", write_through=True)
+"""
+AFTER_HANDLERS = """
+import os, signal, sys, types
+class Moment:
+    def __del__(self, kill=os.kill, process=os.getpid(), number=signal.SIGINT): kill(process, number)
+sys.modules["moment"] = types.ModuleType("moment")
+sys.modules["moment"].last = Moment()
 """
 TWICE = """
 import os, thruster_cli.app, thruster_cli.main
@@ -86,6 +110,38 @@ def test_ctrl_c_while_code_is_compiled_is_one_line(tmp_path):
 def test_ctrl_c_when_all_is_done_is_one_line():
     done = process(AT_THE_END, "thruster", stdout=subprocess.DEVNULL)
     assert (done.returncode, done.stderr) == (130, INTERRUPTED)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    slow_but(
+        ["filters kf", "filters kf --json -", "filters --help", "study ways --help", "--help"],
+        ["filters kf", "--help"],
+    ),
+)
+def test_ctrl_c_while_results_are_printed_leaves_them_whole(arguments):
+    whole = process("", "thruster", arguments, stdout=subprocess.PIPE)
+    done = process(AT_FIRST_OUTPUT, "thruster", arguments, stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr, done.stdout.rstrip()) == (130, INTERRUPTED, whole.stdout.rstrip())
+    assert whole.returncode == 0 and len(whole.stdout) > 200
+
+
+def test_ctrl_c_after_python_has_put_its_handlers_away_changes_nothing():
+    done = process(AFTER_HANDLERS, "thruster", "--version", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr, done.stdout.split()[0]) == (0, "", "thruster-env")
+
+
+def test_a_second_ctrl_c_ends_a_command_whose_output_nobody_reads():
+    command = [sys.executable, "-m", "thruster_cli", "filters"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pipesize=4096) as running:
+        readable = struct.pack("i", 0)
+        while struct.unpack("i", fcntl.ioctl(running.stdout, termios.FIONREAD, readable))[0] < 4096:
+            time.sleep(0.02)
+        running.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            running.wait(0.5)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(10) == 130 and running.stderr.read().decode() == INTERRUPTED
 
 
 @pytest.fixture

@@ -27,12 +27,18 @@ from thruster_env.plants.logs.recorders.topics import (
     reading,
     wants,
 )
+from thruster_env.plants.logs.recorders.transforms import (
+    HEADER_TYPE,
+    STAMPED,
+    Pairs,
+    array_of_transforms,
+    wants_pairs,
+)
 
 KIND = "bag"
 TICKS = 1e9  # a second
 NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
 NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
-HEADER_TYPE = "std_msgs/msg/Header"
 DEEPEST = 8  # messages within messages
 
 
@@ -51,7 +57,8 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     is one only at the beginning, where simulated time begins. It has the times of reception, too. Fields are
     numbers and short arrays, of which each message has as many; a bag has no units. Types come from the bag, or
     where it has none from the newest release of ROS 2 that the package knows. If a topic has several, its messages
-    are matched by the names of fields; a field is NaN in messages without it.
+    are matched by the names of fields; a field is NaN in messages without it. An array of transforms (/tf) is a
+    topic for each pair of frames, TOPIC/PARENT/CHILD, with the stamps of its own headers.
 
     Args:
         path: of a .bag, .db3 or .mcap file, or of the folder of a bag of ROS 2.
@@ -89,6 +96,7 @@ class Contents:
         self.samples: dict[str, dict[tuple[Leaf, ...], Samples]] = {}
         self.unread: dict[str, dict[str, str]] = {}
         self.begin = 0
+        self._pairs = Pairs(path)
         self._size, self._known, self._counts = 0, set[str](), Counter[str]()
 
     def add(self, file: Path, is_packed: bool) -> None:
@@ -98,23 +106,21 @@ class Contents:
             names = {one.id: one.topic for one in reader.connections}
             if len(names) < len(reader.connections):
                 raise ValueError("it has two connections of one number")
-            decoders = {
-                one.id: Decoder(self._types, one, self._is_ros1)
-                for one in reader.connections
-                if wants(self._wanted, one.topic)
-            }
+            decoders = dict(self._decoders(reader.connections))
             some = [one for one in reader.connections if one.id in decoders and decoders[one.id].leaves]
             rows = Counter({one.id: 0 for one in some})
             unpack = unpacker(KIND, self.path).decompress if is_packed else bytes
             for connection, received, data in reader.messages(some) if some else ():
                 decoder = decoders[connection.id]
-                stamp, row = decoder.read(unpack(data))
                 rows[connection.id] += 1
-                parts = self.samples.setdefault(connection.topic, {})
-                if decoder.leaves not in parts:
-                    parts[decoder.leaves] = Samples(decoder.leaves)
-                self._size += 8 * parts[decoder.leaves].add(received, stamp, row)
-                check_bytes(self._size, "the numbers of a bag", self.path)
+                for topic, stamp, row in decoder.read(unpack(data)):
+                    if not wants(self._wanted, topic):
+                        continue
+                    parts = self.samples.setdefault(topic, {})
+                    if decoder.leaves not in parts:
+                        parts[decoder.leaves] = Samples(decoder.leaves)
+                    self._size += 8 * parts[decoder.leaves].add(received, stamp, row)
+                    check_bytes(self._size, "the numbers of a bag", self.path)
             if reader.message_count:
                 self.begin = min(self.begin or reader.start_time, reader.start_time)
         check_counts(rows, names, stated, self.path)
@@ -124,15 +130,34 @@ class Contents:
         for number, count in rows.items():
             self._counts[names[number]] += count
 
+    def _decoders(self, connections: Sequence[Any]) -> Iterator[tuple[int, Decoder]]:
+        """Decoders of the connections that are wanted, by number."""
+        for one in connections:
+            is_wanted = wants(self._wanted, one.topic)
+            if is_wanted or wants_pairs(self._wanted, one.topic):
+                decoder = Decoder(self._types, one, self._is_ros1, self._pairs)
+                if is_wanted or decoder.transforms:
+                    yield one.id, decoder
+
     def check(self, bag: Bag) -> None:
-        """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says."""
+        """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says.
+
+        Nor may a pair of frames have the name of a topic.
+        """
+        self._pairs.check(self._known)
         check_topics(self._counts, bag.counts, self._known, self.path)
 
 
 class Decoder:
-    """Numbers of the messages of one type."""
+    """Numbers of the messages of one connection.
 
-    def __init__(self, types: Any, connection: Any, is_ros1: bool):
+    Attributes:
+        leaves: the fields that hold numbers, of a transform where messages are arrays of them.
+        unread: why others are not read, by path.
+        transforms: the field that is an array of transforms; empty for messages that are one row each.
+    """
+
+    def __init__(self, types: Any, connection: Any, is_ros1: bool, pairs: Pairs):
         """Find the fields that hold numbers, and say of others why they are not read."""
         store = types.get_typestore(types.Stores.EMPTY)
         text, kind = connection.msgdef.data, connection.msgtype
@@ -143,7 +168,9 @@ class Decoder:
             store.register(defined)
         elif not is_ros1:
             store = types.get_typestore(types.Stores.LATEST)
-        every = [*_leaves(store.fielddefs, kind)] if kind in store.fielddefs else []
+        self.transforms = array_of_transforms(store.fielddefs, kind)
+        row = dict(store.fielddefs[STAMPED][1])["transform"][1] if self.transforms else kind
+        every = [*_leaves(store.fielddefs, row)] if kind in store.fielddefs else []
         self.leaves = tuple(one for one in every if not one.why)
         self.unread = {one.path: one.why for one in every if one.why}
         encoding = "cdr" if is_ros1 else connection.ext.serialization_format
@@ -155,13 +182,17 @@ class Decoder:
         self._fields = attrgetter(*(one.path for one in self.leaves), "__class__") if self.leaves else None
         fields = dict(store.fielddefs.get(kind, ((), ()))[1])
         self._has_header = "header" in fields and fields["header"][1] == HEADER_TYPE
+        self._topic, self._pairs = connection.topic, pairs
 
-    def read(self, data: bytes) -> tuple[int, tuple]:
-        """The header's stamp [ns], 0 where there is none, and what each leaf holds."""
+    def read(self, data: bytes) -> Iterator[tuple[str, int, tuple]]:
+        """Topic, stamp of the header [ns], 0 without one, and what each leaf holds, of each row of a message."""
         message = self._message(data)
-        stamp = message.header.stamp if self._has_header else None
         assert self._fields is not None
-        return (0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec), self._fields(message)[:-1]
+        if not self.transforms:
+            yield self._topic, _stamp(message) if self._has_header else 0, self._fields(message)[:-1]
+            return
+        for topic, one in self._pairs.topics(self._topic, getattr(message, self.transforms)):
+            yield topic, _stamp(one), self._fields(one.transform)[:-1]
 
 
 class Samples:
@@ -208,6 +239,11 @@ class Samples:
                     "an array whose length changes" if width < 0 else f"an array of {width} entries"
                 )
         return values, unread
+
+
+def _stamp(message: Any) -> int:
+    """The stamp of a message's header [ns]."""
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
 def _are_set(stamps: np.ndarray) -> bool:
