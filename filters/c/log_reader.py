@@ -526,7 +526,8 @@ static int read_row(long row)
             return refuse("every row must have a time", "");
         }
         double since = row > 0 ? numbers[TIME] - first_time : 0.0;
-        if (is_bare && (fabs(numbers[TIME]) > 4.1e9 || (row > 0 && since >= 100.0 * (double)row))) {
+        if (is_bare && (fabs(numbers[TIME]) > 4.1e9 || (row > 0 && since >= 100.0 * (double)row) ||
+                        (since > 0.0 && fabs(numbers[TIME]) > 2e4 && since < 2e-5 * (double)row))) {
             return refuse("times must be in seconds, or their column say its unit", cells[column_of[TIME]]);
         }
         if (!is_on_grid(row, numbers[TIME])) {

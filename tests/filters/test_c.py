@@ -472,6 +472,7 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
         (["u", "z"], "u,z,t\n1,2,0\n1,3,-.01\n4,5,.01\n", f"line 3: {STEP}, but got '-.01'\n"),
         (["u", "z"], "u,z,timestamp\n1,2,0\n1,3,10000\n4,5,20000\n", f"line 3: {SECONDS}, but got '10000'\n"),
         (["u", "z"], "u,z,t\n1,2,1700000000000\n1,3,1\n", f"line 2: {SECONDS}, but got '1700000000000'\n"),
+        (["u", "z"], "u,z,t\n1,2,46143\n1,3,46143.0000001\n", f"line 3: {SECONDS}, but got '46143.0000001'\n"),
         (["u", "z"], "u,z,t\n1,2,0\n1,3,\n4,5,.01\n", "line 3: every row must have a time, but got ''\n"),
         (
             ["u_uA", "z"],

@@ -119,3 +119,21 @@ def test_an_npz_array_that_holds_more_than_its_header_says_is_refused(tmp_path, 
     np.savez(path, t=0.1 * np.arange(4000), voltage=np.random.default_rng(0).normal(size=4000))
     path.write_bytes(path.read_bytes().replace(stated, damaged))
     refused(path, "'t.npy' holds more than its array")
+
+
+def test_arrays_of_other_lengths_are_named(tmp_path):
+    for other in (0.1, np.arange(3.0), COLUMNS["voltage"][:, None], "text"):
+        np.savez(tmp_path / "a.npz", **COLUMNS, gains=other)
+        refused(
+            tmp_path / "a.npz",
+            r"equal length with some rows, but .* has 'gains' of shape \(.* beside 't' of \(40,\)",
+        )
+
+
+@pytest.mark.parametrize(
+    "content", ["t,voltage\n0,1\n1,2\n\0\0\0\0", "t,voltage\n0,1\n1,2\n".encode("utf-16-le").decode()]
+)
+def test_zero_bytes_are_named(tmp_path, content):
+    """What a loss of power leaves, and UTF-16 without its mark."""
+    (tmp_path / "a.csv").write_text(content)
+    refused(tmp_path / "a.csv", "a CSV file must be text in UTF-8, but .* is not: a zero byte in line [14]")

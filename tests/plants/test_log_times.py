@@ -127,3 +127,17 @@ def test_stamps_that_may_be_in_several_units_are_refused(header, step):
         read_log(run_of(header, step * K), MODEL)
     assert read_log(run_of(header, step * K), MODEL, {"time": f"{header}[us]"}).dt == pytest.approx(step * 1e-6)
     assert read_log(run_of(header, step * K), MODEL, {"time": f"{header}[s]"}).dt == step
+
+
+@pytest.mark.parametrize("first", [46_143.0, 739_738.5, 2_461_162.25])  # of Excel, of MATLAB, Julian
+def test_dates_in_days_are_not_seconds(first, tmp_path):
+    """A sample time of 0.1 us was taken."""
+    run = run_of("t", first + 0.1 * K / 86400.0)
+    with pytest.raises(
+        ValueError, match=r"^times must be in seconds, .*'time=t\[d\]' for dates in days, or \[s\]"
+    ):
+        read_log(run, MODEL)
+    log = read_log(run, MODEL, {"time": "t[d]"})
+    assert (log.dt, log.start) == (pytest.approx(0.1, rel=1e-3), pytest.approx(86400.0 * first))
+    assert read_log(run, MODEL, {"time": "t[s]"}).dt < 2e-6
+    assert read_log(run_of("t", 1e-6 * K), MODEL).dt == 1e-6

@@ -139,3 +139,13 @@ def test_a_header_may_be_named_without_its_unit(tmp_path):
     two = text.replace("n_mot (rpm)", "U_mot [V]")
     with pytest.raises(ValueError, match="the column for V_s must be one of t, U_mot"):
         log_of(tmp_path / "run.csv", two, columns={"V_s": "U_mot"})
+
+
+def test_brackets_without_a_unit_say_none():
+    rows = np.arange(9.0)
+    model = MODEL.replace(measurements=[("duty", "z", "")])
+    for header in ("duty []", "duty [-]", "duty (1)", "z[ ]"):
+        log = read_log({"time": rows, "voltage []": rows % 2, header: rows}, model)
+        np.testing.assert_array_equal(log.measurements[:, 0], rows)
+    with pytest.raises(ValueError, match="must be one that"):
+        read_log({"time": rows, "voltage [-]": rows % 2, "duty": rows}, model)

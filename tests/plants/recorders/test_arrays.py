@@ -186,3 +186,92 @@ def test_flipped_bits_of_packed_arrays_are_found_by_their_check_sum(tmp_path):
             np.testing.assert_array_equal(some[name].values, one)
         counts["same"] += 1
     assert counts["refused"] > 250
+
+
+def test_attributes_of_valid_numbers_and_of_signs(tmp_path):
+    stored = np.arange(-20, 20, dtype=np.int8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, attributes in {
+            "least": {"valid_min": np.int8(-3), "scale_factor": 0.5},
+            "greatest": {"valid_max": [np.int8(4)]},
+            "both": {"valid_range": np.array([-2, 5], np.int8), "add_offset": 1.0},
+            "some": {"missing_value": np.array([1, 2], np.int8)},
+            "unsigned": {"_Unsigned": "true", "_FillValue": np.int8(-1)},
+            "nothing": {"units": h5py.Empty("S1"), "valid_max": h5py.Empty("f8")},
+        }.items():
+            file[name] = stored
+            file[name].attrs.update(attributes)
+        file["halves"] = np.arange(40, dtype=np.float16)
+        file["halves"].attrs["scale_factor"] = 1e6
+        file["wrong"] = stored
+        file["wrong"].attrs["valid_range"] = "0, 1"
+    found, wide = read(tmp_path / "a.h5", None), stored.astype(float)
+    expected = {
+        "least": np.where(wide < -3, np.nan, 0.5 * wide),
+        "greatest": np.where(wide > 4, np.nan, wide),
+        "both": np.where((wide < -2) | (wide > 5), np.nan, wide + 1.0),
+        "some": np.where((wide == 1) | (wide == 2), np.nan, wide),
+        "unsigned": np.where(wide == -1, np.nan, wide % 256),
+        "nothing": wide,
+        "halves": 1e6 * np.arange(40.0),
+    }
+    assert set(found) == set(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name].values, values, err_msg=name)
+    assert found["nothing"].unit == ""
+    assert "valid_range='0, 1' is no number" in contents(tmp_path / "a.h5").unread["wrong"]
+
+
+def test_a_dataset_of_two_names_has_both(tmp_path):
+    """As NeXus files have: hard links. A group within itself has no end, and is read once."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["entry/time"], file["entry/speed"] = 0.1 * np.arange(40), np.arange(40.0)
+        file["entry/again"], file["data/speed"] = file["entry"], file["entry/speed"]
+    some = contents(tmp_path / "a.h5")
+    assert {one.name for one in some.fields} == {"entry.time", "entry.speed", "data.speed"}
+    assert some.unread == {"entry.again": "a group that has another name, too"}
+
+
+@pytest.mark.parametrize("form", ["mat", "h5"])
+def test_sides_of_one_entry_count_for_nothing_and_larger_arrays_are_named(tmp_path, form):
+    """Simulink writes the samples of a signal as 1 x 1 x N."""
+    values, path = np.arange(40.0), tmp_path / f"a.{form}"
+    arrays = {
+        "time": 0.1 * values,
+        "force": values[None, None],
+        "pair": np.stack([values, 2.0 * values])[:, None],
+        "cube": np.zeros((40, 2, 3)),
+        "picture": np.zeros((70, 80)),
+    }
+    if form == "mat":
+        savemat(path, arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(arrays)
+    some, found = contents(path), read(path, None)
+    np.testing.assert_array_equal(found["force"].values, values)
+    np.testing.assert_array_equal(found["pair[1]"].values, 2.0 * values)
+    np.testing.assert_array_equal(found["pair[1]"].times, 0.1 * values)
+    assert set(found) == {"time", "force", "pair[0]", "pair[1]"}
+    assert some.unread == {"cube": "of 3 dimensions", "picture": "a matrix of 70 times 80"}
+
+
+def test_times_that_cannot_be_read_leave_the_numbers(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("time", data=RNG.normal(size=400), chunks=(100,), compression="gzip")
+        file["voltage"] = np.arange(400.0)
+        where = file["time"].id.get_chunk_info(1)
+    with (tmp_path / "a.h5").open("r+b") as file:
+        file.seek(where.byte_offset)
+        file.write(bytes(50))
+    some = contents(tmp_path / "a.h5")
+    assert [(one.name, one.begin) for one in some.fields] == [("voltage", pytest.approx(np.nan, nan_ok=True))]
+    assert "damaged" in some.unread["time"]
+
+
+def test_a_dataset_that_was_never_written_is_named(tmp_path):
+    """It was read as zeros."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"] = 0.1 * np.arange(40)
+        file.create_dataset("voltage", (40,), "f8")
+    assert contents(tmp_path / "a.h5").unread == {"voltage": "never written"}

@@ -17,6 +17,7 @@ TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
 STAMP_NAMES = ("timestamp", "stamp")
 SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
 MOST_SECONDS = 86400.0  # [s], of stamps in seconds
+DAYS, LEAST_SECONDS = 2e4, 2e-5  # stamps beyond the first are dates in days if steps are below the other [s]
 MOST_DIGITS = 17  # of a float64
 
 
@@ -89,7 +90,8 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
     Stamps in ms, us or ns since 1970 are dates from 1989 to 2099 with a sample time of at most 5 s. Others are in
     seconds if these make a sample time below 1000 s (100 s in a column `timestamp`), or of whole minutes up to a
     day, or if they are not whole. What is left is in the only unit that makes a sample time from 0.1 ms to 5 s; a
-    column `timestamp`, as of PX4 and ROS, is never in ms.
+    column `timestamp`, as of PX4 and ROS, is never in ms. Dates in days, as of Excel and MATLAB, have large
+    numbers and small steps, and are refused.
 
     Args:
         stamps: (rows,), NaN where there is none.
@@ -109,6 +111,10 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
         if SINCE_1970[0] * ticks <= middle <= SINCE_1970[1] * ticks and step <= LONGEST_STEP * ticks:
             first = date_text(float(known[0]) / ticks).strip(" ()")
             return unit, f"times in {where} are taken as {unit} since 1970: the first is {first}"
+    if step < LEAST_SECONDS and abs(middle) > DAYS:
+        rule = "times must be in seconds, or their column say its unit"
+        way = f"use --column 'time={header}[d]' for dates in days, or [s]"
+        raise ValueError(f"{rule}, but the sample time in {where} would be {step:.4g} s ({way})")
     is_whole, is_minutes = bool((known == np.round(known)).all()), not (steps % 60.0).any()
     if step <= MOST_SECONDS and (not is_whole or step < (100 if is_stamp else 1000) or is_minutes):
         return SECOND, ""

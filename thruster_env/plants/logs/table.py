@@ -17,7 +17,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, short_repr
+from thruster_env.numerics.checks import as_floats, listed, short_repr
 from thruster_env.numerics.extras import to_install
 from thruster_env.plants.logs.findings import Remark
 from thruster_env.plants.logs.recorders.process import opened
@@ -155,6 +155,9 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(
             f"a CSV file must be text in UTF-8, but {path} is not: {error.reason} in line {line}"
         ) from None
+    if "\0" in text:  # as in UTF-16, or where a loss of power left a block empty
+        line = 1 + text[: text.index("\0")].count("\n")
+        raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: a zero byte in line {line}")
     if not text.strip():
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
     first = text.lstrip().splitlines()[0]
@@ -288,11 +291,15 @@ def _with_index(frame: Any) -> dict:
 
 
 def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
-    rows = {len(one) for one in cells.values() if one.ndim == 1}
-    if len(rows) != 1 or 0 in rows or any(one.ndim != 1 for one in cells.values()):
-        raise ValueError(f"a log must have columns of equal length with some rows, but {path} has not")
-    count = rows.pop()
-    return Table(str(path), cells, range(1, count + 1), "row")
+    rule = "a log must have columns of equal length with some rows"
+    first = next((name for name, one in cells.items() if one.ndim == 1 and len(one)), None)
+    if first is None:
+        raise ValueError(f"{rule}, but {path} has {listed(cells) or 'none'}")
+    for name, one in cells.items():
+        if one.shape != cells[first].shape:
+            sizes = f"{short_repr(name)} of shape {one.shape} beside {short_repr(first)} of {cells[first].shape}"
+            raise ValueError(f"{rule}, but {path} has {sizes}: leave one out")
+    return Table(str(path), cells, range(1, len(cells[first]) + 1), "row")
 
 
 def _has_comma(text: str) -> bool:

@@ -41,6 +41,7 @@ OFFSET = {"K": (1.0, 0.0), "degC": (1.0, 273.15), "degF": (5.0 / 9.0, 459.67 * 5
 TURNING = ("1/s", "1/min", "1/h", "s^-1", "min^-1", "h^-1")  # of turns, or of radians: nobody knows
 WRITTEN = {"Nm": "N*m", "°C": "degC", "°F": "degF", "°": "deg"}  # as pint reads them
 WRITTEN |= {**dict.fromkeys(("m/s/s", "m/s2", "m/s²", "m/s**2"), "m/s^2"), **dict.fromkeys(("g0", "gn"), "g_0")}
+PURE = {"", "-", "1"}  # of a number without a unit
 LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
 _RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
 _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
@@ -53,7 +54,7 @@ def parted(header: str) -> tuple[str, str | None]:
     ("omega_m_rad_per_s", also "omega_m_rad_s"); these are of WORDS.
     """
     if found := _BRACKETS.match(header):
-        return found["base"], found["unit"].strip()
+        return found["base"], found["unit"].strip() or None
     found = _RATE.match(header)
     if found and found["base"] and found["over"] in (WORDS if found["per"] else LENGTHS):
         power = f"^{found['power']}" if found["power"] else ""
@@ -102,7 +103,7 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         ValueError: if pint, which converts the units that `simple` does not, does not know a unit or is not
             installed, or if the unit is of another dimension.
     """
-    if unit is None or unit == wanted:
+    if unit is None or unit == wanted or {unit, wanted} <= PURE:
         return values
     known = conversion(unit, wanted)
     if known is not None:

@@ -62,6 +62,8 @@ def topics_of(
         group, _, field = name.rpartition(".")
         try:
             values = _read(name, one, path)
+            if clock is not None and clock not in known:
+                known = {clock: _times(clock, found[clock], path, unit)}
         except Refused:
             raise
         except Exception as error:  # of this one alone
@@ -75,31 +77,45 @@ def topics_of(
         values = values if values.shape[0] == along else values.T
         fields = columns_of(field, values)
         said = unit(one)
-        if clock is not None and clock not in known:
-            whose = found[clock]
-            times = _read(clock, whose, path).astype(np.float64)
-            where = f"{clock!r} of {path}"
-            try:
-                known = {clock: in_seconds(times, unit(whose) or parted(clock)[1], clock, where)}
-            except ValueError:  # of an unknown unit: fields have no times then
-                known = {clock: (None, "")}
         own, taken = known[clock] if clock is not None else (None, "")
         yield Topic(group, own, fields, dict.fromkeys(fields, said) if said else {}, taken=taken)
+
+
+def _times(clock: str, one: Any, path: Path, unit: Callable[[Any], str]) -> tuple[np.ndarray | None, str]:
+    """The times in a vector [s], None for those of an unknown unit; and how they were read, in words."""
+    try:
+        times = _read(clock, one, path).astype(np.float64)
+        return in_seconds(times, unit(one) or parted(clock)[1], clock, f"{clock!r} of {path}")
+    except Refused:
+        raise
+    except ValueError:
+        return None, ""
 
 
 def _why_not(one: Any) -> str:
     """Why an array is not read, empty if it may be."""
     if isinstance(one, str):
         return one
-    return "" if one.dtype.kind in NUMERIC else getattr(one, "what", f"of {one.dtype}")
+    if one.dtype.kind not in NUMERIC:
+        return getattr(one, "what", f"of {one.dtype}")
+    sides = _sides(one)
+    if len(sides) > 2:
+        return f"of {len(sides)} dimensions"
+    return (
+        f"a matrix of {sides[0]} times {sides[1]}" if min(sides[1:], default=0) > MOST_COLUMNS < sides[0] else ""
+    )
+
+
+def _sides(one: Any) -> list[int]:
+    """The sides of an array of more than one entry; Simulink writes signals as 1 x 1 x samples."""
+    return [side for side in one.shape if side != 1]
 
 
 def _size(one: Any) -> tuple[int, int] | None:
     """The longer and the shorter side of a vector or matrix of numbers, None for anything else."""
-    if isinstance(one, str) or one.dtype.kind not in NUMERIC or len(one.shape) not in (1, 2) or 0 in one.shape:
+    if _why_not(one) or 0 in one.shape or not (sides := _sides(one)):
         return None
-    longer, shorter = max(one.shape), min(one.shape) if len(one.shape) == 2 else 1
-    return (longer, shorter) if longer >= FEWEST and shorter <= MOST_COLUMNS else None
+    return max(sides), min(sides) if len(sides) == 2 else 1
 
 
 def _is_time(name: str) -> bool:
@@ -117,5 +133,4 @@ def _clocks(name: str, vectors: Mapping[str, Mapping[str, int]]) -> Iterator[tup
 def _read(name: str, one: Any, path: Path) -> np.ndarray:
     """An array, of which sides of one entry are left out."""
     check_bytes(math.prod(one.shape) * max(one.dtype.itemsize, 8), f"the array {name!r}", path)
-    values = np.asarray(one[...])
-    return values.reshape(-1) if 1 in values.shape else values
+    return np.squeeze(np.asarray(one[...]))

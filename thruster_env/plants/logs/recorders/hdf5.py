@@ -17,13 +17,16 @@ KIND = "HDF5 file"
 MAGIC = b"\x89HDF\r\n\x1a\n"
 UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
 MISSING = ("_fillvalue", "missing_value")
+LEAST, GREATEST, RANGE = "valid_min", "valid_max", "valid_range"
+UNSIGNED = "_unsigned"
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The numeric arrays of one or two dimensions, by group: GROUP.GROUP.DATASET; see `arrays.topics_of`.
 
     A unit is the attribute `units` or `unit` of a dataset, in any case, a text or an array of one. Numbers are
-    `scale_factor` times what is stored plus `add_offset`, NaN where that is `_FillValue` or `missing_value`. Of
+    `scale_factor` times what is stored plus `add_offset`, NaN where that is `_FillValue` or `missing_value` or
+    outside `valid_range`, or `valid_min` and `valid_max`; whole numbers have no sign if `_Unsigned` says so. Of
     MATLAB's version 7.3, arrays of structures and cells are STRUCT(1).FIELD and CELL{1}. No link is followed,
     neither within the file nor to another one, and no object or text is read; a dataset whose numbers lie in other
     files is none. A process of its own reads the file, since the library breaks off at some that are damaged.
@@ -61,22 +64,37 @@ class Dataset:
     def __getitem__(self, key: Any) -> np.ndarray:
         """Read all of it, in its unit."""
         stored = self._file.read(self._number)
-        absent = [_number(self.attributes[name]) for name in MISSING if name in self.attributes]
-        scale, offset = (_number(self.attributes.get(name)) for name in (SCALE, OFFSET))
-        if scale is None and offset is None and not absent:
+        is_unsigned = stored.dtype.kind == "i" and str(self.attributes.get(UNSIGNED)).lower() == "true"
+        stored = stored.view(stored.dtype.str.replace("i", "u")) if is_unsigned else stored
+        scale, offset, least, greatest = (self._number_of(name) for name in (SCALE, OFFSET, LEAST, GREATEST))
+        absent = [one for name in MISSING for one in self._numbers_of(name)]
+        if RANGE in self.attributes:
+            least, greatest = self._numbers_of(RANGE)
+        if is_unsigned:  # the numbers of attributes have the type of what is stored
+            absent = [one % 256**stored.itemsize for one in absent]
+        if all(one is None for one in (scale, offset, least, greatest)) and not absent:
             return stored
-        values = stored * (1.0 if scale is None else scale) + (0.0 if offset is None else offset)
+        values = stored.astype(np.float64) * (1.0 if scale is None else scale) + (offset or 0.0)
         for one in absent:
-            values = np.where(stored == one, np.nan, values)
+            values[stored == one] = np.nan
+        values[stored < (-np.inf if least is None else least)] = np.nan
+        values[stored > (np.inf if greatest is None else greatest)] = np.nan
         return values
 
+    def _number_of(self, name: str) -> float | int | None:
+        """An attribute that is a number, or an array of one; None for none."""
+        some = self._numbers_of(name)
+        if len(some) > 1:
+            raise ValueError(f"the attribute {name}={some} is no number")
+        return some[0] if some else None
 
-def _number(value: Any) -> float | int | None:
-    """An attribute that is a number, or an array of one; None for none."""
-    value = value[0] if isinstance(value, list) and len(value) == 1 else value
-    if value is None or isinstance(value, int | float):
-        return value
-    raise ValueError(f"the attribute {value!r} is no number")
+    def _numbers_of(self, name: str) -> list[float | int]:
+        """The numbers of an attribute, empty for none."""
+        value = self.attributes.get(name, [])
+        some = value if isinstance(value, list) else [value]
+        if not all(isinstance(one, int | float) for one in some):
+            raise ValueError(f"the attribute {name}={value!r} is no number")
+        return some
 
 
 def _unit(one: Dataset) -> str:

@@ -24,8 +24,12 @@ REFERENCES = "#refs#"  # where MATLAB keeps what its cells and arrays of structu
 MANY = {"{}": "a cell array", "()": "an array of structures"}
 DEEPEST = 16  # groups within groups
 MOST_OBJECTS = 20_000  # of a file
+LONGEST = 400  # letters of a text: no number and no date is longer
 SECONDS = 600  # of processor time
-TOLD = ("units", "unit", "scale_factor", "add_offset", "_fillvalue", "missing_value")  # attributes, in any case
+TOLD = (  # attributes, in any case
+    *("units", "unit", "scale_factor", "add_offset", "_fillvalue", "missing_value"),
+    *("valid_min", "valid_max", "valid_range", "_unsigned"),
+)
 
 
 class Walk:
@@ -53,7 +57,10 @@ class Walk:
                     continue
                 one = group[key]
                 number = _address(one)
-                if number in self._seen or key == REFERENCES:
+                if key == REFERENCES:
+                    continue
+                if number in self._seen and isinstance(one, h5py.Group):  # of which there might be no end
+                    self.found[own] = "a group that has another name, too"
                     continue
                 self._seen.add(number)
                 self._add(one, own, depth, _text(group.attrs.get(CLASS)) == "struct")
@@ -85,6 +92,8 @@ class Walk:
             self.found[name] = "kept in another file"
         elif one.chunks is not None and math.prod(one.chunks) * one.dtype.itemsize > self._most:
             self.found[name] = "packed in parts that are too large"
+        elif one.size and not one.id.get_storage_size():
+            self.found[name] = "never written"
         elif one.attrs.get(EMPTY, 0) or kind == "char" or one.shape is None:
             return
         elif h5py.check_ref_dtype(one.dtype) is h5py.Reference and (kind == "cell" or (in_structure and not kind)):
@@ -134,10 +143,17 @@ def _described(one: Any, field: str | None) -> dict[str, Any]:
     told = (
         {}
         if field is not None
-        else {key: _plain(value) for key, value in one.attrs.items() if key.lower() in TOLD}
+        else {key: _plain(value) for key, value in one.attrs.items() if key.lower() in TOLD and _is_some(value)}
     )
     plain = kind.str if kind.kind in NUMERIC else str(kind)
     return {"shape": list(one.shape), "kind": kind.kind, "dtype": plain, "attributes": told}
+
+
+def _is_some(value: Any) -> bool:
+    """Whether an attribute has a value."""
+    import h5py
+
+    return not isinstance(value, h5py.Empty)
 
 
 def _plain(value: Any) -> Any:
@@ -236,7 +252,7 @@ def main() -> None:
             if values.dtype.kind in SENT:
                 told, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
             else:
-                told, data = {"texts": [str(one) for one in values.reshape(-1)]}, memoryview(b"")
+                told, data = {"texts": [str(one)[:LONGEST] for one in values.reshape(-1)]}, memoryview(b"")
         except Exception as error:
             answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         else:
