@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ def array_of_transforms(defined: dict, kind: str) -> str:
 
     Source: ROS, tf2_msgs/TFMessage, tf/tfMessage, geometry_msgs/TransformStamped.
     """
-    fields = defined[kind][1] if kind in defined else ()
+    fields: Sequence[Any] = defined[kind][1] if kind in defined else ()
     if len(fields) != 1 or not _has_frames(dict(defined.get(STAMPED, ((), ()))[1]), defined):
         return ""
     ((name, (node, what)),) = fields
