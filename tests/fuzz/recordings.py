@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.io import savemat
 
 from tests.fuzz.files import _damaged
 from thruster_env.plants.logs.recorders.registry import contents, read
@@ -140,6 +141,38 @@ def damaged_tables(rng: np.random.Generator, seconds: float) -> str:
             except ValueError as error:
                 assert str(error) and "\n" not in str(error) and "None" not in str(error), repr(error)
                 counts["refused"] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
+def flipped_bits(rng: np.random.Generator, seconds: float) -> str:
+    """Flipped bits of npz and MATLAB files whose arrays have check sums: the numbers of the file, or one line."""
+    counts, end = Counter(), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        while not counts or time.monotonic() < end:
+            columns = {"t": 0.1 * np.arange(900), "voltage": np.round(rng.normal(size=900), 2)}
+            path = Path(folder) / f"a{rng.choice(['.npz', '.mat'])}"
+            if path.suffix == ".mat":
+                savemat(path, columns, do_compression=True)
+            else:
+                rng.choice([np.savez, np.savez_compressed])(path, **columns)
+            data = path.read_bytes()
+            for _ in range(50):
+                bad, first = bytearray(data), 128 if path.suffix == ".mat" else 0
+                for place in rng.integers(first, len(bad), rng.integers(1, 3)):
+                    bad[place] ^= 1 << int(rng.integers(8))
+                path.write_bytes(bad)
+                try:
+                    is_table = path.suffix == ".npz"
+                    some = (
+                        {one: read_table(path).numbers(one) for one in columns} if is_table else read(path, None)
+                    )
+                except ValueError as error:
+                    assert str(error) and "\n" not in str(error), repr(error)
+                    counts["refused"] += 1
+                    continue
+                for name, values in columns.items():
+                    np.testing.assert_array_equal(some[name] if is_table else some[name].values, values)
+                counts["read"] += 1
     return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
 
 

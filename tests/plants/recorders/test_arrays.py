@@ -186,6 +186,8 @@ def test_flipped_bits_of_packed_arrays_are_found_by_their_check_sum(tmp_path):
             np.testing.assert_array_equal(some[name].values, one)
         counts["same"] += 1
     assert counts["refused"] > 250
+    path.write_bytes(data + data[128:135])
+    refused(path, "it ends within an array")
 
 
 def test_attributes_of_valid_numbers_and_of_signs(tmp_path):

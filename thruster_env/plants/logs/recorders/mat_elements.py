@@ -61,6 +61,8 @@ def arrays_of(path: Path) -> dict[str, Any]:
             total += len(data)
             for element in _elements(data, 0, len(data), order):
                 _add(data, element, order, "", found, path)
+    if tag:
+        raise ValueError("it ends within an array")
     return found
 
 
