@@ -329,3 +329,14 @@ def test_a_smoother_warns_as_the_filter_does(name, lag):
             filters.smooth(filter_, None, inputs, z, lag)
     assert [str(one.message) for one in caught] == [str(one.message) for one in of_run]
     assert caught[0].filename == __file__
+
+
+@pytest.mark.usefixtures("as_python")
+def test_runs_that_begin_where_they_are_measured_are_repeated_from_there():
+    inputs, z = data(2, lost=1)
+    runs = [(u, 0.1 + 0.01 * i + rows) for i in range(3) for u, rows in zip(inputs, z, strict=True)]
+    failing = model(**FAILING["f(x, u) is NaN"][1])
+    problem = RunsProblem(runs, failing, start="measurement", held_out=[0, 1])
+    assert (problem.model().prior_cov != failing.prior_cov).any()
+    found = evaluate(make_filter("ekf", problem.model()), problem.data(range(6)), None)
+    assert found.divergences and found.restarts.cause == "f(x, u) is NaN" and found.restarts.states == ("b",)
