@@ -35,12 +35,12 @@ LEAVES = ("x", "y", "x", "y", "49.0", "0.1", "3.0", "7", "-2.5", "0.5", "1", "2"
 OPERATORS = ("+", "-", "*", "/", "%", "//", "+", "*", "%")
 OF_ONE = (
     *("abs({})", "-({})", "float(math.floor({}))", "float(math.ceil({}))", "np.floor({})", "float(round({}))"),
-    *("np.trunc({})", "np.sign({})", "np.round({})", "math.fabs({})", "float({})", "np.rint({})"),
+    *("np.trunc({})", "np.sign({})", "np.round(float({}))", "math.fabs({})", "float({})", "np.rint(float({}))"),
     *(
         "np.isnan({}) * 1.0",
         "np.isfinite({}) * 2.0",
-        "np.logical_not({})",
-        "np.square({})",
+        "bool(np.logical_not({}))",
+        "np.square(float({}))",  # of a truth value NumPy has eight bits, of its rounding sixteen
         "np.heaviside({}, 0.5)",
         "math.copysign({}, x)",
     ),
@@ -127,6 +127,8 @@ class Expression:
 
     def _comparison(self, depth: int) -> str:
         text = str(self._rng.choice(COMPARED)).format(self._drawn(depth), self._drawn(depth))
+        if "np." in text:  # of NumPy's truth values a rest by zero is 0, of Python's there is none
+            text = f"bool({text})"
         return text if re.search(VARIABLE, text) else "x > 1.0"
 
     @property
