@@ -202,7 +202,7 @@ class Live:
         return closeness(self._step, resolution_of(max(abs(time), abs(self.time)), self._resolution))
 
     def _measured(self, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> np.ndarray:
-        values = as_floats(z).reshape(-1)
+        values = as_floats([z] if np.ndim(z) == 0 else z).reshape(-1)  # a single None is missing, too
         names = [sensor] if isinstance(sensor, str) else list(self._channels) if sensor is None else list(sensor)
         if len(values) != len(names):
             raise ValueError(f"z must have a number for each of {', '.join(names)}, but got {short_repr(z)}")

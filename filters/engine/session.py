@@ -14,7 +14,7 @@ from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places, own_place
-from thruster_env.numerics.checks import as_floats, covariance, finite, positive
+from thruster_env.numerics.checks import covariance, finite, positive
 from thruster_env.numerics.direct import direct
 from thruster_env.plants.diffusion import same_dt
 from thruster_env.plants.layout import number_places, with_root
@@ -71,7 +71,8 @@ class Session:
         self._extras = self._row[places.extras : places.extras + kernels.extras]
         values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
         self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
-        self._scalar = len(self._u) == m == 1
+        self._p, self._m = model.inputs, m
+        self._scalar = self._p == m == 1
         self._prior_variances = model.prior_cov.diagonal()
         self._first_values, self._is_direct = values.copy(), False
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
@@ -222,7 +223,7 @@ class Session:
     def start(self, key, z) -> None:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
         self.set_key(key)
-        self._z[:] = as_floats(z)
+        self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(START + UPDATE)
         self._call_directly()
 
@@ -230,6 +231,8 @@ class Session:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
         try:  # what `_set` does, whose call would take a tenth of the step
             if type(z) is MaskedArray or type(u) is MaskedArray:  # whose numbers behind the mask are none
+                raise TypeError
+            if len(z) != self._m or self._p and len(u) != self._p:  # NumPy would repeat a single number
                 raise TypeError
             if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
                 self._values[0], self._values[1] = u[0], z[0]

@@ -1,12 +1,15 @@
 """Missing samples in every form, masked, None or pandas.NA: NaN on all paths."""
 
+import math
+
 import numpy as np
 import pytest
 
 import filters
-from filters import run, smooth
+from filters import make_filter, run, smooth
 from filters.likelihood import likelihood
-from tests.models import line_model, simulated, small
+from tests.kalman_by_hand import LinearModel
+from tests.models import line_model, simulated, small, wide_model
 from thruster_env.numerics.checks import as_floats
 from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.logs.log import Log
@@ -77,3 +80,22 @@ def test_none_alone_and_text_are_no_numbers():
         with pytest.raises(ValueError, match="an array must be one of numbers"):
             as_floats(value)
     np.testing.assert_array_equal(as_floats([1, None, np.ma.masked, 2.5]), [1.0, np.nan, np.nan, 2.5])
+
+
+@pytest.mark.parametrize("missing", [None, np.ma.masked, math.nan, NAType()])
+def test_live_takes_a_single_sample_that_is_missing(missing, as_python):
+    live = make_filter("ekf", LinearModel(np.random.default_rng(0)).model()).live()
+    live.start(0.0)
+    before = live.mean.copy()
+    live.update(0.0, "z0", missing)
+    np.testing.assert_array_equal(live.mean, before)
+
+
+@pytest.mark.parametrize("z", [[1.0], [[1.0, 2.0]], [1.0, 2.0, 3.0], 1.0])
+def test_a_session_takes_one_number_a_channel(z, as_python):
+    session = small("ekf", wide_model()).session()
+    with pytest.raises(ValueError, match="z must be 2 numbers"):
+        session.start((0, 0), z)
+    session.start((0, 0), [1.0, 2.0])
+    with pytest.raises(ValueError, match="z must be 2 numbers"):
+        session.step([0.1, 0.2], z)
