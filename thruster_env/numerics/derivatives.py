@@ -113,7 +113,7 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
         point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
         lines.append(f"y{j} = function({point}, {arguments})")
     source = matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])")
-    names = {"function": inlined(function), "slope": slope_by_complex_step}
+    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step}
     made = written_out("jacobian", f"x, {arguments}", *lines, source, **names)
     _EXACT.add(made)
     return made
