@@ -55,6 +55,7 @@ def ctrl_c_in_the_last_moments(rng: np.random.Generator, seconds: float) -> str:
         what = f"{command!r} interrupted {wait} s after its {'first output' if at_output else 'packages'}"
         line, pipe = [sys.executable, "-c", READY, *command.split()], subprocess.PIPE
         process = subprocess.Popen(line, stdout=pipe, stderr=pipe, bufsize=0)
+        assert process.stderr.readline() == b"ready\n"
         first = process.stdout.read(1) if command not in outputs or at_output else b""
         if command in outputs:
             time.sleep(wait if at_output else 5.0 * wait)
