@@ -40,4 +40,5 @@ def makes_functions(maker: Callable) -> Callable:
     def make(*arguments):
         return of_first(*map(first_equal, arguments))
 
+    make.cache_clear = of_first.cache_clear  # type: ignore[attr-defined]
     return make
