@@ -236,7 +236,7 @@ def test_what_a_window_does_not_allow_is_refused():
             use(filter_)
     nothing = np.zeros((1, 1, 2)), np.zeros((1, 2, 2))
     with pytest.raises(ValueError, match="one gain for all states, but got 'ienkf' with a window of 2"):
-        smooth_ensembles(filter_, np.array([KEY]), *nothing, 1)
+        smooth_ensembles(filter_, np.array([KEY]), *nothing, 1, (np.empty((0, 2, 2)), np.empty((0, 2, 2))))
     with pytest.raises(ValueError, match="window of a filter with adaptive_inflation 0.1 must be 0, but got 2"):
         make_filter("ienkf", plane_model(), window=2, adaptive_inflation=0.1)
     with pytest.raises(ValueError, match="window must be a whole number of at least 0, but got -1"):

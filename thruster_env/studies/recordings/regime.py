@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.plants.shape import observation_slopes, transition_slopes
+from filters.engine.batch import run as run_filter
+from filters.gaussian.extended import ExtendedKalmanFilter
 from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.studies.recordings.measure import ratios
 from thruster_env.studies.recordings.model import DT, on_line
@@ -30,11 +31,7 @@ class Regime(NamedTuple):
 
 
 def regimes(model: StateSpaceModel, runs: Sequence[Recording], factors: Sequence[float] = FACTORS) -> list[Regime]:
-    """An extended Kalman filter with each factor on Q after reversals.
-
-    No filter of the project changes Q during a run: this one is plain NumPy. With a factor of 1 it is equal to the
-    project's filter, which a test checks.
-    """
+    """The extended Kalman filter with each factor on Q after reversals."""
     seen, found = on_line(model), []
     for factor in factors:
         parts = [_filtered(seen, run, factor) for run in runs]
@@ -54,23 +51,14 @@ def after_reversal(command: np.ndarray) -> np.ndarray:
 
 def _filtered(model: StateSpaceModel, run: Recording, factor: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Thrust (K + 1,), NIS of the steps that were measured, and their log-likelihood."""
-    c, x, p = model.constants, model.prior_mean.copy(), model.prior_cov.copy()
-    r, thrust = model.measurement_noise_cov[0, 0], np.empty(len(run.times))
-    squares, likelihood, large = [], 0.0, after_reversal(run.command)
-    by_motion, by_sight = (make(model.functions, model.shape) for make in (transition_slopes, observation_slopes))
-    for k, z in enumerate(run.tachometer):
-        if k:
-            u = (run.command[k - 1],)
-            for _ in range(model.substeps):
-                f = np.array(by_motion(tuple(x), model.scales, u, c))
-                x, p = np.array(model.transition(tuple(x), u, c)), f @ p @ f.T
-            p = p + model.process_noise_cov * (factor if large[k - 1] else 1.0)
-        if not np.isnan(z):
-            h = np.array(by_sight(tuple(x), model.scales, c))[0]
-            s, v = h @ p @ h + r, z - model.observe(tuple(x), c)[0]
-            gain = p @ h / s
-            x, p = x + gain * v, p - np.outer(gain, gain) * s
-            squares.append(v * v / s)
-            likelihood -= 0.5 * (v * v / s + np.log(2 * np.pi * s))
-        thrust[k] = model.outputs["T"].function(tuple(x), c)
-    return thrust, np.array(squares), likelihood
+    factors = np.where(after_reversal(run.command)[:-1], factor, 1.0)
+    estimates = run_filter(
+        ExtendedKalmanFilter(model=model),
+        inputs=run.command[None, :-1, None],
+        measurements=run.tachometer[None, :, None],
+        process_noise_covs=factors[:, None, None] * model.process_noise_cov,
+    )
+    thrust = [model.outputs["T"].function(tuple(mean), model.constants) for mean in estimates.means[0]]
+    measured = ~np.isnan(run.tachometer)
+    squares = estimates.innovations[0, measured, 0] ** 2 / estimates.innovation_covs[0, measured, 0, 0]
+    return np.array(thrust), squares, float(estimates.log_likelihoods.sum())
