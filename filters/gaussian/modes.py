@@ -93,13 +93,14 @@ def mode_kernels(
     def update(memory, z, numbers, size):
         row, _, _ = memory
         recall(row)
+        begun = 0.0
         for j in range(count):
-            row[lost] -= row[first + j * stride + lost]
+            begun -= row[first + j * stride + lost]
         update_all(memory, z, numbers)
         for j in range(count):
-            row[lost] += row[first + j * stride + lost]  # a mode that begins anew counts
+            begun += row[first + j * stride + lost]
         of_innovations(row, probabilities, innovation)
-        row[level] = 0.0
+        row[level], least = 0.0, -math.inf
         if anything_measured(z):
             least = math.inf
             for j in range(count):
@@ -111,6 +112,8 @@ def mode_kernels(
                 if row[part + lost] > 0.0:  # it has begun anew: it says nothing of this measurement
                     row[part + lost], row[part + level] = 0.0, least - LOST if least < math.inf else -math.inf
             row[level] = weigh(row, logs, probabilities)
+        if begun > 0.0 and least < math.inf:
+            row[lost] += 1.0  # modes begin anew: of all of them the likelihood is 0, and the whole belief restarts
         blend(row, probabilities, numbers, 0)
 
     kept = probabilities - first
