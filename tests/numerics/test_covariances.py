@@ -128,3 +128,10 @@ def test_densities_of_a_q_are_those_it_was_made_of(dt, unit):
     a, densities = a * units[:, None] / units, in_units(np.diag([0.0, 0.0, 2.0]), *units)
     found = densities_of(noise_of_densities(densities, a, dt), a, dt)
     np.testing.assert_allclose(found, densities, rtol=1e-9)
+
+
+def test_a_variance_far_below_zero_is_refused_where_its_correlation_is_beyond_float64():
+    filter_ = make_filter("ekf", plane_model(prior_cov=[1e-4] * len(plane_model().prior_mean)))
+    belief = filter_.init((1, 2))
+    with pytest.raises(ValueError, match="cov of a belief must be"):
+        filter_.update(belief._replace(cov=np.full_like(belief.cov, -1e308)), np.zeros(filter_.model.m))

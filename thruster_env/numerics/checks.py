@@ -230,17 +230,21 @@ def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> 
     """Least eigenvalues (...) of the correlations of covariances (..., d, d), and how asymmetric these are.
 
     Neither depends on units. A least eigenvalue is -inf where a variance is negative, or zero beside a covariance
-    that is not. Covariances are divided by `variances` (..., d) in place of their own where those are larger.
+    that is not, or where correlations are beyond float64. Covariances are divided by `variances` (..., d) in place
+    of their own where those are larger.
     """
     own = np.diagonal(covs, axis1=-2, axis2=-1)
     units = np.sqrt(np.maximum(own, 0.0 if variances is None else variances))
     known = units > 0.0
     divisors = np.where(known, units, 1.0)
-    scaled = covs / divisors[..., None] / divisors[..., None, :]
+    with np.errstate(over="ignore"):
+        scaled = covs / divisors[..., None] / divisors[..., None, :]
+    beyond = ~np.isfinite(scaled).all(axis=(-1, -2))
+    scaled = np.where(beyond[..., None, None], 0.0, scaled)
     turned = np.swapaxes(scaled, -1, -2)
     least = np.linalg.eigvalsh(0.5 * (scaled + turned))[..., 0]
     alone = ~(known[..., None] & known[..., None, :]) & (covs != 0.0)
-    impossible = alone.any(axis=(-1, -2)) | ((own < 0.0).any(axis=-1) if variances is None else False)
+    impossible = beyond | alone.any(axis=(-1, -2)) | ((own < 0.0).any(axis=-1) if variances is None else False)
     return np.where(impossible, -np.inf, least), np.abs(scaled - turned).max(axis=(-1, -2))
 
 
