@@ -239,7 +239,7 @@ def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> 
     divisors = np.where(known, units, 1.0)
     with np.errstate(over="ignore"):
         scaled = covs / divisors[..., None] / divisors[..., None, :]
-    beyond = ~np.isfinite(scaled).all(axis=(-1, -2))
+    beyond = np.asarray(~np.isfinite(scaled).all(axis=(-1, -2)))
     scaled = np.where(beyond[..., None, None], 0.0, scaled)
     turned = np.swapaxes(scaled, -1, -2)
     least = np.linalg.eigvalsh(0.5 * (scaled + turned))[..., 0]
