@@ -169,8 +169,7 @@ def of_floats_alone(gain=2.0, rate=1.0, r=0.04):
     """It cannot be traced: each value of a parameter is another function, along which there are differences."""
 
     def move(x, u, c):
-        if not isinstance(x[0], float):
-            raise TypeError("it asks for a float")
+        int(x[0])  # asks for a float
         return (x[0] + DT * (gain * u[0] - rate * x[0]),)
 
     return StateSpaceModel(transition=move, observe=observe, measurement_noise_cov=[r], **REST)
