@@ -27,7 +27,7 @@ def swing_if(x, u, c):
 def swing_by_kind(x, u, c):
     """The pendulum, but for numbers that are no floats."""
     found = swing(x, u, c)
-    return found if isinstance(x[0], float) else (found[0], 0.5 * found[1])
+    return found if hasattr(x[0], "is_integer") else (found[0], 0.5 * found[1])
 
 
 def swing_undefined(x, u, c):
