@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from thruster_env.numerics.algebra.graphs import Number, needed_by
+from thruster_env.numerics.algebra.graphs import COMPARISONS, Number, needed_by
 from thruster_env.numerics.algebra.magnitudes import POSITIVE
 from thruster_env.numerics.algebra.precision import as_single
 
@@ -24,12 +24,7 @@ WORK: dict[str, Callable] = {
     "/": operator.truediv,
     "pow": operator.pow,
     "negative": operator.neg,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "==": operator.eq,
-    "!=": operator.ne,
+    **COMPARISONS,
     "and": operator.and_,
     "or": operator.or_,
 }
