@@ -330,31 +330,61 @@ static int take_given(int i, const char *word)
     return take(i, bare, unit);
 }
 
-/* The column of a quantity by its header, name or symbol. */
-static int take_own(int i)
+/* How a header may name a quantity, in the order in which they are tried. */
+enum { BY_NAME, BY_SYMBOL, BY_SYMBOL_AND_UNIT, BY_OWN_HEADER, NAMINGS };
+
+static int names_quantity(int naming, int k, int i)
 {
-    static char base[LONGEST], unit[LONGEST], its[LONGEST];
-    int chosen = -1;
+    static char base[LONGEST], unit[LONGEST];
+
+    part(titles[k], base, unit);
+    switch (naming) {
+    case BY_NAME:
+        return names[i][0] != '\0' && is_named(base, names[i], 1);
+    case BY_SYMBOL:
+        return is_named(titles[k], symbols[i], 0);
+    case BY_SYMBOL_AND_UNIT:
+        return is_named(base, symbols[i], 0);
+    default:
+        return strcmp(titles[k], headers[i]) == 0;
+    }
+}
+
+/* The first free column that names a quantity; names of all quantities come before symbols. */
+static int take_named(int naming, int i)
+{
+    static char base[LONGEST], unit[LONGEST];
 
     for (int k = 0; k < width; k++) {
-        int is_symbol = is_named(titles[k], symbols[i], 0), is_own = strcmp(titles[k], headers[i]) == 0;
-        part(titles[k], base, unit);
-        if (is_symbol || is_own || (names[i][0] != '\0' && is_named(base, names[i], 1)) ||
-            is_named(base, symbols[i], 0)) {
-            if (chosen >= 0) {
-                fprintf(stderr, "line %ld: a column must be there once for %s, but there are %s and %s\n",
-                        line_number, headers[i], titles[chosen], titles[k]);
-                return 0;
-            }
-            chosen = k;
-            strcpy(its, is_symbol || is_own ? "" : unit);
+        int is_free = 1;
+        for (int other = 0; other < COLUMNS; other++) {
+            is_free = is_free && column_of[other] != k;
+        }
+        if (is_free && names_quantity(naming, k, i)) {
+            part(titles[k], base, unit);
+            return take(i, k, naming == BY_SYMBOL || naming == BY_OWN_HEADER ? "" : unit);
         }
     }
-    if (chosen < 0) {
-        fprintf(stderr, "a log must have a column %s, or its headers be given\n", headers[i]);
-        return 0;
+    return 1;
+}
+
+/* The columns of all quantities by their headers. */
+static int take_all_named(void)
+{
+    for (int naming = 0; naming < NAMINGS; naming++) {
+        for (int i = 0; i < COLUMNS; i++) {
+            if (column_of[i] < 0 && !take_named(naming, i)) {
+                return 0;
+            }
+        }
     }
-    return take(i, chosen, its);
+    for (int i = 0; i < COLUMNS; i++) {
+        if (column_of[i] < 0) {
+            fprintf(stderr, "a log must have a column %s, or its headers be given\n", headers[i]);
+            return 0;
+        }
+    }
+    return 1;
 }
 
 /* The column of times, if there is one. */
@@ -420,7 +450,13 @@ static int read_headers(char **words)
         }
     }
     for (int i = 0; i < COLUMNS; i++) {
-        if (!(words != NULL ? take_given(i, words[i]) : take_own(i))) {
+        column_of[i] = -1;
+    }
+    if (words == NULL) {
+        return take_all_named() && take_time();
+    }
+    for (int i = 0; i < COLUMNS; i++) {
+        if (!take_given(i, words[i])) {
             return 0;
         }
     }

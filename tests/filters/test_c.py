@@ -416,8 +416,8 @@ def test_a_project_filters_a_log_as_estimate_does(name, which, single, tmp_path)
 
 
 def log_of(model, inputs, z):
-    """A log as CSV, with a column that nobody asked for."""
-    names = ["time_s", "other", *["voltage_V"] * model.inputs]
+    """A log as CSV; the second column is the true thrust, whose symbol a measured one could have."""
+    names = ["time_s", "thrust_N", *["voltage_V"] * model.inputs]
     names += ["measured_thrust_N"] if model.inputs else ["z_1"]
     rows = [",".join(names)]
     for k, measured in enumerate(z):
@@ -438,11 +438,7 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
     assert subprocess.run(command, cwd=tmp_path).returncode == 0
     for words, log, told in [
         ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
-        (
-            [],
-            "voltage_V,V_s,thrust\n",
-            "line 1: a column must be there once for voltage_V, but there are voltage_V and V_s\n",
-        ),
+        ([], "V_s,force\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
         (["u", "z"], "u,thrust\n", "a log must have a column z, or its headers be given\n"),
         (["u"], "u,z\n", "give no header, or 2, inputs first\n"),
         (

@@ -157,7 +157,8 @@ def _damaged(rng: np.random.Generator) -> tuple[bytes, bool]:
     force, speed = np.sign(np.sin(np.arange(rows) / 3.0)), rng.normal(size=rows)
     table = [[repr(float(one)) for one in row] for row in zip(times, force, speed, strict=True)]
     is_time = has_times and headers["t"] != "clock"
-    lines = [[headers["t"], headers["force"], headers["speed"], "other"], *[[*row, "7"] for row in table]]
+    also = "other" if rng.random() < 0.8 else str(rng.choice([*HEADERS["force"], *HEADERS["speed"], "clock"]))
+    lines = [[headers["t"], headers["force"], headers["speed"], also], *[[*row, "7"] for row in table]]
     if not has_times:
         lines = [line[1:] for line in lines]
     for _ in range(int(rng.choice([0, 1, 2, 4], p=[0.2, 0.4, 0.2, 0.2]))):
