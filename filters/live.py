@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from filters.engine.belief import Belief
+from filters.engine.checks import vector_like
 from filters.engine.session import Session
 from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
 from filters.restarts import FirstRestart, Restarts
@@ -174,7 +175,8 @@ class Live:
             z: as many numbers.
 
         Raises:
-            ValueError: for an unknown sensor, NaN where that is refused, or a sample that is too late.
+            ValueError: for an unknown sensor, an infinite number, NaN where that is refused, or a sample that is
+                too late.
         """
         self._has_begun()
         time, given = finite("time", time), self._measured(sensor, z)
@@ -213,6 +215,7 @@ class Live:
         return given
 
     def _checked(self, values: np.ndarray) -> np.ndarray:
+        vector_like("z", values, values, missing_allowed=True)
         if not self._skips and np.isnan(values).any():
             raise ValueError(f"z must not be NaN with skip_missing=False, but got {short_repr(values.tolist())}")
         return values

@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from filters.engine.belief import Kernels
+from filters.engine.checks import vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, build_operation, new_memory
 from filters.engine.layout import memory_places
 from filters.filter import Filter
@@ -58,6 +59,13 @@ class Beliefs:
 
     def _do(self, tasks: np.ndarray, u: np.ndarray, z: np.ndarray) -> None:
         self._u[:], self._z[:] = u, z
+        at_work, predicts = tasks != IDLE, tasks == STEP
+        wrong = np.isinf(self._z).any(1) & at_work | ~np.isfinite(self._u).all(1) & predicts
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            if predicts[i]:
+                vector_like(f"u of copy {i}", self._u[i], self._u[i], missing_allowed=False)
+            vector_like(f"z of copy {i}", self._z[i], self._z[i], missing_allowed=True)
         arrays = tasks, self._rows, self._tables, self._u, self._z
         arguments = *self._own, self._size, *arrays, self._numbers
         worker_threads().run(self._operate, len(tasks), *arguments, alone=len(tasks) < THREADED_COPIES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from math import inf
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from thruster_env.numerics.streams import GROUP
 from thruster_env.plants.layout import LANES, number_places, padded
 
 START, PREDICT, UPDATE = 1, 2, 4  # what an operation does, to be added
+REFUSED = -1  # what it returns of an input that is not finite, or an infinite measurement: it has done nothing
 
 
 def build_operation(kernels: Kernels) -> Callable:
@@ -29,6 +31,13 @@ def build_operation(kernels: Kernels) -> Callable:
     def operate(row, table, draws, size, given, numbers, task):
         fingerprint  # noqa: B018 - part of the cache's key
         memory, inputs = (row, table, draws), given.shape[0] - m
+        for i in range(given.shape[0]):
+            if i < inputs:
+                wrong = task & PREDICT and not abs(given[i]) < inf
+            else:
+                wrong = task & UPDATE and abs(given[i]) == inf
+            if wrong:
+                return REFUSED
         if task & START:
             row[step] = 0.0
             row[divergences] = 0.0
@@ -98,7 +107,7 @@ def _build_batch(kernels: Kernels) -> Callable:
 
 
 def operation(kernels: Kernels) -> CompiledOrPython:
-    """`operate(*memory, size, given, numbers, task)` on one belief; it returns how often that diverged.
+    """`operate(*memory, size, given, numbers, task)` on one belief; it returns its number of restarts, or REFUSED.
 
     given = (u, z) in one array, because each further array costs some 80 ns a call; task is a sum of START,
     PREDICT and UPDATE.

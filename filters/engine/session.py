@@ -12,7 +12,7 @@ from numpy.ma import MaskedArray
 
 from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
-from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
+from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places, own_place
 from thruster_env.numerics.checks import covariance, finite, positive
 from thruster_env.numerics.direct import direct
@@ -228,7 +228,10 @@ class Session:
         self._call_directly()
 
     def step(self, u, z) -> None:
-        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
+        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel.
+
+        Raises ValueError, before anything changes, for an input that is not finite and an infinite measurement.
+        """
         try:  # what `_set` does, whose call would take a tenth of the step
             if type(z) is MaskedArray or type(u) is MaskedArray:  # whose numbers behind the mask are none
                 raise TypeError
@@ -240,7 +243,10 @@ class Session:
                 self._u[:], self._z[:] = u, z
         except (TypeError, ValueError, LookupError):  # they are not looked at before: a step has to be quick
             self._set(u, z)
-        self.divergences = self._operate(*self._given, STEP)
+        found = self._operate(*self._given, STEP)
+        if found == REFUSED:
+            self._set(u, z)  # which says why
+        self.divergences = found
 
     def _set(self, u, z) -> None:
         self._u[:] = vector_like("u", u, self._u, missing_allowed=False)

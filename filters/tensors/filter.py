@@ -163,7 +163,7 @@ class TensorFilter:
 
     def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
         """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
-        u = self._tensor("u", u, (self._model.inputs,))
+        u = self._finite("u", u, (self._model.inputs,))
         known, step = (belief.mean, belief.cov, belief.kept), belief.step + 1
         draw, substeps = self._normals(belief.key, step), self._model.substeps
         mean, cov, kept = self._stages.predict(self._known(), known, u, substeps, draw)
@@ -174,7 +174,7 @@ class TensorFilter:
 
         A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
         """
-        z = self._tensor("z", z, (self._model.m,))
+        z = self._finite("z", z, (self._model.m,), missing_allowed=True)
         known = belief.mean, belief.cov, belief.kept
         draw = self._normals(belief.key, belief.step)
         (mean, cov, kept), (v, s, level) = self._stages.update(self._known(), known, z, draw)
@@ -200,12 +200,12 @@ class TensorFilter:
             keys: (..., 2), of an ensemble's random numbers; those of `filters.run` if None.
 
         Raises:
-            ValueError: if shapes do not fit.
+            ValueError: if shapes do not fit, an input is not finite, or a measurement is infinite.
         """
-        z = self._tensor("measurements", measurements, (self._model.m,))
+        z = self._finite("measurements", measurements, (self._model.m,), missing_allowed=True)
         if inputs is None:
             inputs = z.new_zeros(*z.shape[:-2], z.shape[-2] - 1, 0)
-        u = self._tensor("inputs", inputs, (self._model.inputs,))
+        u = self._finite("inputs", inputs, (self._model.inputs,))
         if z.ndim < 2 or u.ndim < 2 or u.shape[:-1] != (*z.shape[:-2], z.shape[-2] - 1):
             raise ValueError(
                 "inputs and measurements must have shapes (..., K, p) and (..., K + 1, m), but got "
@@ -295,6 +295,15 @@ class TensorFilter:
         if found.shape[found.ndim - len(shape) :] != shape:
             wanted = ", ".join(("...", *map(str, shape)))
             raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(found.shape)}")
+        return found
+
+    def _finite(self, name: str, value: Any, shape: tuple[int, ...], *, missing_allowed: bool = False) -> Tensor:
+        """The same; ValueError for infinite numbers, and NaN unless it may be missing."""
+        found = self._tensor(name, value, shape)
+        wrong = torch.isinf(found) if missing_allowed else ~torch.isfinite(found)
+        if wrong.any():
+            rule = "finite or NaN" if missing_allowed else "finite"
+            raise ValueError(f"{name} must be {rule}, but got {short_repr(found[wrong][0].item())}")
         return found
 
 
