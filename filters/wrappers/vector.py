@@ -90,6 +90,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         watches = monitor_of(monitor)
         found = [watch_of(watches, self.filter) for _ in range(self.num_envs)]
         self._watches = [one for one in found if one is not None]  # of all copies, or of none
+        self._reports: list = [None] * self.num_envs
         self._measured = list(split.measurements)
         self._done = np.zeros(self.num_envs, dtype=bool)
         self._low, self._high = actions.low.ravel(), actions.high.ravel()
@@ -105,7 +106,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         z = self._measurements(observations, info)
         self._start(which, z)
         self._done[which] = False
-        return self._observe(observations, z, info), info
+        return self._observe(observations, z, info, stepped=which), info
 
     def step(self, actions):
         """Step the env, then predict with the clipped actions and update with the measurements.
@@ -169,13 +170,23 @@ class EstimateStates(gym.vector.VectorWrapper):
             raise ValueError(
                 f"measurements must have shape {(self.num_envs, self._m)}, but got {short_repr(np.shape(z))}"
             )
-        valid = info.get("measurement_valid")
-        return z if valid is None else np.where(valid, z, np.nan)
+        reported, valid = info.get("_measurement"), info.get("measurement_valid")
+        if reported is not None and not np.all(reported):  # Gymnasium has zeros for copies that reported none
+            observed = as_floats(observations).reshape(self.num_envs, -1)[:, : self._m]
+            z = np.where(reported[:, None], z, observed)
+        if valid is None:
+            return z
+        flagged = info.get("_measurement_valid")
+        return np.where(valid if flagged is None else valid | ~flagged[:, None], z, np.nan)
 
-    def _observe(self, observations, z, info: dict[str, Any], mask: np.ndarray | None = None) -> np.ndarray:
+    def _observe(
+        self, observations, z, info: dict[str, Any], mask: np.ndarray | None = None, stepped=None
+    ) -> np.ndarray:
+        """Report copies of a mask; those of `stepped` (N,), by default all, have a new measurement."""
         n, m, beliefs = self._n, self.filter.model.m, self._beliefs
         mean, cov = beliefs.part("mean", n), beliefs.part("cov", n, n)
         there = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
+        stepped = there if stepped is None else stepped
         added = {
             "estimate": mean,
             "estimate_cov": cov,
@@ -186,11 +197,11 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self._lagged:
             added["smoothed"], added["smoothed_cov"] = beliefs.smoothed()
         if self._watches:
-            added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there)
+            added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there, stepped)
         info |= added
         info |= {f"_{key}": there for key in added}
         counts, given = added["estimate_divergences"], z[:, self._measured]
-        restarts = self._restarts.note(there, counts, (mean, cov), self._used, given)
+        restarts = self._restarts.note(stepped, counts, (mean, cov), self._used, given)
         if restarts is not None:
             said = np.array([one is not None for one in restarts])
             info |= {"estimate_restarts": restarts, "_estimate_restarts": said}
@@ -198,15 +209,17 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self._form == "belief":
             parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
         elif self._form == "measurement+estimate":
-            self._held = np.where(np.isnan(z), self._held, z)
+            self._held = np.where(np.isnan(z) | ~stepped[:, None], self._held, z)
             parts.insert(0, self._held)
         if self._appended:
             parts.append(observations[:, -self._appended :])
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _health(self, innovations: np.ndarray, covs: np.ndarray, z: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """What the monitors of copies that are there say, (N,) of objects."""
+    def _health(self, innovations: np.ndarray, covs: np.ndarray, z: np.ndarray, there, stepped) -> np.ndarray:
+        """Reports (N,) of the monitors, without a new measurement the last; None of copies that are not there."""
         found = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(there):
-            found[i] = self._watches[i].step(innovations[i], covs[i], z[i, self._measured])
+            if stepped[i]:
+                self._reports[i] = self._watches[i].step(innovations[i], covs[i], z[i, self._measured])
+            found[i] = self._reports[i]
         return found

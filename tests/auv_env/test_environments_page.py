@@ -18,8 +18,10 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_an_example_runs(code, capsys):
-    exec(compile(code, "docs/auv.md", "exec"), {})
+def test_an_example_runs_and_warns_of_nothing(code, capsys, recwarn):
+    names = {}
+    exec(compile(code, "docs/auv.md", "exec"), names)
+    assert len(names) > 1 and not recwarn.list and capsys.readouterr().err == ""
 
 
 def test_ids_suites_and_signals_are_named():

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from filters import FILTERS, EstimateState, EstimateStates
 from filters.wrappers.ids import ALIASES, filtered_id
+from thruster_env.plants.state_space import StateSpaceModel
 
 COPIES, STEPS = 3, 30
 MODES = ["NextStep", "SameStep", "Disabled"]
@@ -59,6 +61,77 @@ def test_a_copy_is_a_single_wrapped_env_over_several_episodes(filter_name, mode,
             begun = vector.reset(options={"reset_mask": ended})
             for i in np.flatnonzero(ended):
                 assert_copy(begun, i, singles[i].reset())
+
+
+class Oscillator(gym.Env):
+    """Somebody else's env: episodes end at random, and not every info has a measurement or a flag."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.steps = self.np_random.normal(size=2), 0
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        force = float(action[0]) - self.x[0]
+        self.x = self.x + 0.1 * np.array([self.x[1], force]) + 0.01 * self.np_random.normal(size=2)
+        self.steps += 1
+        info = {"measurement": self.x + 0.1 * self.np_random.normal(size=2)}
+        if self.steps > 1:
+            info["measurement_valid"] = self.np_random.random(2) > 0.3
+        return self.x.astype(np.float32), 0.0, bool(self.np_random.random() < 0.15), self.steps >= 5, info
+
+
+def oscillator():
+    return StateSpaceModel(
+        transition=lambda x, u, c: (x[0] + 0.1 * x[1], x[1] + 0.1 * (u[0] - x[0])),
+        observe=lambda x, c: (x[0], x[1]),
+        process_noise_cov=[1e-4] * 2,
+        measurement_noise_cov=[0.01] * 2,
+        prior_mean=[0.0] * 2,
+        prior_cov=[1.0] * 2,
+    )
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("filter_name", ["ekf", "enkf"])
+def test_a_copy_of_an_env_that_reports_a_measurement_now_and_then_is_a_single_env(as_python, filter_name, mode):
+    kind = {"filter": filter_name, "observation": "measurement+estimate", "model": oscillator(), "monitor": 100.0}
+    kind |= {"ensemble_size": 5} if filter_name == "enkf" else {}
+    vector = EstimateStates(SyncVectorEnv([Oscillator] * COPIES, autoreset_mode=mode), **kind)
+    singles = [EstimateState(Oscillator(), **kind) for _ in range(COPIES)]
+
+    def compare(i, found, expected):
+        (observations, info), (observation, single) = found, expected
+        np.testing.assert_array_equal(observations[i], observation)
+        assert info["health"][i] == single["health"]
+        for key in ("estimate", "estimate_cov", "innovation", "innovation_cov", "estimate_divergences"):
+            np.testing.assert_array_equal(info[key][i], single[key])
+
+    start = vector.reset(seed=[9, 2, 2])
+    for i, single in enumerate(singles):
+        compare(i, start, single.reset(seed=[9, 2, 2][i]))
+    ended = np.zeros(COPIES, dtype=bool)
+    for actions in np.random.default_rng(0).uniform(-2, 2, (20, COPIES, 1)).astype(np.float32):
+        observations, _, terminated, truncated, info = vector.step(actions)
+        latest = []
+        for i, single in enumerate(singles):
+            if mode == AutoresetMode.NEXT_STEP and ended[i]:
+                latest.append(single.reset())
+            else:
+                observation, _, *ends, expected = single.step(actions[i])
+                if mode == AutoresetMode.SAME_STEP and any(ends):
+                    compare(i, (info["final_obs"], info["final_info"]), (observation, expected))
+                    observation, expected = single.reset()
+                latest.append((observation, expected))
+            compare(i, (observations, info), latest[i])
+        ended = terminated | truncated
+        if mode == AutoresetMode.DISABLED and ended.any():
+            begun = vector.reset(options={"reset_mask": ended})
+            for i, single in enumerate(singles):
+                compare(i, begun, single.reset() if ended[i] else latest[i])
 
 
 def test_many_copies_on_all_cores_are_the_few():
