@@ -1,20 +1,11 @@
 """The part of a program in C that reads a log: the rules of `thruster_env.plants.logs`, or a line's number."""
 
 READER = r"""
-static char line[LONGEST], kept[LONGEST];
-static char *cells[MOST_CELLS], *titles[MOST_CELLS];
-static long line_number, empty_line;
-static char delimiter = ',';
-static int column_of[COLUMNS + 1];
+static char line[LONGEST], kept[LONGEST], *cells[MOST_CELLS], *titles[MOST_CELLS], time_text[40], delimiter = ',';
+static long line_number, empty_line, samples[COLUMNS], samples_of_rows;
+static int width, column_of[COLUMNS + 1], varies[COLUMNS], is_wrong, is_bare;
 static double factor_of[COLUMNS + 1], divisor_of[COLUMNS + 1], zero_of[COLUMNS + 1];
-static int width;
-static double numbers[COLUMNS + 1], first_values[COLUMNS];
-static long samples[COLUMNS];
-static int varies[COLUMNS];
-static double first_time, shortest, longest;
-static char time_text[40];
-static long samples_of_rows;
-static int is_wrong, is_bare;
+static double numbers[COLUMNS + 1], first_values[COLUMNS], first_time, shortest, longest;
 
 /* Say why a line is refused. */
 static int refuse(const char *rule, const char *got)
@@ -333,21 +324,15 @@ static int take_given(int i, const char *word)
 /* How a header may name a quantity, in the order in which they are tried. */
 enum { BY_NAME, BY_SYMBOL, BY_SYMBOL_AND_UNIT, BY_OWN_HEADER, NAMINGS };
 
-static int names_quantity(int naming, int k, int i)
+/* Whether a column holds a quantity already. */
+static int is_taken(int k)
 {
-    static char base[LONGEST], unit[LONGEST];
+    int i = 0;
 
-    part(titles[k], base, unit);
-    switch (naming) {
-    case BY_NAME:
-        return names[i][0] != '\0' && is_named(base, names[i], 1);
-    case BY_SYMBOL:
-        return is_named(titles[k], symbols[i], 0);
-    case BY_SYMBOL_AND_UNIT:
-        return is_named(base, symbols[i], 0);
-    default:
-        return strcmp(titles[k], headers[i]) == 0;
+    while (i < COLUMNS && column_of[i] != k) {
+        i++;
     }
+    return i < COLUMNS;
 }
 
 /* The first free column that names a quantity; names of all quantities come before symbols. */
@@ -356,12 +341,11 @@ static int take_named(int naming, int i)
     static char base[LONGEST], unit[LONGEST];
 
     for (int k = 0; k < width; k++) {
-        int is_free = 1;
-        for (int other = 0; other < COLUMNS; other++) {
-            is_free = is_free && column_of[other] != k;
-        }
-        if (is_free && names_quantity(naming, k, i)) {
-            part(titles[k], base, unit);
+        part(titles[k], base, unit);
+        const int names_it[NAMINGS] = {
+            names[i][0] != '\0' && is_named(base, names[i], 1), is_named(titles[k], symbols[i], 0),
+            is_named(base, symbols[i], 0), strcmp(titles[k], headers[i]) == 0};
+        if (names_it[naming] && !is_taken(k)) {
             return take(i, k, naming == BY_SYMBOL || naming == BY_OWN_HEADER ? "" : unit);
         }
     }
@@ -395,15 +379,11 @@ static int take_time(void)
     column_of[TIME] = -1;
     for (int is_date = 0; is_date < 2; is_date++) {
         for (int k = 0; k < width; k++) {
-            int is_used = 0;
-            for (int i = 0; i < COLUMNS; i++) {
-                is_used = is_used || column_of[i] == k;
-            }
             part(titles[k], base, unit);
             for (char *letter = base; is_date && *letter != '\0'; letter++) {
                 *letter = (char)lower(*letter);
             }
-            if (!is_used && is_among(base, is_date ? date_names : time_names)) {
+            if (!is_taken(k) && is_among(base, is_date ? date_names : time_names)) {
                 is_bare = unit[0] == '\0';
                 return take(TIME, k, unit);
             }
