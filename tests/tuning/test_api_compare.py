@@ -96,7 +96,7 @@ def test_filters_with_what_a_model_came_with_are_those_of_the_baseline():
     choice = given_choice("kf", problem)
     data = problem.data(problem.held_out_seeds(0, 4))
     assert rows[0].evaluation.score == evaluate(choice.filter(problem), data, problem.scale).score
-    with pytest.raises(ValueError, match="have its own Q and R, but short's has none"):
+    with pytest.raises(ValueError, match="given Q and R must be those of a user's model, .* but short has none"):
         tuning.compare("ekf", SHORT, seeds=2, knows="given")
 
 

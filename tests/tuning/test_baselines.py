@@ -17,12 +17,17 @@ from tuning.evaluation.baselines import (
     SCALED,
     TUNED,
     baselines,
+    competing_baselines,
+    full_noise,
     given,
+    nearest,
     noise_estimated,
+    oracle,
     rule_label,
     rule_of_thumb,
     same_filter,
 )
+from tuning.evaluation.compare import contender
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.residuals import noise_estimation, residuals
 from tuning.evaluation.worth import worth
@@ -45,8 +50,15 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
     assert "that of the given numbers, x " in gains(comparison, "seeds")[0]
 
 
-def test_a_model_with_the_noise_of_its_plant_gives_nothing_for_that_is_the_oracle():
-    assert pair().given is None and given("kf", pair()) is None and GIVEN not in baselines("kf", pair())
+def test_a_model_with_the_noise_of_its_plant_is_given_and_the_oracle_and_competes_with_no_trial():
+    problem = pair()
+    assert given("kf", problem) == oracle("kf", problem) == baselines("kf", problem)[GIVEN]
+    assert list(competing_baselines("kf", problem)) == [SCALED, RULE, NOISE]
+    comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 4)
+    assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
+    assert list(comparison.ratios)[-2:] == [GIVEN, ORACLE] and "given" not in worth(comparison)
+    assert gains(comparison, "seeds")[-1].startswith("The given Q and R are the plant's own")
+    assert contender("kf", "given").choose(problem) == oracle("kf", problem)
     assert thruster().given is None
 
 
@@ -56,6 +68,18 @@ def test_the_default_of_the_user_s_function_is_the_rule_of_thumb_and_given():
     assert list(baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
     comparison = evaluate_held_out(given("ekf", problem), problem, 0, 4)
     assert list(comparison.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
+
+
+def test_own_numbers_are_nearest_to_noise_estimation_from_any_start():
+    true, far = altitude_problem.model(**altitude_problem.TRUE), {"sigma_a": 1e2, "sigma_b": 1e-6, "r_range": 1e4}
+    for start in ({}, far):  # Q is singular: of two noises for three states
+        problem = altitude_problem.problem(untuned=start)
+        found = nearest(problem, true.process_noise_cov, true.measurement_noise_cov)
+        assert found == pytest.approx(altitude_problem.TRUE, rel=1e-3)
+    found = noise_estimated("ekf", altitude_problem.problem()).model
+    assert found == pytest.approx(altitude_problem.TRUE, rel=0.05)
+    full = full_noise("ekf", altitude_problem.problem()).model
+    assert full.keys() - found.keys() == {"process_noise_cov", "measurement_noise_cov"}
 
 
 def test_own_numbers_are_within_their_ranges_always():

@@ -104,7 +104,7 @@ def test_one_number_may_stand_for_the_whole_noise():
     np.testing.assert_allclose(choice.filter(problem).model.process_noise_cov, np.diag([0.025**2, 0.25]))
     assert problem.untuned == problem.given == {"sigma": 0.1}, "the default of the user's function"
     with pytest.raises(ValueError, match="needs a problem that tunes Q and R, but .* tunes sigma"):
-        Plan("ekf", (problem,), full_q=True).checked()
+        Plan("ekf", (problem,), hold_r=True).checked()
 
 
 def test_the_scale_of_a_pair_is_the_bound_of_the_truth_or_the_open_loop_s_error(monkeypatch):

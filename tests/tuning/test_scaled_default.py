@@ -20,6 +20,8 @@ from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.problems.excitation import Steps
+from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
@@ -54,7 +56,7 @@ def test_where_there_is_no_scaled_default_it_says_why():
     startup = find_scenario("startup")
     found = scaled_default("ekf", startup)
     assert found.choice is None and found.reason.startswith(
-        "no factor on Q brings the mean NIS of ekf to 1: it is 4."
+        "no factor on Q from 0.0001 to 10000 brings the mean NIS of ekf to 1: it is 4."
     )
     comparison = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
     assert comparison.scaled is None and list(comparison.evaluations) == [RULE, NOISE, TUNED, ORACLE]
@@ -62,8 +64,16 @@ def test_where_there_is_no_scaled_default_it_says_why():
         "There is no scaled default, so the rule of thumb comes first: no factor"
     )
     assert worth(comparison) == "makes no significant difference on 4 seeds against the rule of thumb"
-    with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q brings"):
+    with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q from"):
         contender("ekf", "scaled").filter(startup)
+
+
+def test_a_baseline_beyond_reason_is_left_out():
+    tiny = {"process_noise_cov": (1e-9, 1e-11)}
+    loose = ModelProblem(MISMATCH.model(), steps=60, inputs=Steps(12.0), untuned=tiny, scale=[1.0, 1.0])
+    found = scaled_default("ekf", loose)
+    assert found.choice is None and "from 0.0001 to 10000 brings" in found.reason and "with 10000" in found.reason
+    assert SCALED not in baselines("ekf", loose)
 
 
 def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):

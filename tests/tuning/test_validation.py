@@ -15,8 +15,11 @@ from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
 from tuning.api.user_choice import user_choice
-from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED
+from tuning.evaluation.baselines import FULL_Q, GIVEN, NOISE, ORACLE, RULE, SCALED
 from tuning.evaluation.tuned import read_tuned
+from tuning.problems.excitation import Steps
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.parameter import Parameter
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.units import apart
 from tuning.search.enqueued import BASELINE
@@ -52,12 +55,13 @@ def test_four_numbers_of_an_altitude_model_are_no_worse_than_any_baseline_and_tw
 
 
 @pytest.mark.slow
-def test_a_tuned_file_keeps_the_choice_as_data_and_a_noise_that_own_numbers_do_not_give(altitude):
+def test_a_tuned_file_keeps_the_choice_as_data_and_own_numbers(altitude):
     problem, study, file = altitude
     met, content = study.tuning.result.validation, read_tuned_file(file)
     assert content["choice"] == json.loads(json.dumps(as_data(met)))
     assert set(content["choice"]["met"][0]) >= {"name", "value", "over", "proper", "nis", "consistent"}
     assert content["held_out"][problem.name]["given"]["score"] == list(study.held_out.evaluations[GIVEN].score)
+    assert set(study.choice.model) == set(altitude_problem.TRUE)
     again = read_tuned(file, [problem])[0].filter(problem).model
     np.testing.assert_allclose(again.process_noise_cov, study.filter.model.process_noise_cov, rtol=1e-9)
     np.testing.assert_allclose(again.measurement_noise_cov, study.filter.model.measurement_noise_cov, rtol=1e-9)
@@ -150,14 +154,42 @@ def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
     assert choice_sentences(None, plan) == []
 
 
+def of_one_number(q=1.0):
+    """A model whose Q is q times the unit matrix."""
+    return pair().model(process_noise_cov=[q] * 3)
+
+
+@pytest.mark.parametrize("full", (False, True))
+def test_candidates_stay_within_own_parameters_and_a_full_q_is_an_option_that_the_report_prices(full):
+    truth, given = pair().model(process_noise_cov=[0.003, 0.2, 12.0]), {"steps": 60, "scale": (0.5, np.inf, 1.0)}
+    parameters = [Parameter("q", 1e-6, 1e6)]
+    problem = ModelProblem(truth, of_one_number, Steps((1.0, 2.0), hold=5), parameters=parameters, **given)
+    plan = Plan("kf", (problem,), full_q=full)
+    result = run_study(open_study("own", plan), plan, 4)
+    met, said = result.validation, " ".join(choice_sentences(as_data(result.validation), plan))
+    if full:
+        assert met.chosen == FULL_Q and len(result.choice.model["process_noise_cov"]) == 3 and met.full is None
+        assert said.startswith("The noise estimation with a full Q is taken")
+    else:
+        assert all(set(one.choice.model) == {"q"} for one in met.met) and set(result.choice.model) == {"q"}
+        tried = {trial.user_attrs.get(BASELINE) for trial in result.trials}
+        assert {SCALED, NOISE} <= {one.name for one in met.met} & tried
+        assert met.full.name == FULL_Q and met.full.over.high < 1.0
+        assert (
+            f"{100 * (1 - met.full.over.value):.1f} % [" in said and "(--full-q), on 100 validation seeds." in said
+        )
+
+
 def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_said():
     plan, own = Plan("ekf", (altitude_problem.problem(),)), untuned_choice("ekf", altitude_problem.problem())
     trial = _met("trial 3", 1.01, 0.99, 1.02)._replace(choice=own._replace(model={**own.model, "sigma_a": 0.25}))
     noise, given = (
-        _met(NOISE, 1.0, 1.0, 1.0)._replace(choice=own._replace(model={"process_noise_cov": (1.0, 1.0, 1.0)})),
+        _met(FULL_Q, 1.0, 1.0, 1.0)._replace(choice=own._replace(model={"process_noise_cov": (1.0, 1.0, 1.0)})),
         _met(GIVEN, 1.0, 1.0, 1.0)._replace(choice=own),
     )
-    said = choice_sentences(as_data(Validation((7, 8), True, (noise, trial), NOISE, "trial 3", NOISE, None)), plan)
+    said = choice_sentences(
+        as_data(Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)), plan
+    )
     assert said[1].startswith(
         "Your own parameters cannot express its Q and R; in trial 3 they are sigma_a = 0.25, "
     )
@@ -203,7 +235,7 @@ def test_own_numbers_are_evaluated_and_compared():
     problem = pair()
     model = problem.model(process_noise_cov=[1.0, 1.0, 1.0])
     found = tuning.evaluate(make_filter("kf", model), problem, seeds=10, progress=False)
-    assert list(found.evaluations) == [RULE, SCALED, NOISE, "own numbers", ORACLE]
+    assert list(found.evaluations) == [GIVEN, RULE, SCALED, NOISE, "own numbers", ORACLE]  # "given" is the oracle
     assert found.choice.model["process_noise_cov"] == (1.0, 1.0, 1.0) and "own numbers" in str(found)
     assert user_choice(model, problem).name == "ekf"
     compared = tuning.compare([model, "kf"], problem, seeds=10, progress=False)

@@ -17,6 +17,7 @@ from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
+from tuning.problems.coordinates import Coordinates
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
@@ -24,11 +25,15 @@ from tuning.search.space import Choice, given_choice, oracle_choice, untuned_cho
 
 # Their names in tables, sentences and pictures.
 GIVEN, SCALED, RULE, NOISE, ORACLE = "given", "scaled default", "rule of thumb", "noise estimation", "oracle"
+FULL_Q, FULL_QR = "noise estimation with a full Q", "noise estimation with a full Q and R"  # beside own parameters
 TUNED, OWN = "tuned", "own numbers"  # OWN: those that a user brings to an evaluation
 BY_IMPORTANCE = (GIVEN, SCALED, RULE, NOISE, ORACLE)  # the first that there is is the one that a headline names
 NO_RANGES = f"No ranges: the model's Q is taken in place of a {RULE}; give the model state_low and state_high."
-DECADES = 8  # powers of ten, up and down, within which the factor on Q is searched
+DECADES = 4  # powers of ten, up and down, within which the factor on Q is searched: no engineer goes further
 DIGITS = 4  # to which the factor is rounded, so that the printed factor is the one in use
+FLOOR = 1e-6  # of each variance, which is added to singular covariances before they are compared
+UNMOVED = 1e-9  # of a coordinate, within which a parameter has not moved
+BEYOND = 1e200  # in place of an infinite divergence
 CLOSE = 0.02  # tolerance of the mean NIS about 1: that of an ensemble need not be continuous in Q
 
 
@@ -52,10 +57,7 @@ def rule_of_thumb(name: str, scenario: Problem) -> Choice:
 
 
 def given(name: str, scenario: Problem) -> Choice | None:
-    """The filter with the given Q and R of the problem's model; None if there are none.
-
-    A model with the plant's own Q and R is the oracle, not a given one.
-    """
+    """The filter with the given Q and R of the problem's model, which may be the plant's; None without."""
     return given_choice(name, scenario) if filter_type(name).has_covariance else None
 
 
@@ -65,13 +67,82 @@ def rule_label(scenario: Problem) -> str:
 
 
 def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | None:
-    """The filter with the sample covariances of its model's residuals on the truth; None if there are none."""
+    """The filter with the sample covariances of its model's residuals on the truth; None if there are none.
+
+    Of a problem with parameters of its own it has the parameters whose Q and R are `nearest` to these covariances.
+    """
     if not filter_type(name).has_covariance:
         return None
     found = noise_estimation(scenario, seed)
     if found.process_cov is None or found.measurement_cov is None:
         return None
-    return with_covariances(rule_of_thumb(name, scenario), found.process_cov, found.measurement_cov)
+    rule = rule_of_thumb(name, scenario)
+    if scenario.parameters is None:
+        return with_covariances(rule, found.process_cov, found.measurement_cov)
+    projected = rule._replace(model={**rule.model, **nearest(scenario, found.process_cov, found.measurement_cov)})
+    return None if same_filter(projected, rule) else projected
+
+
+def full_noise(name: str, scenario: Problem, seed: int = 0, *, with_r: bool = False) -> Choice | None:
+    """Noise estimation of a problem with own parameters, and a full Q, or Q and R, which they cannot express."""
+    found, projected = noise_estimation(scenario, seed), noise_estimated(name, scenario, seed)
+    if scenario.parameters is None or found.process_cov is None:
+        return None
+    start = _with_noise(projected or rule_of_thumb(name, scenario), scenario)
+    return with_covariances(start, found.process_cov, found.measurement_cov if with_r else None)
+
+
+def nearest(scenario: Problem, q: np.ndarray, r: np.ndarray) -> dict[str, float]:
+    """The parameters of a problem's own whose Q and R are nearest to some others, by Kullback and Leibler.
+
+        theta = argmin D(Q, Q(theta)) + D(R, R(theta)),   D(S, C) = (tr(C^-1 S) - log det(C^-1 S) - n) / 2
+
+    D is the divergence of N(0, C) from N(0, S). If Q and R are sample covariances of residuals, theta is their
+    maximum-likelihood estimate. A millionth of each variance is added to both matrices, because a Q of fewer
+    noises than states is singular. Whole numbers, and parameters that change neither Q nor R, stay what they are.
+
+    Args:
+        scenario: a problem with parameters of its own.
+        q: (n, n).
+        r: (m, m).
+
+    Source: Kullback, Leibler (1951), "On information and sufficiency", Annals of Mathematical Statistics 22(1).
+    """
+    from scipy.optimize import minimize  # loads half of SciPy, for this line
+
+    start = {one.name: float(scenario.untuned[one.name]) for one in scenario.parameters or ()}
+    space = Coordinates([one for one in scenario.parameters or () if not one.integer])
+    first = scenario.model(**scenario.untuned)
+    pairs = ((q, first.process_noise_cov), (r, first.measurement_noise_cov))
+    floors = [FLOOR * np.where(np.diag(s) > 0, np.diag(s), np.diag(c)) for s, c in pairs]
+
+    def divergence(point: np.ndarray) -> float:
+        try:
+            model = scenario.model(**{**scenario.untuned, **space.named(point)})
+        except ValueError:  # of a user's function
+            return BEYOND
+        covs = model.process_noise_cov, model.measurement_noise_cov
+        found = sum(map(_divergence, (q, r), covs, floors))
+        return found if found < BEYOND else BEYOND
+
+    at = space.start({name: value for name, value in start.items() if name in space.names})
+    ends = list(zip(space.low, space.high, strict=True))
+    found = minimize(divergence, at, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-13, "gtol": 1e-7})
+    moved = dict(zip(space.names, np.abs(found.x - at) > UNMOVED, strict=True))
+    return start | {name: value for name, value in space.named(found.x).items() if moved[name]}
+
+
+def _divergence(s: np.ndarray, c: np.ndarray, floor: np.ndarray) -> float:
+    """tr(C^-1 S) + log det C of matrices (n, n) with a floor (n,), in units of S, from which D differs by no C."""
+    rows = floor > 0  # a state without noise in either
+    scale = np.sqrt(floor[rows] / FLOOR)
+    s, c = (one[np.ix_(rows, rows)] / np.outer(scale, scale) + FLOOR * np.eye(len(scale)) for one in (s, c))
+    try:
+        factor = np.linalg.cholesky(c)
+    except np.linalg.LinAlgError:
+        return BEYOND
+    half = np.linalg.solve(factor, s)
+    return float(np.trace(np.linalg.solve(factor, half.T)) + 2.0 * np.log(np.diag(factor)).sum())
 
 
 def with_covariances(choice: Choice, q: np.ndarray | None, r: np.ndarray | None) -> Choice:
@@ -102,22 +173,22 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
     Returns:
         The choice with its factor and mean NIS; or the reason why there is none: the filter has no NIS, or no
-        factor between 1e-8 and 1e8 brings its mean NIS to 1.
+        factor from 1e-4 to 1e4 brings its mean NIS to 1. (Any tuned filter is far better than such a baseline.)
     """
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
     data = data_of(scenario, scenario.training_seeds(seed, TRAINING_SEEDS))
-    start = _with_noise(rule_of_thumb(name, scenario), scenario)
+    rule = rule_of_thumb(name, scenario)
 
     def nis_at(factor: float) -> float:
-        ratio = nis_ratio(values_of(scaled(start, factor).filter(scenario), data, scenario.scale))
+        ratio = nis_ratio(values_of(scaled_rule(rule, scenario, factor).filter(scenario), data, scenario.scale))
         return ratio if 0.0 < ratio < LARGEST else LARGEST
 
     def excess(exponent: float) -> float:
         return math.log(nis_at(10.0**exponent))
 
     first, exponent = excess(0.0), 0
-    if not np.any(start.model["process_noise_cov"]):
+    if not np.any(scenario.model(**rule.model).process_noise_cov):
         said = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
         return Scaled(None, None, None, said)
     step = 1 if first > 0 else -1  # a larger Q lowers the NIS
@@ -127,7 +198,8 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
         last = excess(exponent)
     if last * first > 0:
         ends = f"{math.exp(first):.3g} with a factor of 1 and {math.exp(last):.3g} with {10.0**exponent:g}"
-        return Scaled(None, None, None, f"no factor on Q brings the mean NIS of {name} to 1: it is {ends}")
+        factors = f"no factor on Q from {10.0**-DECADES:g} to {10.0**DECADES:g}"
+        return Scaled(None, None, None, f"{factors} brings the mean NIS of {name} to 1: it is {ends}")
     from scipy.optimize import brentq  # loads half of SciPy, for this line
 
     root = brentq(excess, *sorted((exponent - step, exponent)), xtol=1e-3, rtol=1e-3) if exponent else 0.0
@@ -136,12 +208,17 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     if abs(nis - 1.0) > CLOSE:
         said = f"no factor on Q brings the mean NIS of {name} to 1: it jumps to {nis:.3g} with {factor:g}"
         return Scaled(None, None, None, said)
-    return Scaled(scaled(start, factor), factor, nis)
+    return Scaled(scaled_rule(rule, scenario, factor), factor, nis)
 
 
 def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
-    """A rule of thumb with a factor on its Q, even if Q follows from other parameters."""
-    return scaled(_with_noise(rule, scenario), factor)
+    """A rule of thumb with a factor on its Q; of a problem's own parameters those that are `nearest` to that."""
+    larger = scaled(_with_noise(rule, scenario), factor)
+    if scenario.parameters is None:
+        return larger
+    model = scenario.model(**larger.model)
+    found = nearest(scenario, model.process_noise_cov, model.measurement_noise_cov)
+    return rule._replace(model={**rule.model, **found})
 
 
 def scaled(choice: Choice, factor: float) -> Choice:
@@ -175,6 +252,18 @@ def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | Non
         del found[RULE]
     found |= {NOISE: noise_estimated(name, scenario, seed), ORACLE: oracle(name, scenario)}
     return {key: choice for key, choice in found.items() if choice is not None}
+
+
+def competing_baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
+    """The baselines that trials compete with: all but the oracle, whether it is called so or "given".
+
+    A model that came with the plant's own Q and R is compared with, held out, but a study does not know them.
+    """
+    found = baselines(name, scenario, seed)
+    known = found.pop(ORACLE, None)
+    if known is not None and RULE in found and GIVEN in found and same_filter(found[GIVEN], known):
+        del found[GIVEN]
+    return found
 
 
 def same_filter(a: Choice, b: Choice) -> bool:

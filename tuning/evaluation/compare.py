@@ -180,7 +180,10 @@ def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
     if knows == "given":
         own = given(name, scenario)
         if own is None:
-            raise ValueError(f"the model must have its own Q and R, but {scenario.name}'s has none")
+            raise ValueError(
+                "given Q and R must be those of a user's model, or defaults of its parameters, but "
+                f"{scenario.name} has none: compare with those that filters know as true, scaled or untuned"
+            )
         return own
     if knows == "true":
         known = oracle(name, scenario)

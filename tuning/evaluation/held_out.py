@@ -63,8 +63,16 @@ class Comparison(NamedTuple):
 
     @property
     def baselines(self) -> tuple[str, ...]:
-        """Names of the existing baselines, the most important one first."""
-        return tuple(name for name in BY_IMPORTANCE if name in self.evaluations)
+        """Names of the existing baselines, the most important one first, those with the plant's Q and R last."""
+        names = [name for name in BY_IMPORTANCE if name in self.evaluations]
+        return tuple(sorted(names, key=lambda name: name == ORACLE or (name == GIVEN and self.given_is_oracle)))
+
+    @property
+    def given_is_oracle(self) -> bool:
+        """Whether the model came with the plant's own Q and R, which tuning does not compete with."""
+        if self.given is None or self.true is None or self.rule == GIVEN:
+            return False
+        return (self.given.score, self.given.nis) == (self.true.score, self.true.nis)
 
     @property
     def ratios(self) -> dict[str, Interval]:

@@ -31,7 +31,7 @@ def worth(comparison: Comparison, what: str = "the score") -> str:
     if not comparison.tuned.has_truth:
         return _likelihood_worth(comparison)
     ratios, seeds = comparison.ratios, len(comparison.seeds)
-    names = [name for name in HEADLINE if name in ratios]
+    names = [name for name in HEADLINE if name in ratios and not (name == GIVEN and comparison.given_is_oracle)]
     parts = []
     for name in names:
         verb, by, much = gain(ratios[name], seeds, what).partition(" by ")

@@ -141,7 +141,7 @@ class AssumedProblem(Problem):
     def given(self) -> dict | None:
         """The given values of the model: its own Q and R, or the defaults of its parameters, and `untuned`.
 
-        None for parameters without a default, and if they equal the oracle's.
+        None for parameters without a default.
         """
         if self._parameters is not None:
             own = {one.name: one.default for one in self._parameters if one.default is not None}
@@ -149,10 +149,7 @@ class AssumedProblem(Problem):
             return found if len(own) == len(self._parameters) else None
         model = self.model()
         q, r = rows_argument(model.process_noise_cov), as_argument(model.measurement_noise_cov)
-        found = {"process_noise_cov": q, "measurement_noise_cov": r} | (self._untuned or {})
-        known = self.true
-        same = known is not None and found.keys() == known.keys()
-        return None if same and known and all(np.array_equal(found[key], known[key]) for key in found) else found
+        return {"process_noise_cov": q, "measurement_noise_cov": r} | (self._untuned or {})
 
     @property
     def lacks_ranges(self) -> bool:

@@ -89,7 +89,7 @@ class Problem(ABC):
     def given(self) -> Mapping | None:
         """Model arguments given by the user's model, preset or file, before any tuning.
 
-        None if there are none, or if they are `true`: those of a plant are not a guess.
+        None if there are none. They may equal `true`, those of the plant.
         """
         return None
 

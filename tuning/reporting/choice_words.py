@@ -11,10 +11,11 @@ from typing import Any
 
 from filters.consistency.intervals import Interval, span
 from filters.consistency.verdicts import rounded
-from filters.tuned_file import NOISE
-from tuning.evaluation.baselines import BY_IMPORTANCE, called
+from tuning.evaluation.baselines import FULL_Q, FULL_QR, called
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, PROPER
 from tuning.search.validation import choice_from
+
+FULL_NOISE = {FULL_Q: "--full-q", FULL_QR: "--full-q --full-r"}  # by the option that lets it compete with trials
 
 
 def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
@@ -41,7 +42,7 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
             f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better ({candidate} "
             f"has {over} its {what})."
         ]
-        if NOISE[0] in met[baseline]["choice"]["model"] and plan.scenarios[0].parameters is not None:
+        if baseline in FULL_NOISE:
             said.append(
                 f"Your own parameters cannot express its Q and R; in {candidate} they are "
                 f"{_own(met[candidate], plan)}."
@@ -55,12 +56,29 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     if found["price"] is not None and found["price"] > MOST_PRICE:
         channels = len(plan.scenarios[0].quantities.measurements)
         said.append(_price_sentence(found, met[candidate], what, channels))
+    if found.get("full"):
+        said.append(_full_sentence(found["full"], what, where, likely))
     return said
+
+
+def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool) -> str:
+    """How much better a full Q is than what own parameters express."""
+    option = FULL_NOISE[full["name"]]
+    matrices = full["name"].removeprefix("noise estimation with ")
+    value, low, high = full["over"]
+    ends = sorted(-100 * (part - 1.0) for part in (low, high))
+    gained = f"{_over(full['over'], likely)} its {what}"
+    if not likely:
+        gained = f"{span(Interval(100 * (1.0 - value), *ends), 1, ' %')} better by the {what}"
+    return (
+        f"It would be {gained} with {matrices} of noise estimation, which your own parameters cannot express "
+        f"({option}), on {where}."
+    )
 
 
 def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) -> str:
     """The price of the band, with both sides of the choice."""
-    inside = [one for one in found["met"] if one["consistent"] and one["name"] not in BY_IMPORTANCE]
+    inside = [one for one in found["met"] if one["consistent"] and one["name"].startswith("trial ")]
     best = min(inside, key=lambda one: one["value"])
     nis = rounded(channels * best["nis"]), rounded(channels * taken["nis"])
     return (

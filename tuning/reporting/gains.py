@@ -9,6 +9,8 @@ from tuning.evaluation.baselines import TUNED, called
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.worth import scaling_sentence, sized, without_truth
 
+GIVEN_IS_ORACLE = "The given Q and R are the plant's own, those of the oracle: no trial of a study has them."
+
 
 def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
     """The gain of tuning over each baseline, the main one first, and a description of that one."""
@@ -21,7 +23,8 @@ def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str
     scaling = scaling_sentence(comparison)
     if name == TUNED:
         said += f" {_verdict(ratios[first], called(first), seed_word)}"
-    return [said, *([scaling] if scaling else [])]
+    same = [GIVEN_IS_ORACLE] if comparison.given_is_oracle else []
+    return [said, *([scaling] if scaling else []), *same]
 
 
 def _filter(name: str) -> str:

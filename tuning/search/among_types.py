@@ -72,12 +72,15 @@ def _first_parameters(study: optuna.Study, plan: Plan, key: str, name: str) -> d
 
 
 def _estimated(study: optuna.Study, plan: Plan, with_r: bool) -> dict | None:
-    """Q, and R if asked for, from true states; without these the likeliest ones, and None if there are none."""
+    """Q, and R if asked for, from true states; without these the likeliest ones, and None if there are none.
+
+    Parameters of a problem's own have both at once, and are then the likeliest ones.
+    """
     name, problem = plan.filter_types[0], plan.scenarios[0]
-    choice = None if problem.parameters is not None else noise_estimated(name, problem, plan.seed)
-    if choice is None:
+    choice = noise_estimated(name, problem, plan.seed)
+    if choice is None or (problem.parameters is not None and with_r):
         return noise_by_gradient(study, plan)
-    if not with_r:
+    if not with_r and problem.parameters is None:
         choice = choice._replace(model={**choice.model, R: untuned_choice(name, problem).model[R]})
     return _shared(trial_parameters(choice, plan.space()))
 

@@ -9,7 +9,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
+from tuning.evaluation.baselines import competing_baselines
 from tuning.likelihood.goal import OF_STATES
 from tuning.search.among_types import (
     UNTUNED,
@@ -111,15 +111,10 @@ def _enqueue_rescaled(study: optuna.Study, plan: Plan, last: FrozenTrial) -> Non
 
 
 def _enqueue_baselines(study: optuna.Study, plan: Plan) -> None:
-    """Enqueue the baselines of the first filter type as far as the space has them, without the oracle.
-
-    The scaled default and noise estimation of a problem with parameters of its own have a Q that no parameters
-    give: they meet the best trials at the end (`tuning.search.validation`), and are no trials.
-    """
+    """Enqueue the baselines of the first filter type, without the oracle."""
     problem, space = plan.scenarios[0], plan.space()
-    for name, choice in baselines(plan.filter_types[0], problem, plan.seed).items():
-        if name != ORACLE and (problem.parameters is None or name in (GIVEN, RULE)):
-            enqueue_new(study, within_ranges(trial_parameters(choice, space), space), {BASELINE: name})
+    for name, choice in competing_baselines(plan.filter_types[0], problem, plan.seed).items():
+        enqueue_new(study, within_ranges(trial_parameters(choice, space), space), {BASELINE: name})
 
 
 def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan, start: dict) -> None:

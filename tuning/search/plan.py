@@ -49,8 +49,8 @@ class Plan(NamedTuple):
     hold_r: bool = False  # whether R stays that of the sensor's data sheet
     prune: bool = True  # whether a trial is pruned that is worse than the best one on the same seeds
     budget: float | None = None  # us/step that the filter may take, as `cost.microseconds_a_step` measures them
-    full_q: bool = False  # whether Q has correlations
-    full_r: bool = False  # whether R has correlations
+    full_q: bool = False  # whether Q has correlations; of own parameters whether noise estimation's Q competes
+    full_r: bool = False  # whether R has correlations; the same
     worst: bool = False  # of several problems the worst one counts, and not their mean
     where: tuple[str, ...] = ()  # relations among the numbers of the model, such as "Q22 = 4 Q11"
 
@@ -118,15 +118,15 @@ class Plan(NamedTuple):
         for problem in self.scenarios:
             check_objectives(self.objectives, problem)
         parameters = self.scenarios[0].parameters
-        if parameters is not None and (self.full_q or self.full_r or self.hold_r):
+        if parameters is not None and (self.hold_r or (self.full_r and not self.full_q)):
             names = ", ".join(one.name for one in parameters)
             raise ValueError(
-                f"a full Q, a full R or a held R needs a problem that tunes Q and R, but "
+                f"a held R, or a full R without a full Q, needs a problem that tunes Q and R, but "
                 f"{self.scenarios[0].name} tunes {names}"
             )
         if self.full_q and not self._has_covariance:
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
-        if self.full_r:
+        if self.full_r and parameters is None:
             self._check_full_r()
         if self.where and not self._has_covariance:
             raise ValueError(f"relations need a filter with a covariance, but got {self.filter!r}")

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, slightly
 from filters.registry import filter_type
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
-from tuning.evaluation.baselines import GIVEN, ORACLE, baselines, same_filter
+from tuning.evaluation.baselines import FULL_Q, FULL_QR, GIVEN, competing_baselines, full_noise, same_filter
 from tuning.problems.data import Data
 from tuning.search.measures import Measured, measured, over
 from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
@@ -51,6 +51,7 @@ class Validation(NamedTuple):
     candidate: str  # name of the best trial; that of the baseline where no trial is another filter
     chosen: str  # which of the two the filter is that a study gives
     price: float | None  # error of the best consistent trial over that of the best one, less 1
+    full: Met | None = None  # noise estimation's full Q where it is better than the choice of own parameters
 
     @property
     def gave_way(self) -> bool:
@@ -133,7 +134,38 @@ def validate(
     own = not set(seeds) & set(training[0].seeds)
     validation = Validation(seeds, own, met, baseline, candidate or baseline, baseline, price)
     wins = candidate is not None and _wins(validation.named(candidate), validation.named(baseline), plan, ratio)
-    return validation._replace(chosen=candidate or baseline) if wins else validation
+    validation = validation._replace(chosen=candidate or baseline) if wins else validation
+    return validation._replace(full=_better_with_full_noise(plan, found[validation.chosen], of_kind, training))
+
+
+def _better_with_full_noise(plan: Plan, chosen: Measured, kind: str, training: Sequence[Data]) -> Met | None:
+    """Noise estimation's full Q, or Q and R, if it is significantly better than own parameters; else None."""
+    if plan.full_q or plan.scenarios[0].parameters is None:
+        return None
+    ratio, data, better = plan.objectives[0] not in PROPER, plan.validation_data(), []
+    for name, choice in _full_noise(plan, kind, training).items():
+        one = measured(choice, plan, data)
+        gained = over(one, chosen, ratio=ratio)
+        if gained.high < (1.0 if ratio else 0.0) and not (ratio and slightly(gained)):
+            nis = max(one.nis, key=lambda part: abs(part - 1.0))
+            better.append(Met(name, choice, one.value, gained, one.proper, nis, _is_consistent(one, plan)))
+    return min(better, key=lambda one: one.value, default=None)
+
+
+def _full_noise(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
+    """Noise estimation of own parameters with a full Q, and with a full Q and R, within the budget, by name."""
+    problem = plan.scenarios[0]
+    if not filter_type(kind).has_covariance or len({(one.model().n, one.model().m) for one in plan.scenarios}) > 1:
+        return {}
+    found = {
+        FULL_Q: full_noise(kind, problem, plan.seed),
+        FULL_QR: full_noise(kind, problem, plan.seed, with_r=True),
+    }
+    return {
+        name: one
+        for name, one in found.items()
+        if one is not None and (plan.budget is None or cost_of(one, plan, training) <= plan.budget)
+    }
 
 
 def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]:
@@ -152,7 +184,7 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     Where R is held none of them changes it, and relations among numbers hold for all but what was given.
     """
     problem = plan.scenarios[0]
-    found = {name: one for name, one in baselines(kind, problem, plan.seed).items() if name != ORACLE}
+    found = competing_baselines(kind, problem, plan.seed)
     if plan.hold_r and filter_type(kind).has_covariance:
         held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
         found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
@@ -162,6 +194,9 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     sizes = {(one.model().n, one.model().m) for one in plan.scenarios}
     if len(sizes) > 1:  # a Q or R fits problems of one size alone
         found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}
+    if plan.full_q and problem.parameters is not None:
+        full = _full_noise(plan, kind, training)
+        found |= {name: one for name, one in full.items() if plan.full_r or name == FULL_Q}
     budget = plan.budget
     if budget is not None:
         found = {name: one for name, one in found.items() if cost_of(one, plan, training) <= budget}
@@ -211,8 +246,13 @@ def as_data(found: Validation | None) -> dict | None:
         "seeds": [found.seeds[0], found.seeds[-1] + 1],
         "own_seeds": found.own,
         "price": found.price,
-        "met": [{**one._asdict(), "over": list(one.over), "choice": one.choice._asdict()} for one in found.met],
+        "met": list(map(_met_as_data, found.met)),
+        "full": found.full and _met_as_data(found.full),
     }
+
+
+def _met_as_data(one: Met) -> dict:
+    return {**one._asdict(), "over": list(one.over), "choice": one.choice._asdict()}
 
 
 def choice_from(data: Mapping) -> Choice:
