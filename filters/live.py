@@ -236,11 +236,25 @@ class Live:
             session.set_noise(process_noise_cov=self._noise(length))
         elif not (self._has_one_q and abs(length - self._step) <= closeness(self._step, exact)):
             session.scale_process_noise(length / self._step)
-        for _ in range(count):
-            self._first.hold(session)
-            session.run("predict", u=u)
+        self._repeat(u, count)
         self._last = u
         self.time, self._held = time, u
+
+    def _repeat(self, u: np.ndarray, count: int) -> None:
+        """Predictions under one input; if they end at no finite number once more, to hold the last one that is."""
+        session, before = self._session, self._session.belief()
+        self._first.hold(session)
+        session.run("predict", u=u, count=count)
+        if count > 1 and not self._is_finite():
+            session.load(before)
+            while count > 0 and self._is_finite():
+                self._first.hold(session)
+                session.run("predict", u=u)
+                count -= 1
+            session.run("predict", u=u, count=count)
+
+    def _is_finite(self) -> bool:
+        return bool(np.isfinite(self.mean).all() and np.isfinite(self.cov).all())
 
     def _set_length(self, length: float) -> None:
         self._length = length

@@ -252,15 +252,16 @@ class Session:
         self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
 
-    def run(self, operation: str, u=None, z=None) -> None:
-        """Do one of "start", "predict" or "update" alone, arguments checked."""
+    def run(self, operation: str, u=None, z=None, count: int = 1) -> None:
+        """Do one of "start", "predict" or "update" alone, arguments checked; a prediction `count` times."""
         if operation == "predict":
             self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         if operation == "update":
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
-        self._do(TASKS[operation])
-        if not self._is_direct:
-            self._call_directly()
+        for _ in range(count):
+            self._do(TASKS[operation])
+            if not self._is_direct:
+                self._call_directly()
 
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory; ValueError for one of another model or kind of filter, or none at all."""

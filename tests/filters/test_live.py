@@ -10,9 +10,11 @@ import pytest
 from scipy.linalg import expm
 
 from filters import make_filter, thruster_model
+from filters.restarts import FirstRestart
 from tests.slow import slow_but
 from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.diffusion import noise_for_dt
+from thruster_env.plants.state_space import StateSpaceModel
 
 A = np.array([[0.0, 1.0], [-4.0, -0.6]])
 S = np.diag([0.01, 0.5])
@@ -22,6 +24,10 @@ class Constants(NamedTuple):
     substep: float
     stiffness: float = 4.0
     damping: float = 0.6
+
+
+class Step(NamedTuple):
+    dt: float
 
 
 def rates(x, u, c):
@@ -335,6 +341,33 @@ def test_stamps_since_1970_divide_no_step(start, rate):
         session.step(u, z)
         assert live._session.belief().step == k
     np.testing.assert_allclose(live.mean, session.mean, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_long_gap_costs_predictions_alone_and_says_where_a_restart_began(monkeypatch):
+    """The covariance of x' = x^2 overflows in step 113 of 120: the step that is told, not the last one."""
+    model = StateSpaceModel(
+        transition=lambda x, u, c: (x[0] + c.dt * x[0] * x[0],),
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[1e-4],
+        measurement_noise_cov=[0.1],
+        prior_mean=[1.0],
+        prior_cov=[1e-4],
+        constants=Step(0.01),
+        inputs=1,
+    )
+    live = make_filter("ekf", model).live()
+    live.start(0.0)
+    live.predict_to(1.2, [0.0])
+    live.update(1.2, None, [0.5])
+    assert live.divergences == 1
+    assert (live.restarts.states, live.restarts.cause) == (("x_1",), "the covariance overflows in the prediction")
+    copies = []
+    monkeypatch.setattr(FirstRestart, "hold", lambda self, session: copies.append(1))
+    calm = make_filter("ekf", oscillator().at(0.01)).live()
+    calm.start(0.0)
+    calm.predict_to(20.0, [1.0])
+    assert len(copies) <= 3
 
 
 @pytest.mark.usefixtures("as_python")

@@ -26,6 +26,7 @@ DEEPEST = 16  # groups within groups
 MOST_OBJECTS = 20_000  # of a file
 LONGEST = 400  # letters of a text: no number and no date is longer
 SECONDS = 600  # of processor time
+CHECKED = {"page_checksum_verification": True}  # where pages have check sums
 TOLD = (  # attributes, in any case
     *("units", "unit", "scale_factor", "add_offset", "_fillvalue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_unsigned"),
@@ -217,12 +218,12 @@ def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
         size += sum(one.total_uncompressed_size for one in parts)
     names = pyarrow.parquet.read_schema(request["files"][0]).names
     if request["files"] != [request["path"]] and max(8 * numbers, size) <= request["bytes"]:
-        tables.append(pyarrow.parquet.read_table(request["path"]))  # names of its folders are columns, too
+        tables.append(pyarrow.parquet.read_table(request["path"], **CHECKED))  # names of its folders are columns, too
         names = tables[0].column_names
 
     def read(number: int) -> np.ndarray:
         if not tables:
-            tables.append(pyarrow.parquet.read_table(request["path"]))
+            tables.append(pyarrow.parquet.read_table(request["path"], **CHECKED))
         return tables[0].column(number).to_numpy(zero_copy_only=False)
 
     return {"names": names, "numbers": numbers, "bytes": size}, read
