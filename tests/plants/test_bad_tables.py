@@ -1,6 +1,7 @@
 """Tables that are damaged, huge or oddly parted: one line each, and sizes are read before what has them."""
 
 import io
+import re
 import struct
 import sys
 import zipfile
@@ -119,6 +120,30 @@ def test_an_npz_array_that_holds_more_than_its_header_says_is_refused(tmp_path, 
     np.savez(path, t=0.1 * np.arange(4000), voltage=np.random.default_rng(0).normal(size=4000))
     path.write_bytes(path.read_bytes().replace(stated, damaged))
     refused(path, "'t.npy' holds more than its array")
+
+
+def test_an_npz_that_lists_fewer_arrays_than_it_says_is_refused(tmp_path):
+    """By the length of a comment, behind which the next array's name is taken for the comment."""
+    path = tmp_path / "a.npz"
+    np.savez(path, **COLUMNS)
+    bad = bytearray(path.read_bytes())
+    first, second, third = (one.start() for one in re.finditer(rb"PK\x01\x02", bad))
+    bad[first + 32] = third - second
+    path.write_bytes(bad)
+    refused(path, "it says that it has 3 arrays, but lists 2")
+
+
+def test_pages_of_a_parquet_file_are_compared_with_their_check_sums(tmp_path):
+    arrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "a.parquet"
+    some = {"compression": "none", "use_dictionary": False, "write_page_checksum": True}
+    parquet.write_table(arrow.table(COLUMNS), path, **some)
+    bad = bytearray(path.read_bytes())
+    bad[bad.index(np.float64(9.0).tobytes()) + 5] ^= 1
+    path.write_bytes(bad)
+    refused(path, "a Parquet file must be one, but .* is not: .*(CRC|checksum)")
 
 
 def test_arrays_of_other_lengths_are_named(tmp_path):

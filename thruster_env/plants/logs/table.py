@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +31,7 @@ from thruster_env.plants.logs.stamps import seconds_of, since_first
 MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
 DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
 DELIMITERS = ",;\t"
+ZIP_END, ZIP_COUNT = 22, 10  # bytes of a zip's last record, and where in it the number of its files stands
 TIME_HEADER = "time_s"  # of an index of dates
 SUFFIXES = (".csv", ".parquet", ".npz")
 
@@ -227,7 +230,11 @@ def _read_npz(path: Path) -> Table:
 def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Names and arrays of an npz file, whose sizes are read before what is in them."""
     total = 0
-    with ZipFile(path) as archive:
+    with ZipFile(path) as archive, path.open("rb") as file:
+        file.seek(-ZIP_END - len(archive.comment), os.SEEK_END)
+        (count,) = struct.unpack_from("<H", file.read(ZIP_END), ZIP_COUNT)
+        if count not in (len(archive.infolist()), 2**16 - 1):  # the package goes by the sizes alone
+            raise ValueError(f"it says that it has {count} arrays, but lists {len(archive.infolist())}")
         for one in archive.infolist():
             with archive.open(one) as member:
                 version = np.lib.format.read_magic(member)
