@@ -53,7 +53,8 @@ def command(
     check_targets((out / "README.md",), json, read=(file,))
     choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model)])
     filter_ = choice.filter(found)
-    files = [str(one) for one in write_project(filter_, out, name, single=single, monitor=watch, board=board)]
+    options = {"single": single, "monitor": watch, "board": board, "dt": found.dt}
+    files = [str(one) for one in write_project(filter_, out, name, **options)]
     lines, error = [f"wrote {one}" for one in files], None
     if single:
         announce_compilation()

@@ -21,6 +21,7 @@ from thruster_cli.output import check_picture, check_targets, console, emit, tab
 from thruster_cli.printing import printed_whole
 from thruster_env.plants.logs.findings import sentences
 from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.write import check_suffix, write_log
 from tuning.logs.read import read_named
 
 
@@ -45,6 +46,14 @@ def command(
             rich_help_panel=OUTPUT,
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the log as it is read, on its grid and in the model's units: .csv, .npz or .parquet.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Show how a recorded log is read: its channels, and the gaps, stuck sensors, outliers and the like in it.
@@ -62,7 +71,7 @@ def command(
     Example: thruster log flight.ulg --only actuator
     """
     of_log = {key: value for key, value in reading.named().items() if key != "stamps"}
-    if is_listed(log, only, any((*of_log.values(), plot))):
+    if is_listed(log, only, any((*of_log.values(), plot, out))):
         check_targets((), json, read=(log,))
         some = found_in(log, only, reading.stamps)
         shown, said = as_table(log, some.fields, console.is_terminal), remarks(some)
@@ -73,16 +82,21 @@ def command(
         return
     if plot is not None:
         check_picture(plot, "--plot")
+    if out is not None:
+        check_suffix(out)
     recorded, _ = read_named(log, **reading.named())
-    check_targets((plot,), json, read=(log, reading.preset))
+    check_targets((plot, out), json, read=(log, reading.preset))
+    if out is not None:
+        write_log(out, recorded)
     if plot is not None:
         from thruster_env.plants.logs.figure import findings_figure
 
         findings_figure(plot, recorded)
-    emit(_report(recorded, plot), _as_json(recorded, plot), json)
+    files = [str(one) for one in (plot, out) if one is not None]
+    emit([*_report(recorded), *(f"wrote {one}" for one in files)], _as_json(recorded, files), json)
 
 
-def _report(log: Log, plot: Path | None) -> list[RenderableType]:
+def _report(log: Log) -> list[RenderableType]:
     rows = []
     for channel in log.channels:
         values = log.series(channel).values
@@ -96,10 +110,10 @@ def _report(log: Log, plot: Path | None) -> list[RenderableType]:
     title = f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s{on_grid}"
     columns = ["channel", "samples", "smallest", "largest", "standard\ndeviation"]
     said = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
-    return [table(title, columns, rows), *said, *([f"wrote {plot}"] if plot is not None else [])]
+    return [table(title, columns, rows), *said]
 
 
-def _as_json(log: Log, plot: Path | None) -> dict:
+def _as_json(log: Log, files: list[str]) -> dict:
     return {
         "log": log.name,
         "digest": log.digest,
@@ -109,5 +123,5 @@ def _as_json(log: Log, plot: Path | None) -> dict:
         "samples": {channel: len(log.series(channel).values) for channel in log.channels},
         "pieces": [list(piece) for piece in log.pieces],
         "findings": [asdict(one) for one in log.findings],
-        "files": [] if plot is None else [str(plot)],
+        "files": files,
     }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from filters.c.log_reader import READER
+from filters.c.log_columns import COLUMNS
+from filters.c.log_reader import LINES, ROWS
 from filters.c.programs import FilterPrograms
 from filters.logs.columns import header_of
 from filters.logs.estimate import SKIPPED
@@ -21,8 +22,10 @@ MAIN = """\
 
    HEADER names the columns of the inputs, then of the measurements, "HEADER[UNIT]" with another unit; without any
    they are those below, or others of the same name or symbol. An input acts from its row on, and is held where its
-   cell is empty; an empty cell of a measurement is a missing one. Text, infinite
-   numbers, unknown units, and times that are not one step apart end it with the number of the line.@ABOUT@ */
+   cell is empty; an empty cell of a measurement is a missing one.@GAPS@ Text, infinite numbers, unknown units, and
+   times off the steps end it with the number of the line. What else `thruster estimate` reads, such as dates,
+   stamps in ms without a unit and irregular ones, `thruster log LOG --out log.csv` writes as this program takes
+   it.@ABOUT@ */
 #include "@NAME@.h"
 
 #include <float.h>
@@ -34,6 +37,8 @@ MAIN = """\
 enum { INPUTS = @INPUTS@, CHANNELS = @CHANNELS@, COLUMNS = INPUTS + CHANNELS, STATES = @STATES@@TESTED@ };
 enum { LONGEST = 65536, MOST_CELLS = 4096, TIME = COLUMNS, FEWEST_ROWS = 3 };
 #define LARGEST @LARGEST@
+#define STEP @STEP@ /* [s], 0 where it is not known */
+#define STEP_TEXT "@STEP@"
 
 @TABLES@
 @READER@
@@ -60,27 +65,30 @@ int main(int count, char **words)
     }
     printf("time_s@TITLES@\\n");
     @NAME@_init(&filter@KEY@);
-    for (long row = 0; read_row(row); row++) {
-        for (int i = 0; i < COLUMNS; i++) {
-            last[i] = values[i];
-            if (i >= INPUTS || !isnan(numbers[i])) {
-                values[i] = (@REAL@)numbers[i];
+    for (long row = 0, step = 0; read_row(row); row++) {
+        for (; step <= step_of_row; step++) {
+            for (int i = 0; i < COLUMNS; i++) {
+                double number = step < step_of_row ? (double)NAN : numbers[i];
+                last[i] = values[i];
+                if (i >= INPUTS || !isnan(number)) {
+                    values[i] = (@REAL@)number;
+                }
             }
+            if (step > 0) {
+                @NAME@_predict(&filter@LAST@);
+            }
+@BEGIN@            @NAME@_update(&filter, values + INPUTS);
+            show_time(step);
+            for (int i = 0; i < STATES; i++) {
+                show((double)filter.x[i]);
+                show(sqrt((double)filter.P[i * (STATES + 1)]));
+            }
+            for (int i = 0; i < CHANNELS; i++) {
+                show(isnan(values[INPUTS + i]) ? (double)NAN : (double)filter.innovation[i]);
+                show(sqrt((double)filter.S[i * (CHANNELS + 1)]));
+            }
+@ALARMS@            printf("\\n");
         }
-        if (row > 0) {
-            @NAME@_predict(&filter@LAST@);
-        }
-@BEGIN@        @NAME@_update(&filter, values + INPUTS);
-        printf("%s", time_text);
-        for (int i = 0; i < STATES; i++) {
-            show((double)filter.x[i]);
-            show(sqrt((double)filter.P[i * (STATES + 1)]));
-        }
-        for (int i = 0; i < CHANNELS; i++) {
-            show(isnan(values[INPUTS + i]) ? (double)NAN : (double)filter.innovation[i]);
-            show(sqrt((double)filter.S[i * (CHANNELS + 1)]));
-        }
-@ALARMS@        printf("\\n");
     }
     (void)last;
     return is_sound() ? 0 : 2;
@@ -90,29 +98,38 @@ int main(int count, char **words)
 ABOUT = """ Columns alarm_... count the tests of a
    channel that raise an alarm, from row TESTED on."""
 BEGIN = """\
-        if (row == TESTED) {
-            @NAME@_test_anew(&filter);
-        }
+            if (step == TESTED) {
+                @NAME@_test_anew(&filter);
+            }
 """
 ALARMS = """\
-        for (int i = 0; i < CHANNELS; i++) {
-            int count = 0;
-            for (unsigned some = row < TESTED ? 0 : filter.channel[i].alarms; some > 0; some >>= 1) {
-                count += (int)(some & 1u);
+            for (int i = 0; i < CHANNELS; i++) {
+                int count = 0;
+                for (unsigned some = step < TESTED ? 0 : filter.channel[i].alarms; some > 0; some >>= 1) {
+                    count += (int)(some & 1u);
+                }
+                show((double)count);
             }
-            show((double)count);
-        }
 """
+GAPS = " Rows that are\n   missing by their times are predicted, as in `thruster estimate`."
 
 
-def log_program(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
+def log_program(
+    name: str,
+    programs: FilterPrograms,
+    *,
+    single: bool = False,
+    tested: bool = False,
+    dt: float | None = None,
+) -> str:
     """The source of the program for a filter in C of this name.
 
     It reads numbers, missing ones, units and times as `thruster_env.plants.logs.read.read_log` does, or ends with
-    exit code 2 and the number of the line. An ensemble's random numbers are those of seed 0 in `thruster
-    estimate`, whose columns are those of its output: the estimate and its standard deviation, then each innovation
-    with its own. Where the filter tests its innovations, the number of alarms of each channel follows, from row 50
-    on, as with `--skip 50`.
+    exit code 2 and the number of the line. Logs must be of the sample time dt [s], and rows that they lack are
+    predicted; without a dt they may be of any, and may lack none. An ensemble's random numbers are those of seed 0
+    in `thruster estimate`, whose columns are those of its output: the estimate and its standard deviation, then
+    each innovation with its own. Where the filter tests its innovations, the number of alarms of each channel
+    follows, from row 50 on, as with `--skip 50`.
     """
     model, key = programs.model, "".join(f", {int(word)}" for word in filter_keys([0])[0])
     pairs = [(model.states, ("", "std")), (model.measurements, ("innovation", "innovation_std"))]
@@ -122,9 +139,11 @@ def log_program(name: str, programs: FilterPrograms, *, single: bool = False, te
         "ABOUT": ABOUT * tested,
         "BEGIN": BEGIN * tested,
         "ALARMS": ALARMS * tested,
+        "GAPS": GAPS * (dt is not None),
+        "STEP": repr(float(dt or 0.0)),
         "TESTED": f", TESTED = {SKIPPED}" * tested,
         "TABLES": _tables((*model.input_quantities, *model.measurements)),
-        "READER": READER,
+        "READER": LINES + COLUMNS + ROWS,
         "KEY": key * (programs.members > 0),
         "NAME": name,
         "REAL": "float" if single else "double",

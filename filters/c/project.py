@@ -67,6 +67,7 @@ def write_project(
     single: bool = False,
     monitor: Monitor | Mapping | float | None = None,
     board: bool = False,
+    dt: float | None = None,
 ) -> list[Path]:
     """Write a filter in C, a program that filters a log with it, and how to build them; return the files.
 
@@ -80,6 +81,7 @@ def write_project(
         single: floats in place of doubles.
         monitor: tests of the innovations, as wrappers take them.
         board: whether board.c and board.ld are written as well, for a Cortex-M4 that QEMU emulates.
+        dt: sample time [s] of logs, whose missing rows the program then predicts; None for any without such rows.
 
     Raises:
         ValueError: as `c_filter`, for a wrong monitor, or if a file cannot be written.
@@ -111,7 +113,7 @@ def write_project(
         f"{made.name}.h": made.header,
         f"{made.name}.c": made.source,
         f"{made.name}.hpp": class_of(made.name, programs, single=single, tested=watch is not None),
-        "main.c": log_program(made.name, programs, single=single, tested=watch is not None),
+        "main.c": log_program(made.name, programs, single=single, tested=watch is not None, dt=dt),
         "CMakeLists.txt": CMAKE.format(name=made.name),
         "README.md": README.format(**about),
         **({"board.c": emulated.BOARD, "board.ld": emulated.MEMORY} if board else {}),

@@ -429,6 +429,7 @@ def log_of(model, inputs, z):
 
 SECONDS = "times must be in seconds, or their column say its unit"
 STEP = "times must be one step apart, to a twentieth of a step"
+WAY = "; thruster log LOG --out NEW.csv writes what thruster estimate reads of it\n"
 
 
 @pytest.mark.usefixtures("as_python")
@@ -463,22 +464,22 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
             "line 3 is empty: rows of a log without times must follow one another\n",
         ),
         (["u", "z"], "u,z,u\n1,2,1\n", "line 1: names of columns must differ from one another, but got 'u'\n"),
-        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.03\n", f"line 4: {STEP}, but got '.03'\n"),
-        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.01\n", f"line 4: {STEP}, but got '.01'\n"),
-        (["u", "z"], "u,z,t\n1,2,0\n1,3,-.01\n4,5,.01\n", f"line 3: {STEP}, but got '-.01'\n"),
-        (["u", "z"], "u,z,timestamp\n1,2,0\n1,3,10000\n4,5,20000\n", f"line 3: {SECONDS}, but got '10000'\n"),
-        (["u", "z"], "u,z,t\n1,2,1700000000000\n1,3,1\n", f"line 2: {SECONDS}, but got '1700000000000'\n"),
-        (["u", "z"], "u,z,t\n1,2,46143\n1,3,46143.0000001\n", f"line 3: {SECONDS}, but got '46143.0000001'\n"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.03\n", f"line 4: {STEP}, but got '.03'{WAY}"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,.01\n4,5,.01\n", f"line 4: {STEP}, but got '.01'{WAY}"),
+        (["u", "z"], "u,z,t\n1,2,0\n1,3,-.01\n4,5,.01\n", f"line 3: {STEP}, but got '-.01'{WAY}"),
+        (["u", "z"], "u,z,timestamp\n1,2,0\n1,3,10000\n4,5,20000\n", f"line 3: {SECONDS}, but got '10000'{WAY}"),
+        (["u", "z"], "u,z,t\n1,2,1700000000000\n1,3,1\n", f"line 2: {SECONDS}, but got '1700000000000'{WAY}"),
+        (["u", "z"], "u,z,t\n1,2,46143\n1,3,46143.0000001\n", f"line 3: {SECONDS}, but got '46143.0000001'{WAY}"),
         (["u", "z"], "u,z,t\n1,2,0\n1,3,\n4,5,.01\n", "line 3: every row must have a time, but got ''\n"),
         (
             ["u_uA", "z"],
             "u_uA,z\n",
-            "line 1: the unit of column u_uA must be one that this program converts, but got 'uA'\n",
+            "line 1: the unit of column u_uA must be one that this program converts, but got 'uA'" + WAY,
         ),
         (
             ["u", "z[kg]"],
             "u,z\n",
-            "line 1: the unit of column z must be one that this program converts, but got 'kg'\n",
+            "line 1: the unit of column z must be one that this program converts, but got 'kg'" + WAY,
         ),
         (["u", "z"], "u,z\n1,2\n2,2\n3,2\n", "a measurement must vary, but column z does not\n"),
         (["u", "z"], "u,z\n1,2\n2,3\n", "a log must have at least 3 rows, but got 2\n"),
@@ -517,3 +518,45 @@ def test_a_log_is_read_in_any_unit_as_estimate_reads_it(words, log, tmp_path):
     log = read_log(tmp_path / "log.csv", model, columns, dt=None if has_times else 1.0)
     np.testing.assert_allclose(log.inputs[:, 0], [1.0, 3.0])
     np.testing.assert_allclose(log.measurements[:, 0], [2.0, 3.0, 5.0])
+
+
+@pytest.mark.usefixtures("as_python")
+def test_rows_that_a_log_lacks_are_predicted_as_estimate_does(tmp_path):
+    model = thruster_model()
+    inputs, z = simulated(model, 60, level=1.0)
+    lines = log_of(model, inputs[0], z[0]).splitlines()
+    lines = [line for k, line in enumerate(lines) if k not in (4, 9, 10, *range(20, 41))]
+    filter_ = made("ekf", model)
+    write_project(filter_, tmp_path, "one", dt=0.01)
+    command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]
+    assert subprocess.run(command, cwd=tmp_path).returncode == 0
+
+    def filtered(lines):
+        return subprocess.run([tmp_path / "one_log"], input="\n".join(lines), capture_output=True, text=True)
+
+    headers, *rows = (line.split(",") for line in filtered(lines).stdout.splitlines())
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    wanted = columns_of(estimate_with(filter_, ReplayEnv(tmp_path / "log.csv", model).log))
+    assert len(rows) == 61 == len(wanted["time_s"])
+    for header, column in zip(headers, zip(*rows, strict=True), strict=True):
+        numbers = [float(word) if word else math.nan for word in column]
+        np.testing.assert_allclose(numbers, wanted[header], rtol=1e-8, atol=1e-9)
+    for some in (lines[:1] + lines[1::2], [lines[0], *lines[1:4], lines[2]]):  # of another dt; back in time
+        ended = filtered(some)
+        assert ended.returncode == 2
+        assert re.match(r"line \d+: times must be steps of 0.01 s, .*" + re.escape(WAY), ended.stderr)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_spaces_part_cells_and_a_mark_of_order_may_stand_twice(tmp_path):
+    write_project(made("ekf", thruster_model()), tmp_path, "one")
+    assert subprocess.run(["gcc", "one.c", "main.c", "-lm", "-o", "one_log"], cwd=tmp_path).returncode == 0
+    plain = "t,voltage_V,measured_thrust_N\n0,1,2\n1,3,nan\n2,2,5\n3,2,4\n"
+    log = "\ufeff\ufeff#t voltage_V   measured_thrust_N \n 0 1 2\n\n1\t3 nan \n2 2 5\n3 2 4"
+    one, other = (
+        subprocess.run([tmp_path / "one_log"], input=text.encode(), capture_output=True, check=True).stdout
+        for text in (plain, log)
+    )
+    assert one == other
+    (tmp_path / "log.csv").write_text(log, encoding="utf-8")
+    assert read_log(tmp_path / "log.csv", thruster_model()).inputs[:, 0].tolist() == [1.0, 3.0, 2.0]

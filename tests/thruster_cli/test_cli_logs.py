@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
-from filters import EstimateState
+from filters import EstimateState, thruster_model
 from filters.logs.estimate import estimate
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.parameters import PRESETS
+from thruster_env.plants.logs.read import read_log
 from thruster_env.preset_file import PresetFile, write_preset
 
 TWO_STATES = """
@@ -46,6 +47,30 @@ def simulated(thruster):  # noqa: F811
             assert thruster("simulate", "--out", name, "--steps", 300, "--seed", seed).returncode == 0
 
     return make
+
+
+def test_a_log_is_written_as_it_is_read(thruster, tmp_path):  # noqa: F811
+    """With dates, another unit and stamps off the grid: the exported program in C reads what comes of it."""
+    rng, rows = np.random.default_rng(0), ["when (UTC),U_kV,load [mN],x"]
+    for k in range(40):
+        second = 0.01 * k + 0.003 * rng.random()
+        rows.append(f"2026-05-01T12:00:{second:09.6f},{0.001 * (k % 7)},{rng.normal():.4f},a")
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    options = ["--column", "V_s=U_kV", "--column", "thrust=load [mN]", "--column", "time=when (UTC)"]
+    done = thruster("log", "run.csv", *options, "--out", "grid.csv")
+    assert done.returncode == 0 and "wrote grid.csv" in done.stdout
+    columns = {"V_s": "U_kV", "thrust": "load [mN]", "time": "when (UTC)"}
+    log, again = (
+        read_log(tmp_path / "run.csv", thruster_model(), columns),
+        read_log(tmp_path / "grid.csv", thruster_model()),
+    )
+    assert log.irregular and not again.irregular and log.dt == again.dt
+    np.testing.assert_array_equal(again.inputs, log.inputs)
+    np.testing.assert_array_equal(again.measurements, log.measurements)
+    before = (tmp_path / "grid.csv").read_bytes()
+    for arguments in (["run.csv", *options[:-1], "time=x"], ["run.csv", *options, "--dt", "0.02"]):
+        done = thruster("log", *arguments, "--out", "grid.csv")
+        assert done.returncode == 2 and (tmp_path / "grid.csv").read_bytes() == before
 
 
 def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp_path):  # noqa: F811

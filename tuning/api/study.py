@@ -118,7 +118,8 @@ class Study:
         """
         from filters.c.project import write_project
 
-        write_project(self.filter, folder, name, single=single, monitor=monitor, board=board)
+        options: dict = {"single": single, "monitor": monitor, "board": board, "dt": self.problem.dt}
+        write_project(self.filter, folder, name, **options)
         return Path(folder)
 
     def to_frame(self) -> pandas.DataFrame:

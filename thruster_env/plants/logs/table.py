@@ -152,7 +152,7 @@ def read_table(path: str | Path) -> Table:
 def _read_csv(path: Path) -> Table:
     check_bytes(path.stat().st_size, "a CSV file", path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = path.read_text(encoding="utf-8-sig").lstrip("\ufeff")  # some programs write the mark twice
     except UnicodeDecodeError as error:
         line = 1 + error.object[: error.start].count(b"\n")
         raise ValueError(

@@ -218,7 +218,9 @@ def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
         size += sum(one.total_uncompressed_size for one in parts)
     names = pyarrow.parquet.read_schema(request["files"][0]).names
     if request["files"] != [request["path"]] and max(8 * numbers, size) <= request["bytes"]:
-        tables.append(pyarrow.parquet.read_table(request["path"], **CHECKED))  # names of its folders are columns, too
+        tables.append(
+            pyarrow.parquet.read_table(request["path"], **CHECKED)
+        )  # names of its folders are columns, too
         names = tables[0].column_names
 
     def read(number: int) -> np.ndarray:
