@@ -1,5 +1,6 @@
 """Functions that a factory writes at each call: equal ones stand for one another, and no others do."""
 
+import collections
 import functools
 import gc
 import math
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from filters import make_filter, run
 from thruster_env.numerics import equal_functions
 from thruster_env.numerics.equal_functions import first_equal
 from thruster_env.numerics.integration import runge_kutta
@@ -140,6 +142,69 @@ def decorated(value=1.0):
     return f
 
 
+def with_local_class(value=1.0):
+    class Plant:
+        def __init__(self):
+            self.gain = value
+
+        def method(self, x):
+            return self.gain * x
+
+    return Plant().method
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    value: float
+
+    def __call__(self, x):
+        return self.value * x
+
+
+def with_slots(value=1.0):
+    settings = Slots(value)
+    return lambda x: settings.value * x
+
+
+def with_callable(value=1.0):
+    return Slots(value)
+
+
+def with_mappings(value=1.0):
+    numbers = types.MappingProxyType(collections.defaultdict(float, a=collections.OrderedDict(b=value)))
+    return lambda x: numbers["a"]["b"] * x
+
+
+def with_range(value=1.0):
+    span = range(2), slice(1, 3)
+    return lambda x: value * x * len(span[0]) * span[1].stop
+
+
+def with_members_of_a_local_class(value=1.0):
+    class Plant:
+        gain = value
+
+        @staticmethod
+        def method(x):
+            return Plant.gain * x
+
+    return Plant.method
+
+
+def with_cache(value=1.0):
+    @functools.lru_cache
+    def gain():
+        return value
+
+    return lambda x: gain() * x
+
+
+def with_matrix(value=1.0):
+    with pytest.warns(PendingDeprecationWarning):
+        matrix = np.asmatrix([[1.0, value]])
+    return lambda x: matrix[0, 1] * x
+
+
 def with_module(value=1.0):
     module = types.ModuleType("settings")
     module.value = value
@@ -149,7 +214,8 @@ def with_module(value=1.0):
 FACTORIES = [
     *(with_number, with_default, with_keyword, with_helper, with_two_levels, with_array, with_large_array),
     *(with_list, with_object, with_frozen, with_namespace, with_method, with_partial, with_local_tuple),
-    *(recursive, from_text, decorated),
+    *(recursive, from_text, decorated, with_local_class, with_slots, with_callable, with_mappings, with_range),
+    *(with_members_of_a_local_class, with_cache, with_matrix),
 ]
 
 
@@ -204,6 +270,84 @@ def test_attributes_of_modules_and_classes_count(monkeypatch):
     Holder.gain = 2.0
     assert first_equal(make(Holder)) is not one
     assert first_equal(with_module()) is not first_equal(with_module())  # two modules
+
+
+class Changed:
+    gain = 2.0
+
+    def method(self, x):
+        return self.gain * x
+
+
+CHANGED = Changed()
+
+
+def read_global(x):
+    return GAIN * x
+
+
+def read_through_a_helper(x):
+    return read_global(x)
+
+
+def read_class(x):
+    return Changed.gain * x
+
+
+def read_object(x):
+    return CHANGED.gain * x
+
+
+def read_in_python(x):
+    return read_global(float(x))  # which cannot be traced
+
+
+READING = [read_global, read_through_a_helper, read_class, read_object, read_in_python]
+
+
+def set_gain(monkeypatch, value):
+    monkeypatch.setitem(globals(), "GAIN", value)
+    monkeypatch.setattr(Changed, "gain", value)
+
+
+@pytest.mark.parametrize(
+    "make", [*(lambda f=f: f for f in READING), lambda: Changed().method, lambda: CHANGED.method]
+)
+def test_a_function_that_reads_other_values_than_before_is_another(make, monkeypatch):
+    one = first_equal(make())
+    set_gain(monkeypatch, 5.0)
+    other = first_equal(make())
+    assert other != one and first_equal(make()) == other == first_equal(other) and other(3.0) == 15.0
+    set_gain(monkeypatch, 2.0)
+    assert first_equal(make()) == one
+
+
+def final_mean(function, name="ekf"):
+    """The last estimate of a model that moves by a function, from a prior without measurements."""
+    model = StateSpaceModel(
+        transition=lambda x, u, c: (function(x[0]),),
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[0.01],
+        measurement_noise_cov=[0.04],
+        prior_mean=[1.0],
+        prior_cov=[0.0],
+        inputs=0,
+    )
+    return run(make_filter(name, model), None, np.zeros((1, 2, 0)), np.full((1, 3, 1), np.nan)).means[0, -1, 0]
+
+
+@pytest.mark.parametrize("function", READING)
+def test_a_filter_of_a_model_that_is_made_again_reads_the_values_of_now(function, monkeypatch, as_python):
+    assert final_mean(function) == 4.0
+    set_gain(monkeypatch, 5.0)
+    assert final_mean(function) == 25.0
+
+
+@pytest.mark.parametrize("function", [read_through_a_helper, read_in_python])
+def test_machine_code_of_a_model_that_is_made_again_reads_the_values_of_now(function, monkeypatch):
+    assert final_mean(function) == 4.0
+    set_gain(monkeypatch, 5.0)
+    assert final_mean(function) == 25.0
 
 
 def test_an_array_that_was_written_to_is_another_value():
@@ -266,13 +410,13 @@ def test_functions_that_change_what_they_hold_stay_apart(make):
 
 def test_functions_are_forgotten_with_their_last_user():
     gc.collect()
-    before = len(equal_functions._first), len(equal_functions._known)
+    before = len(equal_functions._first), len(equal_functions._used)
     functions = [first_equal(make(float(value))) for make in FACTORIES for value in range(5)]
     alive = [weakref.ref(f) for f in functions if isinstance(f, types.FunctionType)]
     del functions
     gc.collect()
     assert not any(one() for one in alive)
-    assert (len(equal_functions._first), len(equal_functions._known)) == before
+    assert (len(equal_functions._first), len(equal_functions._used)) == before
 
 
 def test_functions_of_modules_are_themselves():

@@ -1,5 +1,7 @@
 """Identification of models whose functions are written within a factory: the numbers of functions of a module."""
 
+import types
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -119,6 +121,52 @@ def of_an_array(gain=2.0, rate=1.0, r=0.04):
     return in_closure(r=r).replace(transition=move)
 
 
+def of_a_local_class(gain=2.0, rate=1.0, r=0.04):
+    class Local:
+        def __init__(self):
+            self.numbers = types.MappingProxyType({"gain": np.float64(gain), "rate": np.array(rate)})
+
+        def move(self, x, u, c):
+            return (x[0] + DT * (self.numbers["gain"] * u[0] - self.numbers["rate"] * x[0]),)
+
+    return in_closure(r=r).replace(transition=Local().move)
+
+
+@dataclass(slots=True)
+class Callable:
+    gain: float
+    rate: float
+
+    def __call__(self, x, u, c):
+        return (x[0] + DT * (self.gain * u[0] - self.rate * x[0]),)
+
+
+@dataclass
+class WithoutHash(Callable):
+    """Dataclasses that can be changed have no hash."""
+
+
+def of_a_callable_without_hash(gain=2.0, rate=1.0, r=0.04):
+    return in_closure(r=r).replace(transition=WithoutHash(gain, rate))
+
+
+def of_a_callable(gain=2.0, rate=1.0, r=0.04):
+    return in_closure(r=r).replace(transition=Callable(gain, rate))
+
+
+GAIN = 2.0
+
+
+def read_global(x, u, c):
+    return (x[0] + DT * (GAIN * u[0] - c[0] * x[0]),)
+
+
+def of_a_global(gain=2.0, rate=1.0, r=0.04):
+    global GAIN
+    GAIN = gain
+    return in_closure(r=r).replace(transition=read_global, constants=(rate,))
+
+
 class Constants(NamedTuple):
     substep: float
 
@@ -195,7 +243,10 @@ def test_the_log_likelihood_and_its_derivatives_are_those_of_functions_of_a_modu
         np.testing.assert_array_equal(a, b)
 
 
-CAPTURED = [in_closure, with_jacobians, complex_steps, of_an_object, of_a_method, of_a_partial, of_an_array]
+CAPTURED = [
+    *(in_closure, with_jacobians, complex_steps, of_an_object, of_a_method, of_a_partial, of_an_array),
+    *(of_a_local_class, of_a_callable, of_a_callable_without_hash),
+]
 PAIRS = [*((of_module, one) for one in CAPTURED), (of_constants_in_continuous_time, in_continuous_time)]
 
 
@@ -207,6 +258,11 @@ def test_parameters_in_a_closure_have_the_derivatives_of_constants(as_python, ex
     at = coordinates.of([1.8, 0.9, 0.05])
     for a, b in zip(one(at), other(at), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-6, atol=1e-6 * np.abs(a).max())
+
+
+def test_a_factory_that_sets_a_global_for_its_functions_is_refused(as_python):
+    with pytest.raises(ValueError, match="must not read values that its factory sets, but 'gain' changes those"):
+        Objective(recorded(steps=30), of_a_global, Coordinates(FREE))
 
 
 def test_parameters_in_a_closure_are_constants_of_steps_of_any_length_too(as_python):

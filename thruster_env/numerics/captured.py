@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import functools
 import types
 from collections.abc import Callable, Iterator, Sequence
@@ -9,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.equal_functions import first_equal, has_by_name, is_of_a_user
+from thruster_env.numerics.equal_functions import attributes_of, first_equal, has_by_name, is_of_a_user
 from thruster_env.numerics.recipes import Made, as_function, as_made
 
+MAPPINGS = dict, collections.OrderedDict, collections.defaultdict, types.MappingProxyType
 LARGEST = 64  # entries of an array that are numbers of their own
 
 
@@ -52,7 +54,8 @@ class _Copy:
     def of(self, value: Any) -> Any:
         """The copy of a value; what holds no floats, or nothing known, is returned as it is."""
         if isinstance(value, float):
-            return self._other(value)
+            other = self._other(value)
+            return type(value)(other) if isinstance(other, float) else other  # of NumPy a number of NumPy
         if id(value) not in self._copies:
             self._copies[id(value)] = value, value
             self._copies[id(value)] = value, self._of_what_holds(value)
@@ -76,8 +79,10 @@ class _Copy:
             return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
         if type(value) is list:
             return list(map(self.of, value))
-        if type(value) is dict:
-            return {key: self.of(one) for key, one in value.items()}
+        if type(value) in MAPPINGS:
+            held = {key: self.of(one) for key, one in value.items()}
+            kind = type(value)
+            return kind(value.default_factory, held) if kind is collections.defaultdict else kind(held)
         if type(value) is np.ndarray and value.dtype == np.float64 and value.size <= LARGEST:
             numbers = [self._other(one) for one in value.ravel().tolist()]
             plain = all(isinstance(one, float) for one in numbers)
@@ -103,5 +108,6 @@ class _Copy:
         base = types.SimpleNamespace if isinstance(value, types.SimpleNamespace) else object
         copy = base.__new__(type(value))
         self._copies[id(value)] = value, copy
-        vars(copy).update({name: self.of(one) for name, one in vars(value).items()})
+        for name, one in attributes_of(value).items():
+            object.__setattr__(copy, name, self.of(one))
         return copy

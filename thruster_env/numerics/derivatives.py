@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache, lru_cache
+from types import FunctionType
 from typing import Any
 from weakref import WeakSet
 
@@ -140,7 +141,7 @@ def _complex_step_in_loops(function: Callable, rows: int, columns: int, argument
 
 def by_complex_step(function: Callable) -> bool:
     """Whether a Jacobian is one that `complex_step` has returned."""
-    return function in _EXACT
+    return isinstance(function, FunctionType) and function in _EXACT  # others need not have a hash
 
 
 TOOLS: dict[str, Any] = {"np": np, "isfinite": math.isfinite, "step_of": step_of, **NAMES}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache, wraps
 
-from thruster_env.numerics.equal_functions import first_equal
+from thruster_env.numerics.equal_functions import first_equal, original_of
 from thruster_env.numerics.recipes import Made, as_function, as_made, remember
 from thruster_env.numerics.written import made_here
 
@@ -31,7 +31,7 @@ def makes_functions(maker: Callable) -> Callable:
         for key, function in entries.items():
             nested = "<locals>" in getattr(function, "__qualname__", "")  # others are found by their names
             if made_here(function) or (nested and all(function is not one for one in arguments)):
-                remember(function, Made(make, arguments, key))
+                remember(function, Made(make, tuple(map(original_of, arguments)), key))
         if isinstance(result, dict):
             return {key: first_equal(function) for key, function in result.items()}
         return first_equal(result)

@@ -16,6 +16,7 @@ from thruster_env.numerics.algebra.graphs import Number
 from thruster_env.numerics.algebra.tracing import traced
 from thruster_env.numerics.captured import captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.numerics.derivatives import by_complex_step
+from thruster_env.numerics.equal_functions import bound_call
 from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.plants.steps import AnyStepModel, in_any_steps
 
@@ -115,7 +116,7 @@ def _form(form: Any, count: int) -> Any:
 
 def _functions_of(model: StateSpaceModel) -> dict[str, Callable | None]:
     plain = model.plain if isinstance(model, AnyStepModel) else model
-    found = {name: getattr(plain, name) for name in FUNCTIONS}
+    found = {name: bound_call(getattr(plain, name)) for name in FUNCTIONS}
     return {name: None if one is not None and by_complex_step(one) else one for name, one in found.items()}
 
 

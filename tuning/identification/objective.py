@@ -85,6 +85,7 @@ class Objective:
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
+        self._check_factory(at)
         pairs = [self._pair(at, j) for j in range(len(at))]
         same = [same_functions(*pair) for pair in pairs]
         if not all(same):
@@ -121,6 +122,19 @@ class Objective:
     def _given_model(self, at: np.ndarray) -> StateSpaceModel:
         values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
         return self._model(**values)
+
+    def _check_factory(self, at: np.ndarray) -> None:
+        """Raise ValueError if a model's functions read what the factory changes for the next model."""
+        for j, name in enumerate(self.coordinates.names):
+            first, second = self.coordinates.neighbours(at, j, STEP)
+            model = self._given_model(first)
+            functions = model.functions
+            self._given_model(second)
+            if model.functions != functions:
+                raise ValueError(
+                    f"functions of a model must not read values that its factory sets, but {name!r} changes those "
+                    "of a model that was made before: pass it to them in `constants`, or write them in the factory"
+                )
 
     def _models_about(self, at: np.ndarray) -> list[StateSpaceModel]:
         """Models in which all parameters differ: near a point, and elsewhere within the ranges."""

@@ -145,9 +145,12 @@ class Family:
 
     def _check_functions(self) -> None:
         """Raise ValueError if a parameter changes functions of the model."""
-        pairs = self._pairs(self.coordinates.start())
-        for name, (above, below) in zip(self.coordinates.names, pairs, strict=True):
-            if not same_functions(above, below):
+        start = self.coordinates.start()
+        for place, name in enumerate(self.coordinates.names):
+            above, below = self.coordinates.neighbours(start, place, STEP)
+            model = self._model_at(above)
+            functions = model.functions
+            if not same_functions(model, self._model_at(below)) or model.functions != functions:
                 raise ValueError(
                     f"parameters of a gradient must change numbers of the model alone, but {name} changes its "
                     "functions"
