@@ -16,6 +16,7 @@ SECOND = "s"
 TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
 STAMP_NAMES = ("timestamp", "stamp")
 SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
+DOUBTED = 2.0  # [s], of whole stamps, which may as well be in ms
 MOST_SECONDS = 86400.0  # [s], of stamps in seconds
 DAYS, LEAST_SECONDS = 2e4, 2e-5  # stamps beyond the first are dates in days if steps are below the other [s]
 MOST_DIGITS = 17  # of a float64
@@ -85,11 +86,11 @@ def date_text(seconds: float) -> str:
 
 
 def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
-    """The unit of stamps whose column names none, and what was taken, in words; empty for seconds.
+    """The unit of stamps whose column names none, and what was taken, in words; empty for seconds beyond doubt.
 
     Stamps in ms, us or ns since 1970 are dates from 1989 to 2099 with a sample time of at most 5 s. Others are in
     seconds if these make a sample time below 1000 s (100 s in a column `timestamp`), or of whole minutes up to a
-    day, or if they are not whole. What is left is in the only unit that makes a sample time from 0.1 ms to 5 s; a
+    day, or if they are not whole; of whole ones from 2 s on, which may be in ms, that is said. What is left is in the only unit that makes a sample time from 0.1 ms to 5 s; a
     column `timestamp`, as of PX4 and ROS, is never in ms. Dates in days, as of Excel and MATLAB, have large
     numbers and small steps, and are refused.
 
@@ -117,7 +118,11 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
         raise ValueError(f"{rule}, but the sample time in {where} would be {step:.4g} s ({way})")
     is_whole, is_minutes = bool((known == np.round(known)).all()), not (steps % 60.0).any()
     if step <= MOST_SECONDS and (not is_whole or step < (100 if is_stamp else 1000) or is_minutes):
-        return SECOND, ""
+        is_date = SINCE_1970[0] <= middle <= SINCE_1970[1]
+        if not is_whole or is_minutes or is_date or step < DOUBTED:
+            return SECOND, ""
+        said = f"the sample time is {step:.4g} s; if it is {step:.4g} ms, use --column 'time={header}[ms]'"
+        return SECOND, f"times in {where} are taken as s: {said}"
     low, high = SHORTEST_STEP, LONGEST_STEP
     some = [(unit, ticks) for unit, ticks in TICKS.items() if not (is_stamp and unit == "ms")]
     units = [unit for unit, ticks in some if is_whole and low * ticks <= step <= high * ticks]
