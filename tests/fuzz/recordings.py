@@ -13,7 +13,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
+import pyarrow
+from pyarrow import parquet
 from scipy.io import savemat
 
 from tests.fuzz.files import _damaged
@@ -145,35 +148,52 @@ def damaged_tables(rng: np.random.Generator, seconds: float) -> str:
 
 
 def flipped_bits(rng: np.random.Generator, seconds: float) -> str:
-    """Flipped bits of npz and MATLAB files whose arrays have check sums: the numbers of the file, or one line."""
-    counts, end = Counter(), time.monotonic() + seconds
+    """Flipped bits of files with check sums (npz, MATLAB, Parquet, HDF5): the numbers of the file, or one line.
+
+    Names of the columns of Parquet have none: an array may be missing.
+    """
+    counts, end, kinds = Counter(), time.monotonic() + seconds, (".npz", ".mat", ".parquet", ".h5")
     with tempfile.TemporaryDirectory() as folder:
         while not counts or time.monotonic() < end:
             columns = {"t": 0.1 * np.arange(900), "voltage": np.round(rng.normal(size=900), 2)}
-            path = Path(folder) / f"a{rng.choice(['.npz', '.mat'])}"
-            if path.suffix == ".mat":
-                savemat(path, columns, do_compression=True)
-            else:
-                rng.choice([np.savez, np.savez_compressed])(path, **columns)
+            path = Path(folder) / f"a{rng.choice(kinds, p=[0.4, 0.4, 0.1, 0.1])}"
+            _write_with_check_sums(path, columns, rng)
             data = path.read_bytes()
-            for _ in range(50):
+            for _ in range(50 if path.suffix in (".npz", ".mat") else 3):  # a process of its own reads the others
                 bad, first = bytearray(data), 128 if path.suffix == ".mat" else 0
                 for place in rng.integers(first, len(bad), rng.integers(1, 3)):
                     bad[place] ^= 1 << int(rng.integers(8))
                 path.write_bytes(bad)
                 try:
-                    is_table = path.suffix == ".npz"
-                    some = (
-                        {one: read_table(path).numbers(one) for one in columns} if is_table else read(path, None)
-                    )
+                    if path.suffix in TABLES:
+                        table = read_table(path)
+                        some = {one: table.numbers(one) for one in table.names}
+                    else:
+                        some = {one: samples.values for one, samples in read(path, None).items()}
                 except ValueError as error:
                     assert str(error) and "\n" not in str(error), repr(error)
                     counts["refused"] += 1
                     continue
                 for name, values in columns.items():
-                    np.testing.assert_array_equal(some[name] if is_table else some[name].values, values)
-                counts["read"] += 1
+                    assert name in some or path.suffix in (".parquet", ".h5"), (path.suffix, [*some])
+                    np.testing.assert_array_equal(some.get(name, values), values)
+                counts["read" if set(some) == set(columns) else "read in part"] += 1
     return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
+def _write_with_check_sums(path: Path, columns: dict[str, np.ndarray], rng: np.random.Generator) -> None:
+    """Write arrays such that all of them are under check sums."""
+    if path.suffix == ".mat":
+        savemat(path, columns, do_compression=True)
+    elif path.suffix == ".parquet":
+        packing = str(rng.choice(["none", "snappy", "zstd"]))
+        parquet.write_table(pyarrow.table(columns), path, write_page_checksum=True, compression=packing)
+    elif path.suffix == ".h5":
+        with h5py.File(path, "w", libver="latest") as file:
+            for name, values in columns.items():
+                file.create_dataset(name, data=values, chunks=(200,), fletcher32=True)
+    else:
+        rng.choice([np.savez, np.savez_compressed])(path, **columns)
 
 
 def _by_topic(path: Path) -> dict[str, int]:

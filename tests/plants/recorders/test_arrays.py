@@ -1,5 +1,6 @@
 """Arrays of MATLAB and HDF5 within structures and cells, in the units of CF, and in files that end the library."""
 
+import struct
 from collections import Counter
 
 import numpy as np
@@ -277,3 +278,22 @@ def test_a_dataset_that_was_never_written_is_named(tmp_path):
         file["time"] = 0.1 * np.arange(40)
         file.create_dataset("voltage", (40,), "f8")
     assert contents(tmp_path / "a.h5").unread == {"voltage": "never written"}
+
+
+def test_numbers_that_are_lost_or_were_never_written_are_not_zeros(tmp_path):
+    """The library gives the fill value for a part whose place is lost, and fewer numbers of a smaller size."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["t"], file["short"] = np.arange(300.0), np.arange(123.0)
+        for name, fill in (("part", 0.0), ("missing", np.nan)):
+            file.create_dataset(name, (300,), "f8", chunks=(50,), fillvalue=fill)[100:] = 1.0 + np.arange(200.0)
+    data = path.read_bytes()
+    assert data.count(struct.pack("<QQ", 123, 123)) == 1
+    path.write_bytes(data.replace(struct.pack("<QQ", 123, 123), struct.pack("<QQ", 100, 100)))
+    found = contents(path)
+    assert {one.name for one in found.fields} == {"t", "missing"}
+    assert found.unread == {
+        "part": "2 of its 6 parts were never written, or are lost",
+        "short": "damaged: it says 800 bytes, but has 984",
+    }
+    assert np.isnan(read(path, ["missing"])["missing"].values[:100]).all()

@@ -90,9 +90,9 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
 
     Stamps in ms, us or ns since 1970 are dates from 1989 to 2099 with a sample time of at most 5 s. Others are in
     seconds if these make a sample time below 1000 s (100 s in a column `timestamp`), or of whole minutes up to a
-    day, or if they are not whole; of whole ones from 2 s on, which may be in ms, that is said. What is left is in the only unit that makes a sample time from 0.1 ms to 5 s; a
-    column `timestamp`, as of PX4 and ROS, is never in ms. Dates in days, as of Excel and MATLAB, have large
-    numbers and small steps, and are refused.
+    day, or if they are not whole; of whole ones from 2 s on, which may be in ms, that is said. What is left is in
+    the only unit that makes a sample time from 0.1 ms to 5 s; a column `timestamp`, as of PX4 and ROS, is never in
+    ms. Dates in days, as of Excel and MATLAB, have large numbers and small steps, and are refused.
 
     Args:
         stamps: (rows,), NaN where there is none.

@@ -95,6 +95,8 @@ class Walk:
             self.found[name] = "packed in parts that are too large"
         elif one.size and not one.id.get_storage_size():
             self.found[name] = "never written"
+        elif one.size and (why := _why_not_whole(one, self._most)):
+            self.found[name] = why
         elif one.attrs.get(EMPTY, 0) or kind == "char" or one.shape is None:
             return
         elif h5py.check_ref_dtype(one.dtype) is h5py.Reference and (kind == "cell" or (in_structure and not kind)):
@@ -117,6 +119,25 @@ class Walk:
             own = f"{name}{{{place}}}" if brackets == "{}" else f"{group}({place}).{field}"
             if reference:
                 self._add(self._file[reference], own, depth + 1)
+
+
+def _why_not_whole(one: Any, most_bytes: int) -> str:
+    """Why a dataset does not hold as many numbers as it says; empty if it does, or may not be read for its size.
+
+    The library gives the fill value for parts that are not there, as where their index is damaged.
+    """
+    stated, stored = one.size * one.dtype.itemsize, one.id.get_storage_size()
+    if one.chunks is None:
+        is_other = one.dtype.kind in NUMERIC and stored != stated
+        return f"damaged: it says {stated} bytes, but has {stored}" if is_other else ""
+    parts = math.prod(-(-side // chunk) for side, chunk in zip(one.shape, one.chunks, strict=True))
+    count = one.id.get_num_chunks() if stated <= most_bytes else parts
+    if count > parts:
+        return f"damaged: it says that it has {parts} parts, but has {count}"
+    is_missing = one.dtype.kind == "f" and np.isnan(one.fillvalue)
+    return f"{parts - count} of its {parts} parts were never written, or are lost" * (
+        count < parts and not is_missing
+    )
 
 
 def _address(one: Any) -> int:
