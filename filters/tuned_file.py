@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +30,8 @@ PRIOR = "prior_cov_factor"  # on P_0
 FACTORS = "parameter_factors"  # a mapping of names to factors
 STATES = "states"  # which of its states a model has, by a name that the plant knows
 AUGMENTED = "augmented_constants"  # a mapping of constants that are states to [std, walk, mean]
+OPTION_NAMES = {"sensors": "sensor", "columns": "column", "clock_offset": "clock-offset", "held_out": "held-out"}
+OPTION_NAMES |= {"grid": "no-grid", "hold_gaps": "hold-gaps"}
 MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
 
 
@@ -71,6 +76,44 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{error} (in the tuned file {path})") from None
     return content
+
+
+def tune_options(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What named the problem when a tuned file was made: `log` and how logs were read, or `problem`; `preset`."""
+    entry = content["problems"].get(content["problem"])
+    stored = entry.get("content") if isinstance(entry, dict) else None
+    if isinstance(stored, dict) and isinstance(stored.get("of"), dict):  # that of an augmented problem
+        stored = stored["of"].get("content")
+    name, *constants = re.split(r"\+(?=[A-Za-z_])", str(content["problem"]))
+    augment = {"augment": constants} if constants else {}
+    if isinstance(stored, dict) and isinstance(stored.get("logs"), list):
+        logs = [one.get("file") for one in stored["logs"] if isinstance(one, dict)]
+        return {"log": logs, **(stored["options"] if isinstance(stored.get("options"), dict) else {}), **augment}
+    scenario, bracket, preset = name.removesuffix(")").partition(" (")
+    return {"problem": scenario, **({"preset": preset} if bracket else {}), **augment}
+
+
+def made_with(content: Mapping[str, Any]) -> str:
+    """The same as options of `thruster tune`, such as "--log run1.csv --preset mine.toml"."""
+    parts = []
+    for key, value in tune_options(content).items():
+        option = f"--{OPTION_NAMES.get(key, key)}"
+        if isinstance(value, bool):  # only what is not the default is stored
+            parts.append(option)
+        else:
+            parts += [
+                f"{option} {shlex.quote(str(one))}" for one in (value if isinstance(value, list) else [value])
+            ]
+    return " ".join(parts)
+
+
+@contextmanager
+def compared(content: Mapping[str, Any], path: str | Path) -> Iterator[None]:
+    """Add to an error of a comparison with a tuned file the options with which that was made."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{error}; {path} was made with {made_with(content)}") from None
 
 
 def _of_this_version(content: dict) -> dict:

@@ -31,6 +31,7 @@ from thruster_cli.options import (
 )
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
 from thruster_env.plants.logs.write import check_suffix, write_columns
+from tuning.logs.problem import as_tuned
 from tuning.logs.read import read_named
 
 MOST_EPISODES = 8  # that are shown
@@ -95,7 +96,7 @@ def command(
     States or outputs of the model in the log, such as the thrust of a load cell that the filter does not see, are
     compared with the estimate. docs/logs.md has the rules.
 
-    Example: thruster estimate run.csv --tuned out/ekf-run-seed0.json --out est.csv --plot est.png
+    Example: thruster estimate run.csv --tuned tuned.json --out est.csv --plot est.png
 
     Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
     """
@@ -111,7 +112,7 @@ def command(
     watch = asked_monitor(monitor, tuned)
     if isolate and watch is None:
         raise ValueError("--isolate must come with --monitor STEPS, whose alarms it counts")
-    recorded, offer = read_named(log, **reading.named())
+    recorded, offer = read_named(log, **as_tuned(reading.named(), tuned))
     check_targets((out, plot), json, read=(log, tuned, reading.preset))
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}

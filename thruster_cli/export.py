@@ -10,7 +10,15 @@ import typer
 from filters.c.programs import programs_of
 from filters.c.project import write_project
 from filters.c.single import single_error
-from thruster_cli.options import OUTPUT, CodeOption, JsonOption, LogModelOption, MonitorOption, asked_monitor
+from thruster_cli.options import (
+    OUTPUT,
+    CodeOption,
+    JsonOption,
+    LogModelOption,
+    MonitorOption,
+    TunedPresetOption,
+    asked_monitor,
+)
 from thruster_cli.output import announce_compilation, check_targets, emit
 from thruster_env.numerics.checks import one_of
 from tuning.evaluation.tuned import read_tuned
@@ -38,6 +46,7 @@ def command(
     ] = False,
     problem: CodeOption = None,
     model: LogModelOption = None,
+    preset: TunedPresetOption = None,
     json: JsonOption = None,
 ) -> None:
     """Write a tuned Kalman or ensemble filter as C99, with its model, Q and R, and a program that filters a log.
@@ -51,7 +60,7 @@ def command(
     one_of("a language", language, LANGUAGES)
     watch = asked_monitor(monitor, file)
     check_targets((out / "README.md",), json, read=(file,))
-    choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model)])
+    choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
     filter_ = choice.filter(found)
     options = {"single": single, "monitor": watch, "board": board, "dt": found.dt}
     files = [str(one) for one in write_project(filter_, out, name, **options)]

@@ -68,6 +68,15 @@ OfPresetOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+TunedPresetOption = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        help="The preset with which it was tuned; by default as the tuned file names it.",
+        callback=spelt(PRESETS),
+        rich_help_panel=INPUT,
+    ),
+]
 CodeOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption
+from thruster_cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from thruster_cli.output import announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.logs.problem import problems_in
@@ -39,6 +39,7 @@ def command(
     ] = None,
     problem: CodeOption = None,
     model: LogModelOption = None,
+    preset: TunedPresetOption = None,
     json: JsonOption = None,
 ) -> None:
     """Write a report page on a tuned filter, for any browser without a network, and its tables as Markdown.
@@ -54,7 +55,7 @@ def command(
     """
     quiet_optuna()
     announce_compilation()
-    of_files = [one for source in sources if is_file(source) for one in problems_in(Path(source), model)]
+    of_files = [one for source in sources if is_file(source) for one in problems_in(Path(source), model, preset)]
     given = [*map(find_problem, problem or []), *of_files]
     with working(f"reporting on {' and '.join(sources)}"):
         if len(sources) == 1:

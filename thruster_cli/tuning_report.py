@@ -8,15 +8,15 @@ from shlex import quote
 from rich.console import RenderableType
 
 from filters.consistency.intervals import slightly, span
-from filters.consistency.verdicts import mean_sentence
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
 from thruster_env.numerics.modules import is_code
 from tuning.api.run import Tuning
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED, baselines
 from tuning.evaluation.blow_up import blow_up_on
-from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
+from tuning.evaluation.summary import numbers
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
@@ -26,7 +26,7 @@ from tuning.problems.augmented import within
 from tuning.problems.plant_packages import built_in
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
-from tuning.reporting.residual_words import residual_sentences
+from tuning.reporting.residual_words import consistency_sentence, model_doubts, residual_sentences
 from tuning.reporting.units import apart
 from tuning.search.filter_parameters import size_ladder
 from tuning.search.filter_types import filter_types_tried
@@ -45,7 +45,7 @@ def report(tuning: Tuning) -> list[RenderableType]:
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
         first, *others = gains(comparison, scenario.seed_word)
-        shown += [f"{where}{first}", *others]
+        shown += [f"{where}{first}", *others, *model_doubts(scenario, comparison)]
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
     shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
@@ -60,7 +60,7 @@ def report(tuning: Tuning) -> list[RenderableType]:
             choice_table(choices, scenario),
             comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
         ]
-        shown += [_consistency_sentence(comparison.tuned), *residual_sentences(scenario, plan.seed)]
+        shown += [consistency_sentence(comparison), *residual_sentences(scenario, plan.seed)]
     shown += at_ends(result.choice, plan)
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)
@@ -203,7 +203,12 @@ def as_json(tuning: Tuning) -> dict:
     """The result of a tuning as plain data."""
     result, plan = tuning.result, tuning.plan
     held_out = {
-        scenario.name: {**metrics(comparison), **ratios_as_json(comparison)}
+        scenario.name: {
+            **metrics(comparison),
+            **ratios_as_json(comparison),
+            "likelihood_over_regression": numbers(comparison.over_regression),
+            "doubts": model_doubts(scenario, comparison),
+        }
         for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
     }
     data = {
@@ -290,10 +295,3 @@ def _seeds_sentence(result: StudyResult, word: str) -> str:
         f" The others were excluded on the first {min(counts)} {word} before N = {whole} were run on "
         f"{max(counts)}."
     )
-
-
-def _consistency_sentence(evaluation: Evaluation) -> str:
-    if not evaluation.has_truth:
-        return mean_sentence("NIS", evaluation.nis, evaluation.expected_nis)
-    said = mean_sentence("NEES", evaluation.nees, len(evaluation.rmse))
-    return said if said.startswith("Consistent") else f"{said} RMSE and NIS do not fully test the covariance."

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
-from thruster_cli.options import CodeOption, JsonOption, LogModelOption
+from thruster_cli.options import CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from thruster_cli.output import announce_compilation, emit, table, working
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
 from tuning.logs.problem import problems_in
@@ -22,6 +22,7 @@ def command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Tuned file, as `thruster tune` writes it.")],
     problem: CodeOption = None,
     model: LogModelOption = None,
+    preset: TunedPresetOption = None,
     json: JsonOption = None,
 ) -> None:
     """Recompute the held-out metrics of a tuned file on its seeds, and say whether they hold.
@@ -33,7 +34,7 @@ def command(
     """
     announce_compilation()
     with working(f"recomputing the metrics of {file}"):
-        found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model)])
+        found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
     emit(_report(file, found), _as_json(file, found), json)
     if not found.holds:
         sys.exit(1)

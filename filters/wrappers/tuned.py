@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from filters.augmented import Unknown, augmented_model
 from filters.filter import Filter
 from filters.registry import make_filter
-from filters.tuned_file import AUGMENTED, FACTORS, NOISE, PRIOR, read_tuned_file
+from filters.tuned_file import AUGMENTED, FACTORS, NOISE, PRIOR, compared, read_tuned_file
 from filters.tuned_model import check_same_model, check_same_quantities
 from filters.wrappers.models import made, maker_of
 from thruster_env.plants.state_space import StateSpaceModel
@@ -34,7 +34,8 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
     content = read_tuned_file(file)
     plant, check = content.get("plant"), getattr(env.unwrapped, "check_tuned_for", None)
     if model is None and check is not None:
-        check(plant, file)
+        with compared(content, file):
+            check(plant, file)
     entry, tuned_for = content["filter"], content.get("model")
     dt = None if plant is not None else sample_time(env)
     factors = [f"{name} {value:g}" for name, value in entry["model"].get(FACTORS, {}).items() if value != 1.0]
@@ -44,12 +45,14 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
 
     def fits(found: StateSpaceModel) -> None:
         if tuned_for is not None:
-            check_same_quantities(tuned_for, found, dt, file)
+            with compared(content, file):
+                check_same_quantities(tuned_for, found, dt, file)
 
     by_digest = tuned_for is not None and plant is None
     found = _with_numbers(*maker_of(env, model), entry["model"], fits, by_digest)
     if tuned_for is not None and by_digest:
-        check_same_model(tuned_for, found, dt, file)
+        with compared(content, file):
+            check_same_model(tuned_for, found, dt, file)
     return make_filter(entry["name"], found, **entry["numbers"])
 
 

@@ -13,17 +13,23 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, thruster_model
+from filters.tuned_file import made_with
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import of_version, rewrite, write_untuned
 from thruster_env.effects.flow import Gusts
+from thruster_env.numerics.compiled import interpreted
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
 from thruster_env.plant_data import differences, plant_data
+from thruster_env.preset_file import PresetFile, write_preset
 from thruster_env.training.setup import make_configuration
+from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
+from tuning.logs.problem import as_tuned, log_problem, problems_in
 from tuning.problems.files import scenario_of
 from tuning.reporting.subject import find_subject
+from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenarios import SCENARIOS
 
@@ -42,16 +48,19 @@ def wrapped(path, count=None, **arguments):
 
 
 OTHERS = {
-    "dt": ({"dt": 0.02}, r"dt 0.01 \(here 0.02\)$"),
-    "preset": ({"preset": "t200", "max_voltage": 13.0}, r"preset tunnel \(here t200\)$"),
+    "dt": ({"dt": 0.02}, r"dt 0.01 \(here 0.02\);"),
+    "preset": (
+        {"preset": "t200", "max_voltage": 13.0},
+        r"preset tunnel \(here t200\);",
+    ),
     "parameters": (
         {"preset": {**PRESETS["tunnel"]._asdict(), "area": 0.005}},
-        r"area 0.00445 \(here 0.005\)$",
+        r"area 0.00445 \(here 0.005\);",
     ),
-    "channel": ({"sensors": ["speed"]}, r"sensors thrust \(here speed\)$"),
+    "channel": ({"sensors": ["speed"]}, r"sensors thrust \(here speed\);"),
     "all": (
         {"dt": 0.005, "preset": "tunnel_physical", "sensors": ["thrust", "speed"]},
-        r"preset tunnel \(here tunnel_physical\), dt 0.01 \(here 0.005\), sensors thrust \(here thrust, speed\)$",
+        r"preset tunnel \(here tunnel_physical\), dt 0.01 \(here 0.005\), sensors thrust \(here thrust, speed\);",
     ),
 }
 
@@ -110,7 +119,7 @@ def test_a_model_of_one_s_own_and_a_file_of_before_are_not_compared(nominal, tmp
 def test_a_file_of_the_version_before_this_is_compared_by_its_plant(nominal, tmp_path):
     path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), partial(of_version, version=3))
     assert read_tuned(path) == read_tuned(nominal) and verify(path).holds and wrapped(path).filter.name == "ekf"
-    with pytest.raises(ValueError, match=r"old.json was tuned for dt 0.01 \(here 0.02\)$"):
+    with pytest.raises(ValueError, match=r"old.json was tuned for dt 0.01 \(here 0.02\);"):
         wrapped(path, dt=0.02)
 
 
@@ -202,3 +211,62 @@ def test_every_scenario_comes_back_from_its_data():
     made = find_scenario("nominal").replace(flow=(Gusts(std=0.5),), preset=PRESETS["t200"]._asdict())
     again = scenario_of(json.loads(json.dumps(made.as_mapping())), made.name, "x.json")
     assert again.plant.flow == made.plant.flow and again.plant.parameters == made.plant.parameters
+
+
+def test_a_tuned_file_finds_its_preset_or_an_error_names_the_options_that_made_it(thruster):
+    for name, damping in (("mine", 72.0), ("other", 80.0)):
+        mine = PresetFile(PRESETS["tunnel_physical"]._replace(motor_damping=damping), recorder={"dt": 0.01})
+        write_preset(f"{name}.toml", mine, "a thruster")
+    thruster("simulate", "--preset", "tunnel_physical", "--steps", 300, "--measured-only", "--out", "run.csv")
+    problem = log_problem(["run.csv"], preset="mine.toml")
+    names = [name_of(Plan("kf", (one,))) for one in (problem, log_problem(["run.csv"], preset="other.toml"))]
+    assert names[0] == f"kf-run.csv-{problem.digest[:6]}-seed0" and names[1] != names[0]
+    with interpreted():
+        file = write_untuned("tuned.json", problem, "kf")
+    assert read_tuned(file, problems_in(file, preset="mine.toml"))[1].digest == problem.digest
+    assert as_tuned({"preset": None, "sensors": None, "dt": 0.01}, file) == {"preset": "mine.toml", "dt": 0.01}
+    assert as_tuned({"preset": "other.toml"}, file) == {"preset": "other.toml"}
+    made = "; tuned.json was made with --log run.csv --preset mine.toml"
+    for command in ("verify", "evaluate", "report", "export --out boat"):
+        others = thruster(*command.split(), "tuned.json", "--preset", "other.toml")
+        assert others.returncode == 2 and others.stderr.strip().endswith(f"{made}: has that changed?")
+    others = thruster("estimate", "run.csv", "tuned.json", "--preset", "other.toml")
+    assert others.returncode == 2 and others.stderr.strip().endswith(made)
+    shutil.move("mine.toml", "moved.toml")
+    assert read_tuned(file, problems_in(file, preset="moved.toml"))[1].digest == problem.digest
+
+
+@pytest.mark.parametrize(
+    ("content", "options"),
+    [
+        ({"problem": "nominal", "problems": {}}, "--problem nominal"),
+        ({"problem": "nominal (my boat.toml)", "problems": {}}, "--problem nominal --preset 'my boat.toml'"),
+        (
+            {"problem": "mismatch (t200)+voltage_gain:20", "problems": {}},
+            "--problem mismatch --preset t200 --augment voltage_gain:20",
+        ),
+        (
+            {
+                "problem": "a.csv and 1 more",
+                "problems": {
+                    "a.csv and 1 more": {
+                        "content": {
+                            "logs": [{"file": "a.csv"}, {"file": "b.csv"}],
+                            "options": {"model": "m:x", "columns": ["u=U[mV]"], "grid": False, "lead": 40},
+                        }
+                    }
+                },
+            },
+            "--log a.csv --log b.csv --model m:x --column 'u=U[mV]' --no-grid --lead 40",
+        ),
+    ],
+)
+def test_the_options_that_made_a_file_are_those_of_the_command(content, options):
+    assert made_with(content) == options
+
+
+def test_preset_of_a_scenario_must_be_the_file_s_own(nominal):
+    with pytest.raises(
+        ValueError, match="must be that of the tuned file, but got t200, .* with --problem nominal"
+    ):
+        problems_in(nominal, preset="t200")

@@ -136,21 +136,21 @@ def rate_alone(x, c):
 
 
 OTHERS = {
-    "dt": (lambda: pendulum(0.1), pendulum_problem.model, r"dt 0.05 \(here 0.1\)$"),
+    "dt": (lambda: pendulum(0.1), pendulum_problem.model, r"dt 0.05 \(here 0.1\);"),
     "states": (
         pendulum,
         lambda: pendulum_problem.model(states=["theta", ("rate", "omega", "deg/s")]),
-        r"states theta \[rad\], omega \[rad/s\] \(here theta, omega \[deg/s\]\)$",
+        r"states theta \[rad\], omega \[rad/s\] \(here theta, omega \[deg/s\]\);",
     ),
     "sensors": (
         pendulum,
         lambda: pendulum_problem.model(observe=rate_alone, measurement_noise_cov=[0.1], measurements=["w"]),
-        r"measurements cosine, sine, rate \[rad/s\] \(here w\)$",
+        r"measurements cosine, sine, rate \[rad/s\] \(here w\);",
     ),
     "equations": (
         pendulum,
         lambda: pendulum_problem.model(transition=other_swing),
-        r"a model of digest [0-9a-f]{12} \(here [0-9a-f]{12}\)$",
+        r"a model of digest [0-9a-f]{12} \(here [0-9a-f]{12}\);",
     ),
 }
 

@@ -14,7 +14,7 @@ from filters.logs.findings import findings
 from thruster_env.numerics.checks import short_repr
 from tuning.api.estimates import LogEstimates
 from tuning.logs.model_of_logs import model_of_logs
-from tuning.logs.problem import name_of
+from tuning.logs.problem import as_tuned, name_of
 from tuning.logs.read import read_named
 
 if TYPE_CHECKING:
@@ -81,8 +81,9 @@ def estimate(
         )
     log, model, preset = model_of_logs(log, model, preset)
     named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns, "stamps": stamps}
-    read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
     with _as_file(tuned) as file:
+        named = as_tuned(named, file)
+        read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
         found = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
     return LogEstimates(found, findings(found, skip))
 

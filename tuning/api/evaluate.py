@@ -48,7 +48,7 @@ def evaluate(
             tuned file, or "nominal" for the name of a filter.
         seeds: number of held-out seeds, for problems that can generate any number.
         seed: of the study to which they belong.
-        preset: the problem of another thruster, by name or file.
+        preset: the problem of another thruster, by name or file; of a tuned file alone its own preset.
         model: "module:object" for the logs of a tuned file, if their model is code.
         progress: whether to show progress; by default only in terminals and notebooks.
 
@@ -82,12 +82,7 @@ def subject_of(
         found = problem_of(NOMINAL if problem is None else problem, preset)
         return rule_of_thumb(tuned, found), found, False
     if problem is None:
-        if preset is not None:
-            raise ValueError(
-                "preset (--preset) must come with a problem (--problem), because a tuned file names its own, "
-                "but got it alone"
-            )
-        choice, found, _ = read_tuned(tuned, given_for(tuned, model=model))
+        choice, found, _ = read_tuned(tuned, given_for(tuned, model=model, preset=preset))
         return choice, found, True
     found = suited_to(tuned, problem_of(problem, preset))
     return read_choice(tuned, found), found, True

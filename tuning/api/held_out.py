@@ -24,7 +24,7 @@ from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
-from tuning.reporting.residual_words import residual_sentences
+from tuning.reporting.residual_words import model_doubts, residual_sentences
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -200,7 +200,8 @@ class HeldOut:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         restarts = restart_sentences(self.evaluations)
         if self.is_tuned:
-            return [*gains(self.comparison, self.problem.seed_word, self.name), *restarts]
+            said = gains(self.comparison, self.problem.seed_word, self.name)
+            return [*said, *model_doubts(self.problem, self.comparison), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.comparison), *restarts]
 

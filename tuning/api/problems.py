@@ -62,16 +62,21 @@ def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) ->
     return tuple(found)
 
 
-def given_for(file: str | Path, problem: Any = None, model: str | None = None, **of_logs: Any) -> list[Problem]:
+def given_for(
+    file: str | Path,
+    problem: Any = None,
+    model: str | None = None,
+    preset: str | Path | None = None,
+) -> list[Problem]:
     """The problems of a tuned file: those given by the user, and logs that the file names.
 
     Names in a file are never imported: a problem or a model that is code has to be given.
     """
-    given = [] if problem is None else list(problems_of(problem, **of_logs))
+    given = [] if problem is None else list(problems_of(problem))
     kept = read_tuned_file(file)["problems"]
     if any(one.name in kept for one in given):
         return given
-    return [*given, *problems_in(Path(file), model)]
+    return [*given, *problems_in(Path(file), model, preset)]
 
 
 def is_filter(given: Any) -> bool:

@@ -34,6 +34,7 @@ def report(
     storage: str | Path = STUDIES,
     problem: Any = None,
     model: str | None = None,
+    preset: str | Path | None = None,
     progress: bool | None = None,
 ) -> Path:
     """Write a page on a tuned filter, its study and its evaluation on held-out seeds; return the page's path.
@@ -50,6 +51,7 @@ def report(
         storage: storage of the study; without it the page on a file omits the search.
         problem: the problem it was tuned on, if that is code or has changed: a file only names it.
         model: "module:object" for the logs of a tuned file, if their model is code.
+        preset: the preset with which a tuned file was made, such as the new path of its FILE.toml.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Raises:
@@ -70,7 +72,7 @@ def report(
         found = [
             _of_value(one, Path(scratch) / str(place))
             if isinstance(one, Study)
-            else Source(one, storage_text(storage), _given(one, problem, model))
+            else Source(one, storage_text(storage), _given(one, problem, model, preset))
             for place, one in enumerate(several)
         ]
         if len(found) == 1:
@@ -85,14 +87,14 @@ def report(
         return page
 
 
-def _given(source: str | Path, problem: Any, model: str | None) -> Sequence[Problem]:
+def _given(source: str | Path, problem: Any, model: str | None, preset: str | Path | None) -> Sequence[Problem]:
     """What the user gives of the problems that a file or a study names."""
     if not isinstance(source, str | Path):
         raise ValueError(
             f"a report must be of a Study, a tuned file or the name of a study, but got {short_repr(source)}"
         )
     if is_file(source) and Path(source).is_file():
-        return given_for(source, problem, model)
+        return given_for(source, problem, model, preset)
     return [] if problem is None else problems_of(problem)
 
 

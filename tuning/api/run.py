@@ -22,6 +22,8 @@ from tuning.likelihood.goal import OF_STATES
 from tuning.likelihood.gradient import GradientResult, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
+from tuning.problems.augmented import within
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
 from tuning.search.compiling import compile_filters
@@ -35,6 +37,7 @@ from tuning.search.workers import run_in_workers
 
 MOST_TRIALS = 1_000_000
 MOST_WORKERS = 1000
+DIGITS = 6  # of a digest in the name of a study
 METHODS = ("optuna", "gradient")
 
 
@@ -196,10 +199,13 @@ def _check_method(plan: Plan, by_gradient: str | None) -> None:
 
 
 def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) -> str:
-    """A name for a study of a plan, with everything that differs from the default."""
+    """A name for a study of a plan, with everything that differs from the default.
+
+    Of a user's problem or logs it has the beginning of their digest: another model makes another study.
+    """
     parts = [
         re.sub(r"[^\w.+-]+", "-", label_of(plan.filter)),
-        names_of(plan).replace(", ", "+"),
+        "+".join(map(_name_and_digest, plan.scenarios)),
         f"seed{plan.seed}",
     ]
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
@@ -211,6 +217,11 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
     parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]
     parts += [] if way is None else ["way", way]
     return "-".join(parts)
+
+
+def _name_and_digest(problem: Problem) -> str:
+    name = short_name(problem)
+    return name if within(problem).name in built_in() else f"{name}-{problem.digest[:DIGITS]}"
 
 
 def names_of(plan: Plan) -> str:

@@ -26,10 +26,11 @@ from tuning.evaluation.baselines import (
     same_filter,
     scaled_default,
 )
-from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.regression import gain_over_regression
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
-from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS
 from tuning.search.space import Choice
 
 
@@ -51,6 +52,7 @@ class Comparison(NamedTuple):
     given: Evaluation | None = None  # what the model came with; None where nobody gave anything
     noise: Evaluation | None = None  # noise estimation; None where there is none
     lacks_ranges: bool = False  # whether the rule of thumb has the model's own Q: `Problem.lacks_ranges`
+    over_regression: Interval = NOTHING  # without truth: `regression.gain_over_regression` of the tuned filter
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
@@ -120,6 +122,10 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     untuned, tuned = found.pop("untuned"), found.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
     bound, rule, lacks = scenario.bound(data), rule_label(scenario), scenario.lacks_ranges
+    over_regression = NOTHING
+    if data.states is None:
+        training = data_of(scenario, scenario.training_seeds(seed, TRAINING_SEEDS))
+        over_regression = gain_over_regression(scenario.model(), tuned, training, data)
     return Comparison(
         untuned,
         tuned,
@@ -132,6 +138,7 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         given=found["given"],
         noise=found["noise"],
         lacks_ranges=lacks,
+        over_regression=over_regression,
     )
 
 

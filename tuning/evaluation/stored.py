@@ -88,6 +88,7 @@ def comparison_as_data(comparison: Comparison) -> dict:
         "median_nees": {role: one and _plain(one.median_nees) for role, one in found.items()},
         "score_ratios": {name: numbers(ratio) for name, ratio in comparison.ratios.items()},
         "likelihood_gains": {name: numbers(gain) for name, gain in comparison.likelihood_gains.items()},
+        "over_regression": numbers(comparison.over_regression),
         "no_scaled_default": "" if comparison.default is None else comparison.default.reason,
     }
 
@@ -130,6 +131,7 @@ def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Com
             given=found["given"],
             noise=found["noise"],
             lacks_ranges=problem.lacks_ranges,
+            over_regression=as_interval(more.get("over_regression")),
         )
     except (AttributeError, KeyError, TypeError, ValueError):
         return None

@@ -15,7 +15,18 @@ import numpy as np
 
 from filters.estimators.find import is_foreign, label_of
 from filters.monitoring.stored import monitor_data, monitor_for
-from filters.tuned_file import AUGMENTED, FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
+from filters.tuned_file import (
+    AUGMENTED,
+    FACTORS,
+    FILE_FORMAT,
+    FILE_VERSION,
+    NOISE,
+    PRIOR,
+    compared,
+    made_with,
+    read_tuned_file,
+    sealed,
+)
 from filters.tuned_model import check_same_quantities, model_data
 from thruster_env.numerics.checks import at_least, covariance, positive, short_repr
 from thruster_env.numerics.files import write_whole
@@ -141,18 +152,23 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
     """
     kept = content["problems"].get(name) if isinstance(name, str) and name not in built_in() else None
     digest = kept.get("digest") if isinstance(kept, Mapping) else None
-    for one in given if digest is not None else ():
-        if one.digest == digest:
-            return one
+    given = given if digest is not None else ()
+    same = next((one for one in given if one.digest == digest), None)
+    if same is not None:
+        return same
+    for one in given:
         if one.name == name:
             raise ValueError(
                 f"the problem of a tuned file must be the one it was tuned on, {name} of digest {digest}, but "
-                f"here it has the digest {one.digest} ({path})"
+                f"here it has the digest {one.digest}; {path} was made with {made_with(content)}: has "
+                "that changed?"
             )
     plain, unknown = name_and_unknown(name) if digest is not None else (name, {})
     mapping = kept.get("content") if isinstance(kept, Mapping) else kept
     if unknown and isinstance(mapping, Mapping) and "of" in mapping:
-        return augmented(problem_in({"problems": {plain: mapping.get("of")}}, plain, path, given), unknown)
+        return augmented(
+            problem_in({"problem": plain, "problems": {plain: mapping.get("of")}}, plain, path, given), unknown
+        )
     if isinstance(mapping, Mapping) and "logs" in mapping:
         raise ValueError(
             f"a problem of logs must be given, but {path} only names the logs of {name}: the commands evaluate, "
@@ -222,9 +238,10 @@ def read_choice(path: str | Path, problem: Problem) -> Choice:
         ValueError: if the file is damaged, or for another plant: another thruster, dt or sensor.
     """
     content, problem = read_tuned_file(path), suited_to(path, problem)
-    problem.check_tuned_for(content.get("plant"), path)
-    if "model" in content:
-        check_same_quantities(content["model"], problem.model(), problem.dt, path)
+    with compared(content, path):
+        problem.check_tuned_for(content.get("plant"), path)
+        if "model" in content:
+            check_same_quantities(content["model"], problem.model(), problem.dt, path)
     return _choice(content, problem)
 
 

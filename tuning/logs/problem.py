@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from filters.tuned_file import read_tuned_file
+from filters.tuned_file import made_with, read_tuned_file, tune_options
 from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import read_for
@@ -138,10 +138,15 @@ def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[
     return {"options": {**kept, **cuts}}
 
 
-def problems_in(file: Path, model: str | None = None) -> list[Problem]:
+def problems_in(file: Path, model: str | None = None, preset: str | Path | None = None) -> list[Problem]:
     """The problems of logs that a tuned file names, read again; empty if it names none.
 
     A model that is code is not imported because a file names it: the caller has to give it again.
+
+    Args:
+        file: the tuned file.
+        model: of the logs, if it is code.
+        preset: where the file's preset is now; of a scenario the preset with which the file was made.
 
     Raises:
         ValueError: if a log cannot be read, the options in the file are damaged, or a model that is code is not
@@ -150,7 +155,8 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
     if not file.is_file():
         return []
     found: list[Problem] = []
-    for name, entry in read_tuned_file(file)["problems"].items():
+    of_file = read_tuned_file(file)
+    for name, entry in of_file["problems"].items():
         content = entry.get("content") if isinstance(entry, dict) else None
         if isinstance(content, dict) and isinstance(content.get("of"), dict):  # that of an augmented problem
             name, content = name_and_unknown(name)[0], content["of"].get("content")
@@ -166,11 +172,17 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
                 f"logs in a tuned file must have paths and options, but {file} has {short_repr(content)}"
             ) from None
         _check_model(options.get("model"), model, file)
+        options |= {} if preset is None else {"preset": str(preset)}
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
             said = f"logs in a tuned file must be those of {short_repr(name)}"
             raise ValueError(f"{said}, but {file} has {problem.name}")
         found.append(named(problem, name))
+    if preset is not None and not found and str(preset) != tune_options(of_file).get("preset"):
+        raise ValueError(
+            f"preset (--preset) must be that of the tuned file, but got {preset}, and {file} was made with "
+            f"{made_with(of_file)}"
+        )
     return found
 
 
@@ -182,7 +194,22 @@ def model_named_in(problem: Problem) -> str | None:
     return content["options"].get("model")
 
 
-def _check_model(named, given: str | None, file: Path) -> None:
+def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, Any]:
+    """Options for reading a log, with the preset and sensors of a tuned file's own logs where none are given.
+
+    Raises:
+        ValueError: if no model is given, and the file only names one that is code.
+    """
+    if tuned is None or named.get("model") is not None:
+        return dict(named)
+    options = tune_options(read_tuned_file(tuned))
+    if named.get("preset") is None:
+        _check_model(options.get("model"), None, tuned)
+    stored = {name: options[name] for name in ("preset", "sensors") if name in options}
+    return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
+
+
+def _check_model(named, given: str | None, file: str | Path) -> None:
     """Raise ValueError unless the caller gives exactly the code that a file names."""
     if named is None and given is not None:
         raise ValueError(

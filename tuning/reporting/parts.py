@@ -10,9 +10,8 @@ from numpy import isfinite
 from optuna import Study
 from optuna.trial import FrozenTrial
 
-from filters.consistency.intervals import Interval
-from filters.consistency.verdicts import confidence, rounded
-from tuning.evaluation.evaluate import Evaluation, restart_sentences
+from filters.consistency.verdicts import rounded
+from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
@@ -21,6 +20,7 @@ from tuning.reporting.alternatives import of_comparison, of_front, of_history, o
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.figures import draw_comparison, draw_history
 from tuning.reporting.page import Part, Picture, Section, Table, Words
+from tuning.reporting.residual_words import consistency_of, model_doubts
 from tuning.reporting.search_figures import (
     FEWEST_TRIALS,
     counted_trials,
@@ -52,21 +52,15 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
     parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
-    squares = [_squares(comparison.tuned) for comparison in comparisons]
-    if not any(isnan(mean.value) for _, mean, _ in squares):
+    squares = [consistency_of(comparison) for comparison in comparisons]
+    if not any(isnan(mean.value) for _, mean, *_ in squares):
         found = [
-            f"{confidence(mean, right)}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
-            for (name, mean, right), place in zip(squares, places, strict=True)
+            f"{word}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
+            for (name, mean, right, word), place in zip(squares, places, strict=True)
         ]
         parts.append(f"the covariance is {' and '.join(found)}")
-    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + "."])
-
-
-def _squares(evaluation: Evaluation) -> tuple[str, Interval, float]:
-    """The metric of a covariance's consistency: its name, mean and expected value."""
-    if evaluation.has_truth:
-        return "NEES", evaluation.nees, len(evaluation.rmse)
-    return "NIS", evaluation.nis, evaluation.expected_nis
+    doubts = [model_doubts(*pair) for pair in zip(plan.scenarios, comparisons, strict=True)]
+    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *sum(doubts, [])])
 
 
 def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[Comparison]) -> Section:

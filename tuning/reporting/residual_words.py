@@ -1,14 +1,22 @@
-"""What residuals of the true states say of a model: noise that is white about zero has no mean and no memory."""
+"""What residuals of the true states, or without these the innovations, say of a model."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from filters.consistency.intervals import Interval, span
+from filters.consistency.verdicts import confidence, mean_sentence
 from thruster_env.plants.quantities import Quantity
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation
+from tuning.problems.augmented import within
+from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Problem
 
 SMALL = 0.1  # of a mean over its deviation, or of a correlation: what is below says little of a model
+LARGE_NIS = 3.0  # mean NIS of the given Q and R over its expected value, above which the model is in doubt
+MADE_UP = "made consistent by Q and R, not by the model"
 
 
 def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
@@ -45,3 +53,59 @@ def _told(
     relative = np.divide(mean, deviations, out=np.zeros_like(mean), where=deviations > 0)
     rows = zip(quantities, relative.tolist(), correlation.tolist(), strict=True)
     return [f"{one.symbol} ({a:+.2g}; {b:+.2g})" for one, a, b in rows if max(abs(a), abs(b)) > SMALL]
+
+
+def model_doubts(problem: Problem, comparison: Comparison) -> list[str]:
+    """A question about the model of logs without truth, in a list; empty if nothing speaks against it.
+
+    Its given Q and R have a mean NIS above three times the expected one, or the tuned filter predicts held-out
+    measurements far worse than a linear regression, `tuning.evaluation.regression`.
+    """
+    given, over, reasons = comparison.given, comparison.over_regression, []
+    if comparison.tuned.has_truth:
+        return []
+    if given is not None and given.nis.value > LARGE_NIS * given.expected_nis:
+        reasons.append(
+            f"with its own Q and R the mean NIS is {given.nis.value:.3g} where {given.expected_nis:.3g} is right"
+        )
+    if is_far_below(over):
+        gained = span(Interval(-over.value, -over.high, -over.low), 2)
+        reasons.append(
+            f"a linear regression on past rows predicts with a log-likelihood {gained} higher a measurement"
+        )
+    said = "; ".join(reasons)
+    return [f"Is {_model_of(problem)}? {said[:1].upper()}{said[1:]}."] if said else []
+
+
+def _model_of(problem: Problem) -> str:
+    """The model of logs as the user named it, with the options that name another one."""
+    options = (within(problem).as_mapping() or {}).get("options")
+    if options is None:
+        return "this model the right one"
+    if "model" in options:
+        return f"{options['model']} the right model (--model)"
+    preset = options.get("preset")
+    named = f"{preset}" if preset else f"{logs_package().DEFAULT_PRESET}, the default,"
+    return f"{named} the right preset (--preset, or --model)"
+
+
+def consistency_of(comparison: Comparison) -> tuple[str, Interval, float, str]:
+    """NEES, without truth NIS, of the tuned filter: its name, mean and expected value, and a verdict."""
+    tuned = comparison.tuned
+    if tuned.has_truth:
+        name, mean, right = "NEES", tuned.nees, float(len(tuned.rmse))
+    else:
+        name, mean, right = "NIS", tuned.nis, tuned.expected_nis
+    made_up = mean.covers(right) and is_far_below(comparison.over_regression)
+    return name, mean, right, MADE_UP if made_up else confidence(mean, right)
+
+
+def consistency_sentence(comparison: Comparison) -> str:
+    """The same in a sentence; a filter that predicts far worse than a regression is never called consistent."""
+    name, mean, right, word = consistency_of(comparison)
+    said = mean_sentence(name, mean, right)
+    if word == MADE_UP:
+        return f"{MADE_UP[:1].upper()}{MADE_UP[1:]}:{said.partition(':')[2]}"
+    if not comparison.tuned.has_truth or said.startswith("Consistent"):
+        return said
+    return f"{said} RMSE and NIS do not fully test the covariance."
