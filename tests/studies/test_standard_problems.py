@@ -163,6 +163,12 @@ class TestReproduce:
         done = thruster("reproduce", *arguments)
         assert done.returncode == 2 and rule in done.stderr and not done.stdout
 
+    def test_a_package_that_is_not_installed_is_asked_for_before_anything_is_compiled(self, monkeypatch):
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+        monkeypatch.setattr(range_bearing, "problem", None)  # whose data would be drawn first
+        with pytest.raises(ValueError, match="Stone Soup must be installed"):
+            range_bearing.BENCHMARK.reproduce(2)
+
     def test_range_and_bearing_give_what_stone_soup_gives(self, monkeypatch):
         pytest.importorskip("stonesoup")
         short = benchmark.ModelProblem(

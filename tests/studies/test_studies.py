@@ -8,6 +8,7 @@ from scipy.linalg import solve_discrete_are
 from filters import KalmanFilter, run
 from tests.oracles import kalman_update
 from thruster_cli.main import main
+from thruster_env.linear.published import PUBLISHED
 from thruster_env.numerics.text_tables import console
 from thruster_env.plants.simulate import simulate
 from thruster_env.studies import STUDIES
@@ -136,6 +137,16 @@ def test_rows_with_equal_errors_in_both_states(comparisons, name, rows):
     said = study_statements(STUDIES[name], findings(STUDIES[name], comparisons))
     assert sum(rows in statement for statement in said) == 1
     assert set(STUDIES[name].remarks) <= set(said)
+
+
+def test_misprints_of_the_linear_models_are_in_the_remarks_of_the_papers():
+    model = PUBLISHED["open_bladed"]
+    (eigenvalue,) = [f"{one:.4f}" for one in np.linalg.eigvals(np.array(model.a)).real if one > 0]
+    for name in ("kiki2020", "nurhadi2022"):
+        assert f"{eigenvalue} of the open-bladed system is printed 31872" in " ".join(STUDIES[name].remarks)
+    trace = -np.trace(np.array(model.a))
+    assert f"528.83 where the trace gives {trace:.2f}" in " ".join(STUDIES["kiki2020"].remarks)
+    assert f"0.065 for {model.b[0][0]}" in " ".join(STUDIES["nurhadi2022"].remarks)
 
 
 def test_by_the_article_s_own_numbers_the_ensemble_filter_is_the_worse_one_in_the_motor_speed():

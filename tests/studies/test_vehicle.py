@@ -181,6 +181,7 @@ def test_why_differences_are_told_by_size(as_python):
     assert "psi below the limit" in tiny
     huge = why_different(PrintedRow({"x": 1e3, "psi": pose["psi"]}, 1.0), scores, result)
     assert "x unlike any of ours" in huge and "psi similar to" in huge
+    assert "no one transformation gives the row" in huge and "transformation gives" not in full + tiny
 
 
 def test_digits_stand_apart_by_thousands():

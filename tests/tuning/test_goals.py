@@ -213,7 +213,6 @@ def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
     ("plan", "rule"),
     [
         (Plan("ekf", (of_two_sensors(),), full_r=True, hold_r=True), "R must be free to be full, but got hold_r"),
-        (Plan("ekf", (NOMINAL,), full_r=True), "a full R needs two measurements or more, but nominal has 1"),
         (
             Plan("low-pass", (NOMINAL,), full_r=True),
             "a full R needs a filter with a cov.* 'low-pass'",
@@ -224,3 +223,8 @@ def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
 def test_a_full_r_that_cannot_be_is_refused(plan, rule):
     with pytest.raises(ValueError, match=rule):
         plan.checked()
+
+
+def test_of_one_channel_a_full_r_is_its_variance():
+    full = Plan("ekf", (NOMINAL,), full_q=True, full_r=True).checked()
+    assert list(full.parameters()) == list(full._replace(full_r=False).checked().parameters())

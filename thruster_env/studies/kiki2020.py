@@ -39,6 +39,8 @@ TABLE = PublishedTable(
         "that of Nurhadi et al. (2022) does: they are no run.",
         "Observability is tested with the measurement matrix [0 1], but the observability matrix printed is that "
         "of [1 0]. The runs have neither: H = [-2.03 -12.2].",
+        "The eigenvalue 3.1872 of the open-bladed system is printed 31872, and its characteristic polynomial has "
+        "528.83 where the trace gives 523.83.",
         "The derivative of dU_a/dt by U_0 is printed as -2 (K4/K3) U_0; the equation gives 2 (K4/K3) |U_a - U_0|.",
     ),
 )

@@ -38,6 +38,9 @@ TABLE = PublishedTable(
         "The abstract's EnKF values 0.7920 and 0.1352 stand in the table of Kiki (2020), not in this "
         "paper's. Its KF values 1.9957 and 2.0609 come from there too, from two different rows (q = 0.8 and "
         "q = 0.6): they are no run. And 1.9957 is most likely a slip for 2.6821, which the text there has.",
+        "The eigenvalue 3.1872 of the open-bladed system is printed 31872, and its characteristic polynomial has "
+        "528.83 where the trace gives 523.83.",
+        "B of the open-bladed system is printed with 0.065 for 0.65: the printed B_d follows from 0.65 only.",
         "The conclusion contradicts the paper's own Table 2. By the printed numbers the EnKF's error of omega_m "
         "in the open-bladed case is 2.4 to 2.7 times the KF's.",
     ),

@@ -25,7 +25,7 @@ from filters.consistency.intervals import rmse_intervals
 from filters.engine.batch import run
 from thruster_env.plants.quantities import Quantity
 from thruster_env.studies.benchmark import Benchmark, OnRow, Row
-from thruster_env.studies.stone_soup import stone_soup_means
+from thruster_env.studies.stone_soup import check_installed, stone_soup_means
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.search.outcome import best_trial
@@ -87,6 +87,7 @@ def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
 
 def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
     """Both filters before and after tuning, beside Stone Soup's with the same numbers."""
+    check_installed()  # before anything is compiled
     data, found = problem.data(seeds), []
     for word, sigma in (("untuned", SIGMA.start), ("tuned", tuned_sigma())):
         for name, numbers in (("ekf", {}), ("ukf", POINTS)):

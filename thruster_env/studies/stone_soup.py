@@ -11,6 +11,12 @@ import numpy as np
 START = datetime.datetime(2024, 1, 1)
 
 
+def check_installed() -> None:
+    """Raise ValueError if Stone Soup is not installed."""
+    if importlib.util.find_spec("stonesoup") is None:
+        raise ValueError("Stone Soup must be installed to compare with: pip install stonesoup")
+
+
 def stone_soup_means(
     name: str,
     measurements: np.ndarray,
@@ -36,8 +42,7 @@ def stone_soup_means(
     Raises:
         ValueError: if Stone Soup is not installed.
     """
-    if importlib.util.find_spec("stonesoup") is None:
-        raise ValueError("Stone Soup must be installed to compare with: pip install stonesoup")
+    check_installed()
     from stonesoup.models.measurement.nonlinear import CartesianToBearingRange
     from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
     from stonesoup.predictor.kalman import ExtendedKalmanPredictor, UnscentedKalmanPredictor

@@ -50,7 +50,7 @@ class Plan(NamedTuple):
     prune: bool = True  # whether a trial is pruned that is worse than the best one on the same seeds
     budget: float | None = None  # us/step that the filter may take, as `cost.microseconds_a_step` measures them
     full_q: bool = False  # whether Q has correlations; of own parameters whether noise estimation's Q competes
-    full_r: bool = False  # whether R has correlations; the same
+    full_r: bool = False  # whether R has correlations, of one channel none; the same
     worst: bool = False  # of several problems the worst one counts, and not their mean
     where: tuple[str, ...] = ()  # relations among the numbers of the model, such as "Q22 = 4 Q11"
 
@@ -146,9 +146,6 @@ class Plan(NamedTuple):
             raise ValueError("R must be free to be full, but got hold_r (--hold-r) with full_r (--full-r)")
         if not self._has_covariance:
             raise ValueError(f"a full R needs a filter with a covariance, but got {self.filter!r}")
-        count = len(self.scenarios[0].quantities.measurements)
-        if count < 2:
-            raise ValueError(f"a full R needs two measurements or more, but {self.scenarios[0].name} has {count}")
 
     def _check_problems(self) -> None:
         """Raise ValueError unless all scenarios are problems, and the same parameters have a meaning for each."""

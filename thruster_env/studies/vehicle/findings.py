@@ -59,8 +59,8 @@ def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> st
             said = [words]
             break
     if not said:
-        likest = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
-        said = likest or ["unlike any of ours"]
+        said = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
+        said += ["no one transformation gives the row"] * (len(said) > 1)
     below = [name for name, value in printed.rmse.items() if value < result.bound.pose[POSE.index(name)] / FACTOR]
     if below:
         said.append(f"{', '.join(below)} below the limit set by measured u, v, w, r on a true path")
