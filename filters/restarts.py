@@ -257,7 +257,7 @@ def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Found:
 def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Found | None]:
     slopes = transition_slopes(model.functions, model.shape)
     for _ in range(model.substeps):
-        moved = _called(model.transition, model.n, as_value(x), as_value(u), model.constants)
+        moved = _called(model.functions.transition, model.n, as_value(x), as_value(u), model.constants)
         if not np.isfinite(moved).all():
             return x, p, (~np.isfinite(moved), f"f(x, u) is {_kind(moved)}")
         f = _called(slopes, (model.n, model.n), as_value(x), as_value(model.scales), as_value(u), model.constants)
@@ -270,7 +270,7 @@ def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray,
 
 def _updated(model: StateSpaceModel, x, p, z) -> Found:
     everything = np.ones(model.n, dtype=bool)
-    expected = _called(model.observe, model.m, as_value(x), model.constants)
+    expected = _called(model.functions.observe, model.m, as_value(x), model.constants)
     seen = ~np.isnan(z)
     if not np.isfinite(expected[seen]).all():
         return everything, f"h(x) is {_kind(expected[seen])}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
 from thruster_env.numerics.angles import difference, wrapped_where
+from thruster_env.numerics.sources import as_value
 from thruster_env.plants.state_space import StateSpaceModel
 
 
@@ -147,14 +148,16 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+    move, measure, c = model.functions.transition, model.functions.observe, model.given_constants
+
     def advance(x, dt, u):
-        x = tuple(x)
+        x = as_value(x)
         for _ in range(model.substeps):
-            x = model.transition(x, tuple(u), model.constants)
+            x = move(x, as_value(u), c)
         return np.array(x)
 
     def look(x):
-        return np.array(model.observe(tuple(x), model.constants))
+        return np.array(measure(as_value(x), c))
 
     def functions(kind: str, angles: tuple[bool, ...]) -> dict:
         if not any(angles):

@@ -19,6 +19,7 @@ from filters.tensors.graphs import order_of, values_of
 from filters.tensors.stages import Equation
 from thruster_env.numerics.algebra.graphs import Graph, Number
 from thruster_env.numerics.sources import is_array
+from thruster_env.numerics.user_functions import needs_floats
 from thruster_env.plants.shape import Shape, constants_are_array
 
 POINTS = 64  # at which functions of tensors are compared with those of floats
@@ -227,4 +228,6 @@ def equation_of(
     try:
         return OfGraph(*of_model, others, shape)
     except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+        if reason := needs_floats(*of_model):
+            raise ValueError(f"{name} must accept tensors, but {reason}") from None
         return Called(name, *of_model, shape, of_floats=True)

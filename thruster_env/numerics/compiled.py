@@ -26,11 +26,11 @@ import numpy as np
 from thruster_env.numerics.code_cache import keep_code
 from thruster_env.numerics.code_text import code_text
 from thruster_env.numerics.optimising import Which, optimise_once
+from thruster_env.numerics.user_functions import OURS, needs_python, stand_in
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 
-OURS = "thruster_env", "auv_env", "filters", "tuning"  # packages whose quotients may be products with reciprocals
 JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divide divmod".split())
 
 MOST_WAITING = 10_000  # functions, above which those that nobody has any more are forgotten
@@ -44,6 +44,9 @@ _called: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions th
 _apart: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions of which there is one copy
 _narrow: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
+_only_python: weakref.WeakKeyDictionary[Callable, str] = (
+    weakref.WeakKeyDictionary()
+)  # why functions are not compiled
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
 _untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
@@ -104,6 +107,28 @@ def overloaded(function: Callable, teach: Callable[[Callable], None] | None = No
     if teach is not None:
         _untaught[function] = teach
     return function
+
+
+def compiled_in_place_of(function: Callable, other: Callable) -> Callable:
+    """Mark a function in whose place compiled functions have another one; those that need Python run as it."""
+    _marked.add(function)
+    if other in _called:
+        _called.add(function)
+    reason = needs_python(other)
+    if not isinstance(other, types.FunctionType) and not hasattr(other, "py_func"):
+        reason = f"numba compiles plain functions, and no {type(other).__name__}"
+    if reason:
+        _only_python[function] = reason
+    _untaught[function] = lambda function: _teach_other(function, other)
+    return stand_in(function, other)
+
+
+def _teach_other(function: Callable, other: Callable) -> None:
+    from numba.extending import overload
+
+    plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
+    options = {"forceinline": function not in _called, "no_cfunc_wrapper": True, "fastmath": fastmath_of(other)}
+    overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 
 
 def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
@@ -310,6 +335,11 @@ class CompiledOrPython:
 
     def _call_first(self, *arguments):
         if not self._proven:
+            reasons = [_only_python[one] for one in _with_callees([self._python]) if one in _only_python]
+            if reasons:
+                warnings.warn(f"the model runs as Python, slowly, because {reasons[0]}", stacklevel=3)
+                self._run, self._proven = self._python, True
+                return self(*arguments)
             try:
                 return self._run(*arguments)
             except Exception as error:  # numba's, of many classes: compiled code itself raises nothing

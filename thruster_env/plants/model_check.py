@@ -12,6 +12,7 @@ import numpy as np
 from thruster_env.numerics.checks import as_floats, short_repr
 from thruster_env.numerics.derivatives import by_complex_step
 from thruster_env.numerics.modules import said
+from thruster_env.numerics.python_floats import with_floats
 from thruster_env.numerics.sources import as_value, is_array
 
 
@@ -68,7 +69,7 @@ def _arguments(names: str, model, x: np.ndarray) -> list:
         "u": as_value([0.0] * model.inputs),
         "c": model.given_constants,
     }
-    return [given[name] for name in names.split(", ")]
+    return with_floats(float, [given[name] for name in names.split(", ")])
 
 
 def _check_arguments(name: str, function: Callable, arguments: str) -> None:

@@ -11,10 +11,10 @@ from typing import Any, Self
 import numpy as np
 
 from thruster_env.numerics.checks import at_least, covariance, covariance_root, one_of, vector
-from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.derivatives import by_complex_step, complex_step
 from thruster_env.numerics.equal_functions import first_equal
 from thruster_env.numerics.pickling import as_function, as_made
+from thruster_env.numerics.python_floats import with_python_floats
 from thruster_env.numerics.results import array_valued
 from thruster_env.numerics.sources import is_array
 from thruster_env.plants.model_check import check_functions, checked_constants
@@ -183,10 +183,18 @@ class StateSpaceModel:
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
         n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
-        f = array_valued(inlined(first_equal(self.transition)), "x, u, c", n)
-        h = array_valued(inlined(first_equal(self.observe)), "x, c", m)
-        by_state = slopes[0] and array_valued(slopes[0], "x, u, c", n, n)
-        return Functions(f, by_state, h, slopes[1] and array_valued(slopes[1], "x, c", m, n))
+
+        def ready(function: Callable | None, arguments: str, *shape: int) -> Any:
+            if function is None or by_complex_step(function):
+                return function
+            return array_valued(with_python_floats(function), arguments, *shape)
+
+        return Functions(
+            ready(first_equal(self.transition), "x, u, c", n),
+            ready(slopes[0], "x, u, c", n, n),
+            ready(first_equal(self.observe), "x, c", m),
+            ready(slopes[1], "x, c", m, n),
+        )
 
     @property
     def given_constants(self) -> tuple | np.ndarray:

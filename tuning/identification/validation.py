@@ -13,6 +13,7 @@ import numpy as np
 from filters.engine.batch import Estimates
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.numerics.angles import difference, on_one_branch
+from thruster_env.numerics.sources import as_value
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.identification.result import Identification
@@ -104,6 +105,6 @@ def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hi
     """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
     if not hidden.any():
         return np.zeros_like(runs.measurements)
-    c = model.given_constants
-    predicted = [[model.observe(tuple(x), c) for x in means] for means in estimates.means.tolist()]
+    observe, c = model.functions.observe, model.given_constants
+    predicted = [[observe(as_value(x), c) for x in means] for means in estimates.means.tolist()]
     return difference(runs.measurements, np.array(predicted), model.shape.measurement_angles)

@@ -12,6 +12,7 @@ from filters.plot_styles import MEASURED, colour_of
 from thruster_env.numerics.angles import wrapped, wrapped_where
 from thruster_env.numerics.characters import TITLE, verbatim
 from thruster_env.numerics.plots import GREY, new_figure, thinned, tidy
+from thruster_env.numerics.sources import as_value
 from thruster_env.plants.quantities import Quantity
 from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
@@ -126,12 +127,17 @@ def _slopes(model: StateSpaceModel, mean: np.ndarray) -> np.ndarray:
     """Slopes of the measurements by the states at an estimate, (m, n)."""
     if not np.isfinite(mean).all():
         return np.full((model.m, model.n), np.nan)
-    x, c = tuple(mean.tolist()), model.given_constants
-    if model.observe_jacobian is not None:
-        return np.array(model.observe_jacobian(x, c), dtype=float).reshape(model.m, model.n)
+    functions, c = model.functions, model.given_constants
+    if functions.observe_jacobian is not None:
+        return np.array(functions.observe_jacobian(as_value(mean.tolist()), c), dtype=float).reshape(
+            model.m, model.n
+        )
     columns = []
     for i, step in enumerate(STEP * model.scales):
-        sides = [np.array(model.observe(tuple(mean + s * step * np.eye(model.n)[i]), c)) for s in (1, -1)]
+        sides = [
+            np.array(functions.observe(as_value((mean + s * step * np.eye(model.n)[i]).tolist()), c))
+            for s in (1, -1)
+        ]
         columns.append((sides[0] - sides[1]) / (2 * step))
     return np.stack(columns, axis=-1).reshape(model.m, model.n)
 

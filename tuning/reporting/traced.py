@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from thruster_env.numerics.user_functions import needs_floats
 from tuning.reporting import symbols
 from tuning.reporting.symbols import Branch, Symbol, Tape, on_symbols, text
 
@@ -30,6 +31,9 @@ def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: An
     Raises:
         ValueError: in one line, with that of the function, where it cannot be traced.
     """
+    rule = "a function to be written out must be made of operators and elementary functions, but"
+    if reason := needs_floats(function):
+        raise ValueError(f"{rule} {reason}")
     tape = Tape()
     try:
         run = _rebound(function, {})
@@ -37,10 +41,7 @@ def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: An
         results = [text(one) for one in found]
     except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError) as error:
         what = str(error) if isinstance(error, Branch) else f"cannot be run on symbols ({_first_line(error)})"
-        raise ValueError(
-            "a function to be written out must be made of operators and elementary functions, but "
-            f"{_place(error, function)} {what}"
-        ) from None
+        raise ValueError(f"{rule} {_place(error, function)} {what}") from None
     return [*(f"{name} = {told};" for name, told in tape.lines(results)), f"[{'; '.join(results)}]"]
 
 

@@ -13,17 +13,16 @@ is, but for a few decisions, of which all sides can be traced (`branches`).
 
 from __future__ import annotations
 
-import builtins
 import math
 import operator
 import types
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 
 from thruster_env.numerics.algebra.folding import worked_out
 from thruster_env.numerics.algebra.graphs import UNARY, Number, arctan2, where
+from thruster_env.numerics.user_functions import Copies, needs_floats
 
 OTHER_NAMES = {
     "atan": "arctan",
@@ -235,19 +234,15 @@ def _has_numbers(value) -> bool:
     return isinstance(value, Number) or isinstance(value, (list, tuple)) and any(map(_has_numbers, value))
 
 
-class _Module:
-    """A module whose functions take Numbers, where there is one of ours."""
-
-    def __init__(self, module: types.ModuleType):
-        self._module = module
-
-    def __getattr__(self, name: str):
-        return _in_place_of(self._module, name)
-
-
 def traced(function: Callable) -> Callable:
-    """A copy of a function that takes Numbers; it raises TypeError where they do not do for floats."""
-    copy = _traced(function, {})
+    """A copy of a function that takes Numbers; it raises TypeError where they do not do for floats.
+
+    Raises:
+        TypeError: for a function that needs floats: it catches exceptions, or asks whether a comparison `is` True.
+    """
+    if reason := needs_floats(function):
+        raise TypeError(reason)
+    copy = Copies(_in_place_of, BUILTINS).called(function)
 
     def as_written(*arguments):
         known = next(_numbers_in(arguments), None)
@@ -266,36 +261,3 @@ def _numbers_in(value) -> Iterator[Number]:
     elif isinstance(value, (tuple, list)) or isinstance(value, np.ndarray) and value.dtype == object:
         for one in value:
             yield from _numbers_in(one)
-
-
-def _traced(value: Any, copies: dict[int, Any]) -> Any:
-    """A value that a function finds under a name, as its copy shall find it."""
-    if isinstance(value, types.ModuleType) and value in (math, np):
-        return _Module(value)
-    name = getattr(value, "__name__", "")
-    for module in (math, np):
-        if callable(value) and value is getattr(module, name, None):
-            return _in_place_of(module, name)
-    function = getattr(value, "py_func", value)  # of a function compiled by numba
-    if not isinstance(function, types.FunctionType):
-        return value
-    if id(function) not in copies:
-        cells = tuple(types.CellType() for _ in function.__closure__ or ())
-        names = vars(builtins) | BUILTINS | {"__builtins__": builtins}  # which what NumPy imports late asks for
-        copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
-        copy.__kwdefaults__ = function.__kwdefaults__
-        copies[id(function)] = copy
-        names |= {name: _traced(function.__globals__[name], copies) for name in _names(function)}
-        for cell, old in zip(cells, function.__closure__ or (), strict=True):
-            cell.cell_contents = _traced(old.cell_contents, copies)
-    return copies[id(function)]
-
-
-def _names(function: types.FunctionType) -> list[str]:
-    """The global names of a function, and of those defined within it."""
-    waiting, found = [function.__code__], []
-    while waiting:
-        code = waiting.pop()
-        found += [name for name in code.co_names if name in function.__globals__]
-        waiting += [one for one in code.co_consts if isinstance(one, types.CodeType)]
-    return found
