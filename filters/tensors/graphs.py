@@ -27,6 +27,7 @@ WORK: dict[str, Callable] = {
     **COMPARISONS,
     "and": operator.and_,
     "or": operator.or_,
+    "cbrt": lambda x: torch.sign(x) * abs(x) ** (1.0 / 3.0),
 }
 """Operations of tensors and floats; other ones are torch's functions of tensors, by their names."""
 NAMES = {"rint": "round"}
@@ -37,10 +38,23 @@ HAS_SLOPE: dict[str, Callable] = {
     "/": lambda a, b: b != 0.0,
     "pow": lambda x, e: torch.isfinite(x**e) & ((x != 0.0) | (e >= 1.0)),
     **dict.fromkeys(("arctan2", "hypot"), lambda a, b: (a != 0.0) | (b != 0.0)),
-    "exp": lambda x: torch.isfinite(torch.exp(x)),
+    "cbrt": lambda x: x != 0.0,
+    "log1p": lambda x: x > -1.0,
+    **dict.fromkeys(("log2", "log10"), lambda x: x > 0.0),
+    "arccosh": lambda x: x > 1.0,
+    "arctanh": lambda x: abs(x) < 1.0,
+    **dict.fromkeys(("exp", "expm1", "exp2"), lambda x: torch.isfinite(torch.exp(x))),
     **dict.fromkeys(("sinh", "cosh"), lambda x: torch.isfinite(torch.cosh(x))),
 }
 """Where an operation has a finite slope, of those that do not have one everywhere."""
+
+
+OF_ZERO = frozenset(HAS_SLOPE) - {"arccosh", "arctanh"}  # of these, operations that have one of a positive number
+
+
+def _divisor(one: Number) -> Number:
+    """The number that decides whether an operation has a finite slope."""
+    return one.of[-1 if one.operation == "/" else 0]
 
 
 def _with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor]) -> Tensor:
@@ -77,7 +91,7 @@ def values_of(
             values[one.place] = given[one.arguments[0]]
         elif one.value is not None:
             values[one.place] = one.value if like.dtype == torch.float64 else as_single(one.value)
-        elif one.operation in HAS_SLOPE and one.of[-1 if one.operation == "/" else 0].sign != POSITIVE:
+        elif one.operation in HAS_SLOPE and not (one.operation in OF_ZERO and _divisor(one).sign == POSITIVE):
             function = WORK.get(one.operation) or getattr(torch, one.operation)
             values[one.place] = _with_finite_slope(one.operation, function, [*map(tensor, arguments)])
         elif one.operation in WORK:

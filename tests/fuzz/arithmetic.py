@@ -52,7 +52,14 @@ OF_TWO = (
     *("divmod({}, {})[0]", "np.logical_or({}, {}) + 1.0"),
 )
 COMPARED = ("({}) > ({})", "({}) <= ({})", "({}) == ({})", "({}) != ({})", "({}) < ({})")
-SMOOTH = ("math.sin({})", "math.exp({})", "math.sqrt({})", "math.hypot({}, y)", "math.tanh({})", "np.hypot({}, x)")
+SMOOTH = (
+    *("math.sin({})", "math.exp({})", "math.sqrt({})", "math.hypot({}, y)", "math.tanh({})", "np.hypot({}, x)"),
+    *("np.cbrt(float({}))", "math.log2({})", "np.log1p(float({}))", "math.expm1({})", "np.exp2(float({}))"),
+    *("math.erf({})", "math.erfc({})", "np.logaddexp(float({}), y)", "math.asinh({})", "math.log10({})"),
+    *("np.interp(float({}), [-3.0, 0.0, 0.5, 49.0], [1.0, -2.0, 0.3, 4.0])", "np.polyval([0.5, -1.0, 3.0], {})"),
+    *("np.std([float({}), x, y])", "np.var([float({}), y, 2.0])", "np.linalg.norm([float({}), y])"),
+    "np.select([({}) > 0.3, x > y], [x, y], 0.5)",
+)
 NUMBERS = (
     0.0,
     1.0,
@@ -122,7 +129,7 @@ class Expression:
 
     def _condition(self, depth: int) -> str:
         first, other = (self._comparison(max(0, depth - 2)) for _ in range(2))
-        joined = self._rng.choice(("", "", "&", "|"))
+        joined = self._rng.choice(("", "", "&", "|", "^"))
         return f"({first}) {joined} ({other})" if joined else first
 
     def _comparison(self, depth: int) -> str:

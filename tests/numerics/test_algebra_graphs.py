@@ -89,7 +89,7 @@ UNTRACEABLE = {
     "array of integers": lambda x, y: np.array([x, y], dtype=int).sum(),
     "equality": lambda x, y: 1.0 if (x, y) == (1.0, 2.0) else 2.0,
     "library": lambda x, y: math.gamma(x),
-    "linear algebra": lambda x, y: np.linalg.solve([[x, y], [y, x]], [1.0, 2.0])[0],
+    "linear algebra": lambda x, y: np.linalg.eigvals([[x, y], [y, x]])[0],
 }
 
 

@@ -20,6 +20,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -127,7 +128,11 @@ def _teach_other(function: Callable, other: Callable) -> None:
     from numba.extending import overload
 
     plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
-    options = {"forceinline": function not in _called, "no_cfunc_wrapper": True, "fastmath": fastmath_of(other)}
+    options: Any = {
+        "forceinline": function not in _called,
+        "no_cfunc_wrapper": True,
+        "fastmath": fastmath_of(other),
+    }
     overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 
 

@@ -8,6 +8,7 @@ returns complex numbers, a copy of it is called with floats whose arithmetic is 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import sys
@@ -19,7 +20,15 @@ import numpy as np
 from thruster_env.numerics.algebra.tracing import OTHER_NAMES
 from thruster_env.numerics.compiled import compiled_in_place_of, inlined
 from thruster_env.numerics.pickling import makes_functions
-from thruster_env.numerics.user_functions import Copies, caught, functions_in, inverts, needs_python, takes_roots
+from thruster_env.numerics.user_functions import (
+    Copies,
+    Module,
+    caught,
+    functions_in,
+    inverts,
+    needs_python,
+    takes_roots,
+)
 
 WITHOUT_VALUE = ArithmeticError, ValueError, TypeError  # of 1/0, of sqrt(-1), of complex numbers that are compared
 
@@ -98,6 +107,8 @@ def _is_caught() -> bool:
 def _in_place_of(module, name: str) -> Any:
     """What a copy finds under a name in `math` or NumPy: functions of the latter in place of what raises."""
     function = getattr(module, name)
+    if function is np.linalg:
+        return Module(np.linalg, _in_place_of)
     if not callable(function) or isinstance(function, type):
         return function
 
@@ -105,8 +116,10 @@ def _in_place_of(module, name: str) -> Any:
         try:
             return _plain(function(*arguments, **named))
         except (ValueError, ArithmeticError) as error:
-            if module is not math or _is_caught():
+            if module is np or _is_caught():
                 raise
+            if isinstance(error, np.linalg.LinAlgError):  # of a singular matrix
+                return np.full(np.shape(arguments[-1]), math.nan)
             of_numpy = getattr(np, OTHER_NAMES.get(name, name), None)
             if of_numpy is None and "domain" not in str(error):
                 raise
@@ -191,22 +204,19 @@ def with_python_floats(function: Callable) -> Callable:
     kind = np.float64 if any(map(inverts, codes)) else Float if any(map(takes_roots, codes)) else float
 
     def called(*arguments):
+        failure: Exception = TypeError("a function of a model must return real numbers")
         try:
             found = function(*with_floats(kind, arguments))
             if _is_real(found):
                 return found
         except WITHOUT_VALUE as error:
-            failure: Exception | None = error
+            failure = error
             if not any(isinstance(one, float) for one in arguments[0][:1]):  # Numbers or tensors
                 raise
-        else:
-            failure = None
         with np.errstate(all="ignore"):
             for other in (_by_ieee, _by_numpy):
-                try:
+                with contextlib.suppress(*WITHOUT_VALUE):
                     return other(function, arguments)
-                except WITHOUT_VALUE as error:
-                    failure = failure or error
         raise failure
 
     called.__name__, called.__module__ = (getattr(function, name, "") for name in ("__name__", "__module__"))

@@ -25,6 +25,7 @@ LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "numba", "torch"} - {"_
 NO_FUNCTIONS = bool | int | float | complex | str | bytes | np.ndarray | np.generic | None
 OURS = "thruster_env", "auv_env", "filters", "tuning"  # packages whose quotients may be products with reciprocals
 WRITTEN_OUT = "thruster_env.numerics.written"  # the module of functions that are made of text
+MODULES = math, np, np.linalg  # of whose functions copies find others
 CALL = ("__call__",)  # what is read of a value that is called
 CATCHING = {"CHECK_EXC_MATCH", "CHECK_EG_MATCH"}  # instructions of `except Kind:`
 
@@ -167,17 +168,17 @@ class Copies:
     """Copies of functions and of all plain functions that they call, which find others under some names."""
 
     def __init__(self, in_place_of: Callable[[types.ModuleType, str], Any], names: Mapping[str, Any]):
-        """Take what copies find in `math` or NumPy, by module and name, and in place of Python's functions."""
+        """Take what copies find in MODULES, by module and name, and in place of Python's functions."""
         self._in_place_of, self._names = in_place_of, names
         self._copies: dict[int, types.FunctionType] = {}
 
     def of(self, value: Any) -> Any:
         """The copy of a function; of another value what a copy shall find in its place."""
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
-        if isinstance(value, types.ModuleType) and value in (math, np):
+        if isinstance(value, types.ModuleType) and value in MODULES:
             return Module(value, self._in_place_of)
         name = getattr(value, "__name__", "")
-        for module in (math, np):
+        for module in MODULES:
             if callable(value) and value is getattr(module, name, None):
                 return self._in_place_of(module, name)
         if isinstance(value, types.MethodType) and isinstance(value.__func__, types.FunctionType):

@@ -20,7 +20,7 @@ from thruster_env.numerics.algebra.precision import as_single
 from thruster_env.numerics.algebra.programs import CALLED_IN_ROUNDS, Place, Program
 
 OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}
-OTHER_NAMES = {"abs": "fabs", "arctan": "atan", "arctan2": "atan2"}
+OTHER_NAMES = {"abs": "fabs"} | {f"arc{name}": f"a{name}" for name in ("tan", "tan2", "sinh", "cosh", "tanh")}
 """Functions of math.h that have other names in NumPy."""
 
 

@@ -14,6 +14,8 @@ import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from thruster_env.numerics.algebra.magnitudes import GROWING
+
 if TYPE_CHECKING:
     from thruster_env.numerics.algebra.graphs import Number
 
@@ -42,12 +44,15 @@ _OF_CONSTANTS: dict[str, Callable] = {
     "abs": abs,
     "arctan": math.atan,
     "arctan2": math.atan2,
+    "arcsinh": math.asinh,
+    "arccosh": math.acosh,
+    "arctanh": math.atanh,
     "pow": math.pow,
     "rint": round,
 }
 
 
-UNDEFINED = frozenset(("/", "sqrt", "log", "pow", "fmod", "tan", "exp", "sinh", "cosh"))
+UNDEFINED = GROWING | {"/", "sqrt", "fmod", "tan", "arccosh"}
 """Operations that make NaN or infinity of usual numbers."""
 
 

@@ -42,7 +42,25 @@ from thruster_env.numerics.algebra.folding import (
 )
 from thruster_env.numerics.algebra.magnitudes import overflow_of, sign_of
 
-UNARY = ("sqrt", "exp", "log", "sin", "cos", "tan", "arctan", "tanh", "sinh", "cosh", "floor", "ceil")
+UNARY = (
+    *(
+        "sqrt",
+        "exp",
+        "log",
+        "sin",
+        "cos",
+        "tan",
+        "arctan",
+        "tanh",
+        "sinh",
+        "cosh",
+        "floor",
+        "ceil",
+        "cbrt",
+        "exp2",
+    ),
+    *("expm1", "log1p", "log2", "log10", "arcsinh", "arccosh", "arctanh", "erf", "erfc"),
+)
 TWO_SIDED = {"+", "*"}  # operations whose arguments may change places
 COMPARISONS: dict[str, Callable] = {
     "<": operator.lt,
@@ -303,13 +321,29 @@ class Number:
 
     __rand__, __ror__ = __and__, __or__
 
+    def __invert__(self):
+        if not self.is_condition:
+            raise TypeError("floats have no bits: ~ is the contrary of a comparison")
+        return self == 0.0
+
+    def __xor__(self, other):
+        if isinstance(other, (bool, np.bool_)):
+            return ~self if other else self
+        self._check_joined(other)
+        return self != other
+
+    __rxor__ = __xor__
+
     def _joined(self, operation: str, other, known: bool):
         """Both conditions, or one of them; one that is known now decides, or the other one does."""
         if isinstance(other, (bool, np.bool_)):
             return known if other == known else self
-        if not (self.is_condition and isinstance(other, Number) and other.is_condition):
-            raise TypeError("floats have no bits: & and | join comparisons")
+        self._check_joined(other)
         return self.graph.make(operation, self, other)
+
+    def _check_joined(self, other) -> None:
+        if not (self.is_condition and isinstance(other, Number) and other.is_condition):
+            raise TypeError("floats have no bits: &, | and ^ join comparisons")
 
 
 def _unary(name: str):

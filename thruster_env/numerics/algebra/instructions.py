@@ -26,7 +26,8 @@ OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
 OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "abs": "fabs", "pow": "pow"} | {
     name: name for name in ("floor", "ceil", "rint", "copysign")
 }  # functions of vectors; others are called for each run
-IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2"}  # other names than NumPy's in C's library
+IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2", "arcsinh": "asinh", "arccosh": "acosh", "arctanh": "atanh"}
+"""Other names than NumPy's in C's library."""
 DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
 
 

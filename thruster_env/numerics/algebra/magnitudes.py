@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from thruster_env.numerics.algebra.graphs import Number
 
-GROWING = ("exp", "log", "sinh", "cosh", "pow")  # whose results may be infinite for numbers of usual size
+GROWING = frozenset("exp exp2 expm1 log log2 log10 log1p sinh cosh arctanh pow".split())
+"""Operations whose results may be infinite for numbers of usual size."""
 UNKNOWN, NEVER_NEGATIVE, POSITIVE = range(3)
 
 
@@ -31,4 +32,6 @@ def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
         return max(NEVER_NEGATIVE, of[0].sign) if of[0] is of[1] else min(of[0].sign, of[1].sign)
     if operation in ("sqrt", "abs", "hypot"):
         return max(NEVER_NEGATIVE, *[one.sign for one in of])
-    return {"exp": NEVER_NEGATIVE, "cosh": POSITIVE}.get(operation, UNKNOWN)
+    if operation in ("exp", "exp2", "erfc"):
+        return NEVER_NEGATIVE
+    return {"cosh": POSITIVE, "cbrt": of[0].sign if of else UNKNOWN}.get(operation, UNKNOWN)

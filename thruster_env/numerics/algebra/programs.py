@@ -190,7 +190,15 @@ def work_names() -> dict:
         "over_members": _total,
         "largest_of_members": _largest,
         "called": _called,
+        "erf": lambda x: _special("erf", x),
+        "erfc": lambda x: _special("erfc", x),
     }
+
+
+def _special(name: str, x):
+    from scipy import special  # which takes long to import
+
+    return getattr(special, name)(x)
 
 
 def _chosen(condition, a, b):

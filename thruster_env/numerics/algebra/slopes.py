@@ -17,8 +17,10 @@ Choices say this, as their derivatives are choices again: the rule holds for slo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
+from thruster_env.numerics.algebra.folding import worked_out
 from thruster_env.numerics.algebra.graphs import CONDITIONS, Number, needed_by, where
 from thruster_env.numerics.algebra.magnitudes import POSITIVE
 
@@ -101,6 +103,11 @@ def _twice(slope: Slope) -> Slope:
     return None if slope is None else slope + slope
 
 
+def _bell(x: Number) -> Number:
+    """The derivative of the error function."""
+    return (2.0 / math.sqrt(math.pi)) * (-x * x).exp()
+
+
 def _none(y, *others):
     """Of what is constant but for jumps."""
     return None
@@ -123,6 +130,17 @@ _RULES: dict[str, Callable] = {
     "tanh": lambda y, x, dx: _fading(dx, x, lambda: 1.0 - y * y),
     "sinh": lambda y, x, dx: dx * x.cosh(),
     "cosh": lambda y, x, dx: dx * x.sinh(),
+    "cbrt": lambda y, x, dx: _unless_zero(y, dx / (3.0 * y * y)),
+    "exp2": lambda y, x, dx: _fading(dx, x, lambda: math.log(2.0) * y),
+    "expm1": lambda y, x, dx: _fading(dx, x, lambda: y + 1.0),
+    "log1p": lambda y, x, dx: dx / (1.0 + x),
+    "log2": lambda y, x, dx: dx / (math.log(2.0) * x),
+    "log10": lambda y, x, dx: dx / (math.log(10.0) * x),
+    "arcsinh": lambda y, x, dx: dx / worked_out("hypot", x, x.graph.constant(1.0)),
+    "arccosh": lambda y, x, dx: _unless_zero(y, dx / ((x - 1.0).sqrt() * (x + 1.0).sqrt())),
+    "arctanh": lambda y, x, dx: dx / ((1.0 - x) * (1.0 + x)),
+    "erf": lambda y, x, dx: _fading(dx, x, lambda: _bell(x)),
+    "erfc": lambda y, x, dx: _fading(dx, x, lambda: -_bell(x)),
     "pow": _of_power,
     "arctan2": _of_angle,
     "where": _of_choice,

@@ -22,13 +22,18 @@ import numpy as np
 
 from thruster_env.numerics.algebra.folding import worked_out
 from thruster_env.numerics.algebra.graphs import UNARY, Number, arctan2, where
-from thruster_env.numerics.user_functions import Copies, needs_floats
+from thruster_env.numerics.user_functions import Copies, Module, needs_floats
 
+MOST_POINTS = 100  # of a table that is traced
+MOST_ROWS = 4  # of a matrix whose determinant is written out
 OTHER_NAMES = {
     "atan": "arctan",
     "atan2": "arctan2",
     "asin": "arcsin",
     "acos": "arccos",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
     "fabs": "absolute",
     "abs": "absolute",
     "pow": "power",
@@ -110,6 +115,83 @@ def _step(x, at_zero):
     return where(x > 0.0, 1.0, where(x == 0.0, at_zero, where(x < 0.0, 0.0, x)))
 
 
+def _log_of_sum(a, b):
+    """log(exp(a) + exp(b)), with the slope of the mean where both are equal."""
+    found = where(a > b, a + (b - a).exp().log1p(), b + (a - b).exp().log1p())
+    return where((a == b) & (abs(a) == math.inf), a, found)
+
+
+def _interpolated(x, xp, fp, left=None, right=None, period=None):
+    """Lines between the points of a table; at one of these, the slope of the line to its right."""
+    xp, fp = np.asarray(xp, dtype=float), np.asarray(fp, dtype=object)
+    if period is not None or not 1 < len(xp) <= MOST_POINTS or not (np.diff(xp) > 0.0).all():
+        raise TypeError(f"a traced table must have from 2 to {MOST_POINTS} increasing points and no period")
+
+    def at(x):
+        found = where(x > xp[-1], fp[-1] if right is None else right, fp[-1])
+        for j in reversed(range(len(xp) - 1)):
+            line = (fp[j + 1] - fp[j]) / (xp[j + 1] - xp[j]) * (x - xp[j]) + fp[j]
+            found = where(x < xp[j + 1], line, found)
+        return where(x == x, where(x < xp[0], fp[0] if left is None else left, found), x)
+
+    return _of_entries(at)(x)
+
+
+def _polynomial(p, x):
+    found, *others = p
+    for coefficient in others:
+        found = found * x + coefficient
+    return found
+
+
+def _variance(a, axis=None, dtype=None, out=None, ddof=0, keepdims=False):
+    a = np.asarray(a, dtype=object)
+    count = a.size if axis is None else a.shape[axis]
+    off = a - np.sum(a, axis=axis, keepdims=True) / count
+    return np.sum(off * off, axis=axis, keepdims=keepdims) / (count - ddof)
+
+
+def _selected(conditions, choices, default=0):
+    for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
+        default = _in_place_of(np, "where")(condition, choice, default)
+    return default
+
+
+def _square_matrix(a) -> np.ndarray:
+    a = np.asarray(a, dtype=object)
+    if a.ndim != 2 or a.shape[0] != a.shape[1] or not 0 < len(a) <= MOST_ROWS:
+        raise TypeError(
+            f"a traced matrix must be one of at most {MOST_ROWS} rows to have a determinant or an inverse"
+        )
+    return a
+
+
+def _determinant(a):
+    """By the first row; that of no rows is 1."""
+    a = _square_matrix(a) if len(a) else a
+    terms = [(-1.0) ** j * a[0, j] * _determinant(_without(a, 0, j)) for j in range(len(a))]
+    return sum(terms[1:], terms[0]) if terms else 1.0
+
+
+def _without(a: np.ndarray, row: int, column: int) -> np.ndarray:
+    return np.delete(np.delete(a, row, 0), column, 1)
+
+
+def _solved(a, b):
+    """X of A x = b, by the inverse's numerators and the determinant."""
+    a, b = _square_matrix(a), np.asarray(b, dtype=object)
+    places = range(len(a))
+    numerators = [[(-1.0) ** (i + j) * _determinant(_without(a, j, i)) for j in places] for i in places]
+    return np.array(numerators, dtype=object) @ b / _determinant(a)
+
+
+def _norm(x, ord=None, axis=None, keepdims=False):
+    x = np.asarray(x, dtype=object)
+    if axis is not None or keepdims or ord is not None and (ord, x.ndim) not in ((2, 1), ("fro", 2)):
+        raise TypeError("a traced norm must be that of a vector or Frobenius'")
+    return sum(one * one for one in x.ravel()).sqrt()
+
+
 def _condition(x):
     """Whether a number is not zero."""
     return (x if x.is_condition else x != 0.0) if isinstance(x, Number) else bool(x)
@@ -146,6 +228,9 @@ FUNCTIONS: dict[str, Callable] = {
     "isnan": lambda x: x != x,
     "isinf": lambda x: abs(x) == math.inf,
     "isfinite": lambda x: abs(x) < math.inf,
+    "logaddexp": lambda a, b: _log_of_sum(*_numbers(a, b)),
+    "reciprocal": lambda x: 1.0 / x,
+    "float_power": lambda x, e: x**e,
     "logical_and": lambda a, b: _condition(a) & _condition(b),
     "logical_or": lambda a, b: _condition(a) | _condition(b),
     "logical_xor": lambda a, b: _condition(a) != _condition(b),
@@ -158,6 +243,23 @@ FUNCTIONS: dict[str, Callable] = {
     "not_equal": operator.ne,
 }
 """In place of functions of `math` and NumPy, by NumPy's names, where they get a Number."""
+
+OF_ARRAYS: dict[str, Callable] = {
+    "interp": _interpolated,
+    "polyval": _polynomial,
+    "var": _variance,
+    "std": lambda *arguments, **named: _in_place_of(np, "sqrt")(_variance(*arguments, **named)),
+    "select": _selected,
+}
+"""In place of NumPy's functions of vectors, where there is a Number among these."""
+
+OF_MATRICES: dict[str, Callable] = {
+    "det": _determinant,
+    "solve": _solved,
+    "inv": lambda a: _solved(a, np.eye(len(a))),
+    "norm": _norm,
+}
+"""The same of `numpy.linalg`."""
 
 OF_MATH: dict[str, Callable] = {
     "remainder": _nearest_rest,
@@ -212,20 +314,35 @@ BUILTINS = {
 def _in_place_of(module: types.ModuleType, name: str):
     """What traced functions find under a name in `math` or NumPy."""
     value, name = getattr(module, name), OTHER_NAMES.get(name, name)
-    ours = (OF_MATH if module is math else ARRAYS).get(name) or FUNCTIONS.get(name)
-    if ours is None or name in ARRAYS:
+    if value is np.linalg:
+        return Module(np.linalg, _in_place_of)
+    of_arrays = OF_MATRICES.get(name) if module is np.linalg else OF_ARRAYS.get(name) if module is np else None
+    known = {} if module is np.linalg else (OF_MATH if module is math else ARRAYS)
+    ours = of_arrays or known.get(name) or (None if module is np.linalg else FUNCTIONS.get(name))
+    if ours is None or module is np and name in ARRAYS:
         return ours or value
 
     def function(*arguments, **named):
-        if not any(map(_has_numbers, arguments)):
+        if not any(map(_has_numbers, (*arguments, *named.values()))):
             return value(*arguments, **named)
-        if module is math or not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
+        if module is math or of_arrays:
             return ours(*arguments, **named)
-        of_arrays = np.frompyfunc(lambda *entries: ours(*entries, **named), len(arguments), 1)
-        with np.errstate(all="ignore"):  # of NaN among constants
-            return of_arrays(*(np.asarray(one, dtype=object) for one in arguments))
+        return _of_entries(ours)(*arguments, **named)
 
     return function
+
+
+def _of_entries(function: Callable) -> Callable:
+    """A function of numbers as one of arrays, too."""
+
+    def of_arrays(*arguments, **named):
+        if not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
+            return function(*arguments, **named)
+        entries = np.frompyfunc(lambda *given: function(*given, **named), len(arguments), 1)
+        with np.errstate(all="ignore"):  # of NaN among constants
+            return entries(*(np.asarray(one, dtype=object) for one in arguments))
+
+    return of_arrays
 
 
 def _has_numbers(value) -> bool:
