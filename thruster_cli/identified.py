@@ -12,8 +12,9 @@ from thruster_env.numerics.plots import save_figure
 from thruster_env.plants.logs.log import Log
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
-from tuning.identification.validation import Validation
+from tuning.identification.validation import Validation, fall_sentence
 from tuning.logs.identify import remarks, write_found
+from tuning.search.parameters import index_pairs
 
 
 def report(
@@ -31,7 +32,7 @@ def report(
         numbers = found.start[name], found.values[name], found.standard_errors[name]
         test = found.null_tests.get(name)
         without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
-        label = f"{name} [{units[name]}]" if units[name] else name
+        label = index_pairs(name) + (f" [{units[name]}]" if units[name] else "")
         rows.append([label, *(f"{v:.5g}" for v in numbers), known, *without])
     count, steps = len(runs), sum(log.steps for log in runs)
     title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
@@ -54,6 +55,7 @@ def report(
     return [
         *shown,
         *found.sentences(),
+        *(fall_sentence(checked) if proving else []),
         *remarks(runs, proving, found),
         *(f"wrote {path}" for path in files),
     ]
@@ -109,6 +111,10 @@ def as_json(
         "interrupted": found.interrupted,
         "validation": {name: one._asdict() for name, one in checked.items()},
         "profiles": [{**one._asdict(), "interval": one.interval} for one in made],
-        "sentences": [*found.sentences(), *remarks(runs, proving, found)],
+        "sentences": [
+            *found.sentences(),
+            *(fall_sentence(checked) if proving else []),
+            *remarks(runs, proving, found),
+        ],
         "files": list(files),
     }

@@ -13,6 +13,7 @@ from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
 from tuning.search.filter_types import TypeResult
 from tuning.search.objectives import LIKELIHOOD
+from tuning.search.parameters import index_pairs
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
@@ -82,7 +83,7 @@ def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
     for i, (one, error) in enumerate(zip(found.free, found.standard_errors.tolist(), strict=True)):
         of_factor = f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}"
         values = [f"{optimum.parameters[i]:.4g}" for optimum in found.optima]
-        name = f"{one.name} [{one.unit}]" if one.unit else one.name
+        name = index_pairs(one.name) + (f" [{one.unit}]" if one.unit else "")
         rows.append([name, *values, of_factor if one.log else f"± {error:.2g}"])
     levels = [f"{level:{'.2f' if likeliest else '.6g'}}" for level in (one.level for one in found.optima)]
     rows.append(["log L" if likeliest else found.objective, *levels, ""])

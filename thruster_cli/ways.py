@@ -37,7 +37,7 @@ def command(
         emit([f"{name}: {way.about}.", f"Use it {way.when}.", f"Source: {way.source}", text], data, json)
         return
     rows = [[one, way.about, way.when, _needs(way.needs)] for one, way in WAYS.items()]
-    emit([table("ways of tuning: thruster tune --way NAME", HEADS, rows)], data, json)
+    emit([table("ways of tuning: thruster tune --way NAME", HEADS, rows, words=True)], data, json)
 
 
 def _needs(needs: tuple[str, ...]) -> str:

@@ -87,8 +87,12 @@ def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
 
 
 def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
-    """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)"."""
-    one, unit = some[0], f" {channel.unit}" if channel.unit else ""
+    """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
+
+    It begins with its first alarm; where the sensor is stuck or missing, with that, which explains the others.
+    """
+    one = next((alarm for alarm in some if alarm.test in ("stuck", "missing")), some[0])
+    unit = f" {channel.unit}" if channel.unit else ""
     what = {
         "outlier": f"an outlier {one.size:+.3g}{unit} off",
         "variance": f"noise with {one.size:.2g} times the expected variance",
@@ -99,7 +103,7 @@ def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray
     at = [time_text(times[step], dt, 5) for step in (one.since, one.step, some[-1].step)]
     since = "" if one.test == "outlier" else f" since {at[0]} s, found"
     found = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[one.step])} ({one.test})"
-    others = list(dict.fromkeys(alarm.test for alarm in some[1:]))
+    others = list(dict.fromkeys(alarm.test for alarm in some if alarm is not one))
     if not others:
         return found
     return f"{found}; {len(some) - 1} more until {at[2]} s ({', '.join(others)})"

@@ -241,6 +241,10 @@ def test_episodes_are_told_in_words():
         "T: a bias of +0.5 N since 2 s, found at 3 s (cusum); 1 more until 4 s (glr)"
     )
     assert episode_sentence(second, thrust, times) == "T: an outlier -4 N off at 9.5 s (outlier)"
+    dead = [Alarm("outlier", 0, 30, 30, 0.5), Alarm("stuck", 0, 38, 29, 10.0), Alarm("glr", 0, 40, 31, 0.6)]
+    assert episode_sentence(dead, thrust, times) == (
+        "T: equal readings since 2.9 s, found at 3.8 s (stuck); 2 more until 4 s (outlier, glr)"
+    )
 
 
 @pytest.mark.parametrize("dead", ["stuck", "missing"])

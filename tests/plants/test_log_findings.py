@@ -1,5 +1,7 @@
 """What is found in logs: gaps, stuck and saturated sensors, outliers, rows moved, dropped and doubled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -146,6 +148,11 @@ def test_many_of_one_kind_are_one_sentence():
     (said,) = sentences(log.findings)
     assert len(log.pieces) == 10 and "; so in 9 places, " in said
     assert remarks_on([log, log]) == [f"a table: {said}"]
+    (both,) = remarks_on([log, replace(log, name="another")])
+    rows = sum(one.count for one in log.findings)
+    assert both.startswith("a table: a gap: ") and both.endswith(
+        f"; so in 2 logs, 18 places, {2 * rows} rows in all."
+    )
 
 
 def test_the_picture_marks_what_was_found():

@@ -22,6 +22,7 @@ from thruster_cli.benchmark import fitted
 from thruster_cli.tuning_report import way_out
 from thruster_env.numerics.checks import any_case, meant, one_of
 from thruster_env.numerics.progress import listening
+from thruster_env.numerics.text_tables import plain_text, table
 from tuning.api.progress import trial_bar
 from tuning.api.run import file_name
 from tuning.problems.find import find_problem
@@ -213,6 +214,10 @@ def test_a_study_that_is_done_shows_its_best_and_no_time_left():
     with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
         pass
     assert "3/3 best 1.5 0:00:00" in stream.getvalue()
+    plan = plan._replace(objectives=("likelihood",))  # whose trials have the negative one
+    with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
+        pass
+    assert "3/3 best log L -1.5 0:00:00" in stream.getvalue()
 
 
 def test_trials_have_whole_numbers_in_pictures():
@@ -221,3 +226,13 @@ def test_trials_have_whole_numbers_in_pictures():
         study.add_trial(create_trial(value=value))
     figure = draw_history(study.trials, "a study", "score [-]")
     assert all(float(tick).is_integer() for tick in figure.axes[0].get_xticks())
+
+
+def test_a_table_whose_words_fit_is_never_wider_than_the_terminal(monkeypatch):
+    words = "a covariance of innovations " * 3
+    rows = [["expectation-maximisation", words, words, "true states, a gradient"]]
+    monkeypatch.setattr("thruster_env.numerics.text_tables.console", Console(width=80))
+    lines = plain_text([table("", ["way", "what it does", "use it", "needs"], rows)], 80).splitlines()
+    assert max(map(len, lines)) <= 80 and all(
+        word in " ".join(lines).split() for word in "gradient states,".split()
+    )

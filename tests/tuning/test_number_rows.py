@@ -1,10 +1,12 @@
 """Rows of the numbers of filters: equal variances of many states share one; nobody invents correlations."""
 
 import numpy as np
+import pytest
 
 from filters import affine_model
 from tuning.problems.model_problem import ModelProblem
 from tuning.reporting.units import number_rows
+from tuning.search.parameters import index_pairs
 from tuning.search.space import Choice
 
 
@@ -31,3 +33,27 @@ def test_variances_that_are_the_same_share_a_row_and_correlations_stand_where_q_
     found = {row[0]: row[1:] for row in number_rows([tied, equal, silent], "ekf", problem, str)}
     assert found["correlation 12"] == ["0.5", "0.0", "None"]
     assert found["correlation 13 to correlation 45"] == ["0.0", "0.0", "None"]
+
+
+def test_correlations_of_more_than_five_states_are_one_row_and_two_digits_stand_apart():
+    n = 11
+    model = affine_model(
+        a=0.5 * np.eye(n),
+        b=np.zeros((n, 1)),
+        c=np.eye(n)[:1],
+        process_noise_cov=np.ones(n),
+        measurement_noise_cov=[1.0],
+        prior_mean=np.zeros(n),
+        prior_cov=np.ones(n),
+    )
+    problem = ModelProblem(model, inputs=[0.0] * 60, scale=np.ones(n))
+    assert repr(problem) == f"ModelProblem({problem.name!r})"
+    q = np.diag(1.0 + np.arange(n))
+    q[0, 1] = q[1, 0] = -0.8 * np.sqrt(2.0)
+    rows = number_rows(
+        [Choice("ekf", {"process_noise_cov": tuple(map(tuple, q.tolist()))}, {})], "ekf", problem, str
+    )
+    assert [row[0] for row in rows if row[0].startswith("Q")][-2:] == ["Q10,10", "Q11,11"]
+    (largest,) = [row for row in rows if "correlation" in row[0]]
+    assert largest[0] == "largest of 55 Q correlations" and float(largest[1]) == pytest.approx(-0.8)
+    assert index_pairs("Q11 and Q1010, R1111") == "Q11 and Q10,10, R11,11"

@@ -66,14 +66,27 @@ def table(
 
 
 def _keep_words_whole(out: Table) -> None:
-    """Let cells fold between words only, if there is room for the longest one of each column."""
+    """Let cells fold between words only, if there is room for the longest one of each column.
+
+    The rest of the line goes to the columns in proportion to what they lack: rich itself would make a table with
+    minimal widths wider than the terminal, and cut it.
+    """
     columns = [[column.header, *column.cells] for column in out.columns]
     longest = [max((len(word) for cell in cells for word in str(cell).split()), default=1) for cells in columns]
-    if sum(longest) + 2 * len(longest) > console.width:
-        out.padding = 0
-    if sum(longest) + len(longest) + 1 <= console.width:
-        for column, width in zip(out.columns, longest, strict=True):
-            column.min_width = width
+    taken = 2 * len(longest)  # by padding, frame and gaps
+    if sum(longest) + taken > console.width:
+        out.padding, taken = 0, len(longest) + 1
+    lines = [max((len(line) for cell in cells for line in str(cell).split("\n")), default=1) for cells in columns]
+    spare = console.width - sum(longest) - taken
+    if spare < 0:
+        return
+    lacking = [line - word for line, word in zip(lines, longest, strict=True)]
+    if sum(lacking) > spare:
+        for column, word, lack in zip(out.columns, longest, lacking, strict=True):
+            column.width = word + spare * lack // sum(lacking)
+        return
+    for column, width in zip(out.columns, longest, strict=True):
+        column.min_width = width
 
 
 def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str:

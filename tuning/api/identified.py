@@ -15,7 +15,7 @@ from thruster_env.plants.state_space import StateSpaceModel
 from tuning.api.showing import drawn, frame, html
 from tuning.identification.profiles import profile_figure, profiles
 from tuning.identification.result import Identification
-from tuning.identification.validation import Validation
+from tuning.identification.validation import Validation, fall_sentence
 from tuning.logs.identify import AnyStepFamily, remarks, write_found
 
 if TYPE_CHECKING:
@@ -74,8 +74,9 @@ class Identified:
         return self.found.objective.model_at(self.found.at)
 
     def sentences(self) -> list[str]:
-        """Which parameters the data determine, and the findings in the logs."""
-        return [*self.found.sentences(), *remarks(self.runs, self.held_out, self.found)]
+        """Which parameters the data determine, whether held-out runs say so, and the findings in the logs."""
+        fell = fall_sentence(self.validation) if self.held_out else []
+        return [*self.found.sentences(), *fell, *remarks(self.runs, self.held_out, self.found)]
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per parameter: unit, start, value, standard error, whether the data determine it, and a test.

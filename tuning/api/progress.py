@@ -88,7 +88,7 @@ def trial_bar(
     )
     with Progress(*columns, console=console) as progress:
         done = min(len(before), total)
-        task = progress.add_task(title.format(named), total=total, completed=done, best=_best(before))
+        task = progress.add_task(title.format(named), total=total, completed=done, best=_best(before, plan))
         progress.update(task, completed=done)  # so that no time remains where all trials are done
 
         def show_kinds(kinds: Sequence[str]) -> None:
@@ -97,7 +97,7 @@ def trial_bar(
 
         def advance(study, finished: int) -> None:
             trials = study.get_trials(deepcopy=False)
-            progress.update(task, completed=finished, best=_best(trials))
+            progress.update(task, completed=finished, best=_best(trials, plan))
             if running := filter_types_running(trials):
                 show_kinds(running)
 
@@ -111,12 +111,16 @@ def trial_bar(
             yield advance, show_kinds
 
 
-def _best(trials: Sequence[FrozenTrial]) -> str:
-    """The first objective of the best trial; a dash before there is one."""
+def _best(trials: Sequence[FrozenTrial], plan: Plan) -> str:
+    """The first objective of the best trial, of a likelihood log L itself; a dash before there is one."""
+    from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
     from tuning.search.outcome import best_trial
 
     best = best_trial(trials)
-    return "-" if best is None else f"{best.values[0]:.4g}"
+    if best is None:
+        return "-"
+    name = {LIKELIHOOD: "log L ", LOG_SCORE: "log score "}.get(plan.objectives[0], "")
+    return f"{name}{-best.values[0] if name else best.values[0]:.4g}"
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from tuning.likelihood.family import known_information
 from tuning.problems.data import Data, where_true
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.parameters import places_in
+from tuning.search.parameters import index_pairs, places_in
 from tuning.search.space import Choice, choice_of, ends_of, parameters_of, untuned_choice
 
 KNOWN_WITHIN = np.log(10.0)  # a parameter with a wider 95 % interval than a factor of ten is not determined
@@ -248,7 +248,7 @@ def sentences(found: Identifiability) -> list[str]:
             f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
             f"the most likely value lies at the end of the range.{trade}"
         )
-    return said
+    return list(map(index_pairs, said))
 
 
 def as_data(found: Identifiability) -> dict:

@@ -42,6 +42,10 @@ class Problem(ABC):
     scale: Sequence[float] | None
     seed_word: ClassVar[str] = "seeds"  # name of its seeds in messages
 
+    def __repr__(self) -> str:
+        """The class and the name."""
+        return f"{type(self).__name__}({self.name!r})"
+
     @property
     @abstractmethod
     def digest(self) -> str:

@@ -14,6 +14,7 @@ from tuning.problems.problem import BOUND, OPEN_LOOP, Problem
 from tuning.reporting.page import Section, Table, Words
 from tuning.reporting.subject import Subject
 from tuning.search.objectives import NIS_BAND, find_objective
+from tuning.search.parameters import index_pairs
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.ranges import range_words
 from tuning.search.space import Choice
@@ -111,7 +112,12 @@ def _rows(name: str, matrix, quantities: Sequence[Quantity]) -> list[list[str]]:
         square = "" if not one.unit else f" ({one.unit})²" if set("/ ^") & set(one.unit) else f" {one.unit}²"
         deviation = sqrt(max(matrix[i, i], 0.0))
         found.append(
-            [f"{name}{i + 1}{i + 1}", one.text_symbol, f"{matrix[i, i]:.4g}{square}", f"{deviation:.4g}{unit}"]
+            [
+                index_pairs(f"{name}{i + 1}{i + 1}"),
+                one.text_symbol,
+                f"{matrix[i, i]:.4g}{square}",
+                f"{deviation:.4g}{unit}",
+            ]
         )
     return found
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 
 from tuning.problems.problem import Problem
+from tuning.search.parameters import index_pairs
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 
 SMALL, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MOST_CORRELATIONS = 10  # of five states: more are one row with the largest
 ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
 
@@ -43,7 +45,7 @@ def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2"
     """
     known = parameters(kind, problem, **everything_of(problem))
     units = {one.name: one.unit.replace("^2", square) for one in known}
-    said = {name: name.replace("_", " ") for name in names}
+    said = {name: index_pairs(name.replace("_", " ")) for name in names}
     return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in said.items()}
 
 
@@ -63,7 +65,15 @@ def number_rows(
     """
     columns = [parameters_of(choice) for choice in choices]
     names = labels(dict.fromkeys(name for column in columns for name in column), kind, problem, square)
-    rows = [[label, *(word(_said(column, name)) for column in columns)] for name, label in names.items()]
+    rows = []
+    for letter in ("", "R "):
+        some = [name for name in names if name.startswith(f"{letter}correlation ".replace(" ", "_"))]
+        if len(some) > MOST_CORRELATIONS:
+            values = [[_said(column, name) for name in some] for column in columns]
+            largest = [max((one for one in column if one is not None), key=abs, default=None) for column in values]
+            rows.append([f"largest of {len(some)} {letter or 'Q '}correlations", *map(word, largest)])
+            names = {name: label for name, label in names.items() if name not in some}
+    rows = [[label, *(word(_said(column, name)) for column in columns)] for name, label in names.items()] + rows
     groups: list[list[list[str]]] = []
     for row in rows:
         alike = groups and row[1:] == groups[-1][0][1:] and _letters(row[0]) == _letters(groups[-1][0][0])
@@ -80,7 +90,7 @@ def _said(column: Mapping[str, float], name: str) -> float | None:
 
 def _letters(label: str) -> str | None:
     """What the label of a variance or a correlation begins with and ends with; the whole of all others."""
-    found = re.fullmatch(r"(Q|R|correlation |R correlation )\d+(?: \d+)?( \[.*\])?", label)
+    found = re.fullmatch(r"(Q|R|correlation |R correlation )\d+(?:[ ,]\d+)?( \[.*\])?", label)
     return f"{found[1]}{found[2]}" if found else label
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -113,6 +114,11 @@ def model_parameters(
     """
     found = _all_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
     return related(found, where) if where else found
+
+
+def index_pairs(text: str) -> str:
+    """A text with the indices of its variances apart where they have two digits: Q1010 is Q10,10."""
+    return re.sub(r"\b([QR])(\d{2,})\2\b", r"\1\2,\2", text)
 
 
 def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: bool, prior: bool) -> list[Parameter]:

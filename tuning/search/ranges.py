@@ -7,7 +7,7 @@ from math import log
 
 from filters.tuned_file import NOISE
 from tuning.problems.parameter import Argument, Parameter
-from tuning.search.parameters import MeasurementVariance, ProcessVariance
+from tuning.search.parameters import MeasurementVariance, ProcessVariance, index_pairs
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
@@ -22,7 +22,8 @@ def model_ranges(plan: Plan) -> dict[str, Parameter]:
 def range_words(plan: Plan) -> str:
     """The ranges of the model's parameters in words; empty if none is chosen."""
     parts = [
-        f"{name} {one.low:.3g} to {one.high:.3g} {one.unit}".rstrip() for name, one in model_ranges(plan).items()
+        f"{index_pairs(name)} {one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
+        for name, one in model_ranges(plan).items()
     ]
     return "; ".join(parts)
 
@@ -43,7 +44,8 @@ def at_ends(choice: Choice, plan: Plan) -> list[str]:
         if not NEAR_END < place < 1.0 - NEAR_END:
             end, low = ("lower", True) if place <= NEAR_END else ("upper", False)
             told = f"{one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
-            said.append(f"{name} = {value:.3g} ended at the {end} end of its range, {told}: {_advice(one, low)}.")
+            ended = f"{index_pairs(name)} = {value:.3g} ended at the {end} end of its range, {told}"
+            said.append(f"{ended}: {_advice(one, low)}.")
     return said
 
 

@@ -115,9 +115,26 @@ def sentences(findings: Sequence[Finding]) -> list[str]:
 
 
 def remarks_on(logs: Sequence[Log]) -> list[str]:
-    """The findings in some logs in words, each with the name of its log; of pieces those in the whole log."""
+    """The findings in some logs in words; of pieces those in the whole log.
+
+    Each begins with the name of its log; what several logs have in common is one sentence, on the longest.
+    """
     whole = {log.name: log for log in (log.whole or log for log in logs)}
-    return [f"{name}: {said}" for name, log in whole.items() for said in sentences(log.findings)]
+    groups: dict[tuple[str, str], dict[str, list[Finding]]] = {}
+    for name, log in whole.items():
+        for one in log.findings:
+            groups.setdefault((one.kind, one.channel), {}).setdefault(name, []).append(one)
+    said: list[str] = []
+    for of_logs in groups.values():
+        name, some = max(of_logs.items(), key=lambda item: max(one.count for one in item[1]))
+        if len(of_logs) == 1:
+            said += [f"{name}: {one}" for one in sentences(some)]
+            continue
+        longest = max(some, key=lambda one: one.count)
+        places = sum(map(len, of_logs.values()))
+        rows = sum(one.count for found in of_logs.values() for one in found)
+        said.append(f"{name}: {longest.sentence}; so in {len(of_logs)} logs, {places} places, {rows} rows in all.")
+    return said
 
 
 def has_outliers(logs: Sequence[Log]) -> bool:
