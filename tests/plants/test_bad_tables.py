@@ -162,3 +162,13 @@ def test_zero_bytes_are_named(tmp_path, content):
     """What a loss of power leaves, and UTF-16 without its mark."""
     (tmp_path / "a.csv").write_text(content)
     refused(tmp_path / "a.csv", "a CSV file must be text in UTF-8, but .* is not: a zero byte in line [14]")
+
+
+def test_a_csv_that_is_cut_off_within_its_last_number_says_so(tmp_path):
+    """What a loss of power leaves: -0.96 is read as -0.9, or -0."""
+    path = tmp_path / "a.csv"
+    text = "t,voltage,tach\n" + "".join(f"{0.1 * k:.1f},{k % 5},{np.sin(k):.2f}\n" for k in range(6))
+    for end, is_cut in ((None, False), (-1, False), (-2, True), (-4, True)):
+        path.write_text(text[:end])
+        said = [one.sentence for one in read_log(path, MODEL).findings if one.kind == "damaged"]
+        assert [one.partition(",")[0] for one in said] == [f"line 7 of {path}"] * is_cut

@@ -297,3 +297,20 @@ def test_numbers_that_are_lost_or_were_never_written_are_not_zeros(tmp_path):
         "short": "damaged: it says 800 bytes, but has 984",
     }
     assert np.isnan(read(path, ["missing"])["missing"].values[:100]).all()
+
+
+def test_units_may_be_one_for_each_column(tmp_path):
+    """Of any other number they were ignored: kN was taken for N."""
+    path, t = tmp_path / "a.h5", 0.1 * np.arange(50)
+    with h5py.File(path, "w") as file:
+        file["t"] = t
+        file["m"] = np.column_stack([np.sin(t), np.cos(t)])
+        file["m"].attrs["units"] = ["mV", "rpm"]
+        file["two"] = np.sin(t)
+        file["two"].attrs["units"] = ["mV", "kV"]
+    log = read_log(path, MODEL, {"V_s": "m[0]", "tach": "m[1]"})
+    np.testing.assert_allclose(log.inputs[:, 0], 1e-3 * np.sin(t[:-1]), atol=1e-15)
+    np.testing.assert_allclose(log.measurements[:, 0], np.pi / 30.0 * np.cos(t), atol=1e-15)
+    with pytest.raises(ValueError, match="the unit of column 'two' .* but got 'mV, kV'.*name another in brackets"):
+        read_log(path, MODEL, {"V_s": "two", "tach": "m[1]"})
+    assert read_log(path, MODEL, {"V_s": "two[V]", "tach": "m[1]"}).inputs[1, 0] == np.sin(t[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,10 @@ FEWEST = 2  # samples; what has fewer is a constant
 
 
 def topics_of(
-    found: Mapping[str, Any], path: Path, wanted: Wanted = None, unit: Callable[[Any], str] = lambda one: ""
+    found: Mapping[str, Any],
+    path: Path,
+    wanted: Wanted = None,
+    unit: Callable[[Any], Sequence[str]] = lambda one: (),
 ) -> Iterator[Topic]:
     """The channels among arrays: a vector, or a matrix whose columns are channels NAME[0], NAME[1] and so on.
 
@@ -30,7 +33,7 @@ def topics_of(
         found: arrays by "GROUP.NAME", with shape, dtype and what `[...]` reads; or a text, why one is refused.
         path: of the file, for messages.
         wanted: columns that are read; None for all.
-        unit: of an array, empty where it has none.
+        unit: of an array, or one for each of its columns; empty where it has none.
 
     Raises:
         ValueError: if an array is wanted that is refused, or too large.
@@ -76,16 +79,23 @@ def topics_of(
             continue
         values = values if values.shape[0] == along else values.T
         fields = columns_of(field, values)
-        said = unit(one)
         own, taken = known[clock] if clock is not None else (None, "")
-        yield Topic(group, own, fields, dict.fromkeys(fields, said) if said else {}, taken=taken)
+        yield Topic(group, own, fields, _units(unit(one), [*fields]), taken=taken)
 
 
-def _times(clock: str, one: Any, path: Path, unit: Callable[[Any], str]) -> tuple[np.ndarray | None, str]:
+def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
+    """The units of fields: one for all or one for each; of any other number all texts, which are the unit of none."""
+    each = texts if len(texts) == len(fields) else [", ".join(texts)] * len(fields)
+    return {field: text for field, text in zip(fields, each, strict=True) if text}
+
+
+def _times(
+    clock: str, one: Any, path: Path, unit: Callable[[Any], Sequence[str]]
+) -> tuple[np.ndarray | None, str]:
     """The times in a vector [s], None for those of an unknown unit; and how they were read, in words."""
     try:
         times = _read(clock, one, path).astype(np.float64)
-        return in_seconds(times, unit(one) or parted(clock)[1], clock, f"{clock!r} of {path}")
+        return in_seconds(times, ", ".join(unit(one)) or parted(clock)[1], clock, f"{clock!r} of {path}")
     except Refused:
         raise
     except ValueError:

@@ -24,7 +24,8 @@ UNSIGNED = "_unsigned"
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The numeric arrays of one or two dimensions, by group: GROUP.GROUP.DATASET; see `arrays.topics_of`.
 
-    A unit is the attribute `units` or `unit` of a dataset, in any case, a text or an array of one. Numbers are
+    A unit is the attribute `units` or `unit` of a dataset, in any case, a text or an array of one, or of one for
+    each column of a matrix. Numbers are
     `scale_factor` times what is stored plus `add_offset`, NaN where that is `_FillValue` or `missing_value` or
     outside `valid_range`, or `valid_min` and `valid_max`; whole numbers have no sign if `_Unsigned` says so. Of
     MATLAB's version 7.3, arrays of structures and cells are STRUCT(1).FIELD and CELL{1}. No link is followed,
@@ -97,12 +98,11 @@ class Dataset:
         return some
 
 
-def _unit(one: Dataset) -> str:
-    """The unit that a dataset says it has; of "seconds since 2026-05-01", as of CF conventions, "seconds"."""
+def _unit(one: Dataset) -> list[str]:
+    """The units that a dataset says it has; of "seconds since 2026-05-01", as of CF conventions, "seconds"."""
     for name in UNITS:
         value = one.attributes.get(name)
-        while isinstance(value, list) and len(value) == 1:
-            value = value[0]
-        if isinstance(value, str):
-            return value.partition(" since ")[0].strip()
-    return ""
+        some = np.ravel(np.array(value, object)).tolist()
+        if value is not None and all(isinstance(text, str) for text in some):
+            return [text.partition(" since ")[0].strip() for text in some]
+    return []
