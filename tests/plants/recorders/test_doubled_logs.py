@@ -66,6 +66,19 @@ def test_damage_is_found_in_the_log_and_in_the_listing(tmp_path, ending):
         assert [one.sentence for one in found] == [damage] and "the log" in damage
 
 
+@pytest.mark.parametrize("kind", b"E@Td\x04\xc4LF")
+def test_a_ulog_message_whose_kind_is_damaged_is_not_lost_unsaid(tmp_path, kind):
+    """Each is one flipped bit away from D; the package passes over them as over newer kinds, text or formats."""
+    path = write_good(tmp_path / "a.ulg")
+    data = bytearray(path.read_bytes())
+    place = len(data) // 2
+    place = data.index(struct.pack("<HB", 18, ord("D")), place)
+    data[place + 2] = kind
+    path.write_bytes(data)
+    assert sum(one.samples for one in contents(path).fields) == 599
+    assert contents(path).damage == ("1 message is damaged, or of a kind that is not known",)
+
+
 def ulog_of(path, change):
     """A ULog of two topics whose subscriptions are changed as bytes."""
     columns = {"timestamp": 10_000 * np.arange(30), "x": np.arange(30.0)}

@@ -84,7 +84,7 @@ def topics_of(
 
 
 def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
-    """The units of fields: one for all or one for each; of any other number all texts, which are the unit of none."""
+    """The units of fields: one for all or one for each; of any other number all texts, which are no unit."""
     each = texts if len(texts) == len(fields) else [", ".join(texts)] * len(fields)
     return {field: text for field, text in zip(fields, each, strict=True) if text}
 

@@ -40,6 +40,7 @@ SEVERAL = 4  # messages that follow one another: none begin by chance
 APPENDED = struct.pack("<HB", 40, ord("B")) + bytes(8) + b"\1"  # flags of a log to which data were appended
 FORMAT, SUBSCRIPTION = b"FA"
 KINDS = b"ABCDFILMOPQRS"  # of messages
+TEXTS, LEVELS = b"LC", (*(bytes([one]) for one in b"01234567"),)  # messages of text, and what they begin with
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
@@ -63,7 +64,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     with reading(KIND, path), silent():
         content = path.read_bytes()
         parts = _whole_parts(content)
-        _check_definitions(content, parts, path)
+        strays = _checked_definitions(content, parts, path)
         size = len(content)
         lost = size - START - sum(end - begin for begin, end in parts)
         if lost:  # where bytes are left out, the places of what was appended are no longer right
@@ -76,7 +77,10 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             raise ValueError("it holds no data")
     places = 1 + len(parts) - (not parts or parts[0][0] == START) - (not parts or parts[-1][1] == size)
     damage = f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"
-    if not lost:
+    if strays:
+        are = "message is" if strays == 1 else "messages are"
+        damage = f"{damage}, and " * bool(lost) + f"{strays} {are} damaged, or of a kind that is not known"
+    elif not lost:
         damage = "some messages of the log are not as long as their formats say" if log.file_corruption else ""
     while found:
         some = [found.pop(0)]
@@ -139,17 +143,21 @@ def _begins(content: bytes, place: int) -> bool:
     return True
 
 
-def _check_definitions(content: bytes, parts: Sequence[tuple[int, int]], path: Path) -> None:
-    """Raise Refused for a format that is defined twice, or a number that stands for two topics.
+def _checked_definitions(content: bytes, parts: Sequence[tuple[int, int]], path: Path) -> int:
+    """How many messages cannot be what their kind says, as where it is damaged; the package passes over them.
 
-    The package keeps the last one, and drops what belongs to the first.
+    Raises Refused for a format that is defined twice, or a number that stands for two topics: the package keeps
+    the last one, and drops what belongs to the first.
     """
-    formats, subscribed = dict[bytes, bytes](), set[int]()
+    formats, subscribed, strays = dict[bytes, bytes](), set[int](), 0
     for place, last in parts:
         while place < last:
             count, kind = struct.unpack_from("<HB", content, place)
             begin, end = place + HEADER, place + HEADER + count
-            if kind == FORMAT:
+            is_text = kind not in TEXTS or content[begin : begin + 1] in LEVELS
+            if kind not in KINDS or not is_text or (kind == FORMAT and subscribed):  # formats come first
+                strays += 1
+            elif kind == FORMAT:
                 name, _, text = content[begin:end].partition(b":")
                 if formats.setdefault(name, text) != text:
                     what = name[:80].decode("ascii", "replace")
@@ -162,6 +170,7 @@ def _check_definitions(content: bytes, parts: Sequence[tuple[int, int]], path: P
                     raise Refused(f"{rule}, but {path} gives {number} again, to {what!r}")
                 subscribed.add(number)
             place = end
+    return strays
 
 
 def _numbers(data: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
