@@ -189,15 +189,13 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a log must have a header and rows, but {path} has only a header")
     columns = list(zip(*(row for _, row in rows), strict=True))
     named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
-    damage = (
-        f"line {rows[-1][0]} of {path}, the last, has no end and its last number the fewest digits: it may be cut"
-    )
+    damage = f"line {rows[-1][0]} of {path}, the last, has no end, its number the fewest digits: it may be cut"
     is_cut = not text.endswith(("\n", "\r")) and _is_shortest(columns[-1])
     return Table(str(path), named, [line for line, _ in rows], damage=(damage,) * is_cut)
 
 
 def _is_shortest(cells: Sequence[str]) -> bool:
-    """Whether the last of some numbers has fewer digits than any other, behind the point where there are points."""
+    """Whether the last of some numbers has the fewest digits, behind the point where there are points."""
     some = [cell.lstrip("+-") for cell in cells]
     if any("." in cell for cell in some):
         some = [cell.partition(".")[2] for cell in some]
