@@ -43,7 +43,7 @@ def message_counts(rng: np.random.Generator, seconds: float) -> str:
         while not counts or time.monotonic() < end:
             ending = str(rng.choice([*good]))
             data, written = good[ending]
-            data = _zeroed(rng, data) if rng.random() < 0.5 else _damaged(rng, data) or data
+            data = rng.choice([_zeroed, _damaged, _one_bit])(rng, data) or data
             path = Path(folder) / f"{counts.total()}{ending}"
             path.write_bytes(data)
             try:
@@ -208,6 +208,13 @@ def _zeroed(rng: np.random.Generator, data: bytes) -> bytes:
     """Zeros in place of some bytes, as of a block that was never written."""
     place, length = int(rng.integers(len(data))), int(rng.integers(1, 200))
     return (data[:place] + bytes(length) + data[place + length :])[: len(data)]
+
+
+def _one_bit(rng: np.random.Generator, data: bytes) -> bytes:
+    """One flipped bit, behind the first bytes."""
+    bad = bytearray(data)
+    bad[int(rng.integers(16, len(bad)))] ^= 1 << int(rng.integers(8))
+    return bytes(bad)
 
 
 def _write_dataflash(path: Path, orders: list[list[str]], rows: list[np.ndarray]) -> Path:

@@ -98,7 +98,7 @@ def check_topics(read: Counts | Mapping[str, int], stated: Mapping[str, int], kn
 
 def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
     size = path.stat().st_size
-    alone, indexed, statistics = Counter[int](), Counter[int](), None
+    alone, indexed, statistics, described = Counter[int](), Counter[int](), None, None
     seen: Counter[int] = Counter()
     channels: dict[int, bytes] = {}
     place = len(MCAP)
@@ -120,7 +120,8 @@ def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
             if channels.setdefault(int.from_bytes(content[:2], "little"), content) != content:
                 raise ValueError("it defines a channel twice")
         elif kind == STATISTICS:
-            statistics = _statistics(_exact(file, count))
+            content = _exact(file, count)
+            statistics, described = _statistics(content), struct.unpack_from("<HI", content, 8)
         elif kind == DATA_END:
             _check_sum(file, 0, place, struct.unpack("<I", _exact(file, 4))[0], "data")
         elif kind == FOOTER:
@@ -129,6 +130,10 @@ def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
                 _check_sum(file, summary, place + 25, check, "summary")
             break
         place += 9 + count
+    schemas, named = described or (seen[SCHEMA], seen[CHANNEL])
+    if seen[CHUNK] and (seen[SCHEMA] < min(schemas, 1) or seen[CHANNEL] < named):
+        rule = "an MCAP file must have its schemas and channels in its summary"
+        raise Refused(f"{rule}, but {path} has them in its chunks alone: mcap recover writes one that is read")
     if seen[CHUNK_INDEX] and seen[CHUNK_INDEX] != seen[CHUNK]:
         raise ValueError(f"it has {seen[CHUNK]} chunks, but an index of {seen[CHUNK_INDEX]}")
     if seen[CHUNK] and seen[CHUNK_INDEX] and not seen[INDEX] and statistics != {}:
