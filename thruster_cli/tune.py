@@ -25,7 +25,7 @@ from thruster_cli.options import (
 from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
-from tuning.api.run import aim_of, name_of, run_tuning
+from tuning.api.run import aim_of, name_of, run_tuning, with_budget
 from tuning.evaluation.tuned import check_keepable
 from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.objectives import OBJECTIVES
@@ -103,7 +103,7 @@ def command(
         float | None,
         typer.Option(
             metavar="MICROSECONDS",
-            help="Time limit of a step of the filter on one core.",
+            help="Time limit of a step of the filter on one core; of auto by default 2.5 n^2 for n states.",
             rich_help_panel=FILTER,
         ),
     ] = None,
@@ -220,6 +220,7 @@ def command(
         where=tuple(where or ()),
         worst=worst,
     )
+    plan = with_budget(plan)
     tuning = tune(plan, trials, storage, study, out, by_gradient=aim, way=way, workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:

@@ -3,15 +3,19 @@
 import json
 import math
 import sys
+import warnings
 
 import numpy as np
 import optuna
 import pytest
+from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
 from rich.progress import Progress
 
+import tuning
 from filters.registry import FILTERS
 from thruster_cli.main import main
+from tuning.api.run import warn_of_few_trials
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
@@ -19,7 +23,16 @@ from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search import trials as tuning_trials
-from tuning.search.among_types import ESTIMATED, ESTIMATED_Q, SMALLER, TRANSFERRED, UNTUNED, ends_a_round
+from tuning.search.among_types import (
+    ESTIMATED,
+    ESTIMATED_Q,
+    NEAR_BEST,
+    SMALLER,
+    TRANSFERRED,
+    UNTUNED,
+    next_in_race,
+    race_of,
+)
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.enqueued import RESCALED
 from tuning.search.filter_types import filter_types_tried, trials_of_type
@@ -95,11 +108,12 @@ def test_each_kind_is_tried_with_the_noise_that_true_states_show(priced):
     trials = studied(PLAN._replace(prune=False), 16).trials
     assert [trial.user_attrs.get(UNTUNED) for trial in trials[:2]] == ["ekf", None]
     assert choice_of("auto", trials[0].params, MISMATCH) == untuned_choice("ekf", MISMATCH)
-    for key, kinds in ((ESTIMATED_Q, list(FEW)), (ESTIMATED, ["ekf", "kf", "enkf"])):  # pf is over the budget
+    in_race = set(race_of(PLAN, trials).running)
+    assert [trial.user_attrs[ESTIMATED_Q] for trial in trials if ESTIMATED_Q in trial.user_attrs] == list(FEW)
+    assert in_race and any(ESTIMATED in trial.user_attrs for trial in trials)
+    for key in (ESTIMATED_Q, ESTIMATED):
         found = [trial for trial in trials if key in trial.user_attrs]
-        assert (
-            [trial.user_attrs[key] for trial in found] == [trial.params[FILTER_TYPE] for trial in found] == kinds
-        )
+        assert [trial.user_attrs[key] for trial in found] == [trial.params[FILTER_TYPE] for trial in found]
         for trial in found:
             choice = choice_of("auto", trial.params, MISMATCH)
             estimated = noise_estimated(choice.name, MISMATCH).model
@@ -157,14 +171,12 @@ def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
 
 
 def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
-    assert [n for n in range(1, 65) if ends_a_round(n, 4)] == [12, 24, 48]
-    result = studied(PLAN._replace(prune=False), 17)
+    result = studied(PLAN._replace(budget=30.0), 17)  # a round of four types leaves two
     heirs = [trial for trial in result.trials if TRANSFERRED in trial.user_attrs]
     (best,) = {trial.user_attrs[TRANSFERRED] for trial in heirs}
     best = result.trials[best]
     kinds = [trial.params[FILTER_TYPE] for trial in heirs]
-    assert best.params[FILTER_TYPE] not in kinds and "pf" not in kinds  # which is over the budget
-    assert 2 <= len(kinds) == len(set(kinds))
+    assert len(kinds) == 1 and best.params[FILTER_TYPE] not in kinds and heirs[0].number > len(FEW)
     assert all(trial.params[key] == best.params[key] for trial in heirs for key in ("Q11", "Q22", "R"))
 
 
@@ -188,9 +200,78 @@ def test_without_a_budget_a_front_of_error_against_cost_tells_the_kinds(priced):
     assert min(trial.values[1] for trial in result.front) == 0.07
 
 
-def test_the_same_seed_gives_the_same_study(priced):
+def test_the_same_seed_gives_the_same_study_and_one_that_goes_on_the_same_race(priced):
     first, second = ([trial.params for trial in studied(PLAN, 14).trials] for _ in range(2))
     assert first == second
+    storage = optuna.storages.InMemoryStorage()
+    run_study(open_study("s", PLAN, storage), PLAN, 9)
+    parts = run_study(open_study("s", PLAN, storage), PLAN, 14).trials
+    whole = [trial.params[FILTER_TYPE] for trial in studied(PLAN, 14).trials]
+    assert [trial.params[FILTER_TYPE] for trial in parts] == whole
+
+
+def finished(number, name, values, state=TrialState.COMPLETE):
+    """A trial of a filter type with these scores of single seeds."""
+    return optuna.trial.create_trial(
+        state=state,
+        value=float(np.mean(values)) if state == TrialState.COMPLETE else None,
+        params={FILTER_TYPE: name},
+        distributions={FILTER_TYPE: CategoricalDistribution(FEW)},
+        intermediate_values=dict(enumerate(values)),
+    )
+
+
+def test_the_best_third_of_the_types_rounded_up_goes_on_with_twice_as_many_trials(priced):
+    def race(scores):
+        return race_of(PLAN, [finished(i, name, [score] * 8) for i, (name, score) in enumerate(scores)])
+
+    first = [("ekf", 1.2), ("kf", 1.5), ("enkf", 1.1)]
+    assert race(first) == (0, ("enkf", "ekf", "kf", "pf"), 1)  # until each has had a trial
+    first.append(("pf", 2.0))
+    assert race(first) == (1, ("enkf", "ekf"), 3)
+    trials = [finished(i, name, [score] * 8) for i, (name, score) in enumerate(first)]
+    assert next_in_race(PLAN, trials) == "enkf"
+    trials.append(finished(4, "enkf", [], TrialState.RUNNING))  # another worker's
+    assert next_in_race(PLAN, trials) == "ekf"
+    assert race([*first, *[("kf", 0.5)] * 9]) == (1, ("kf", "enkf"), 3)
+    second = [*first, *[("ekf", 1.0), ("enkf", 1.3)] * 2]
+    assert race(second) == (2, ("ekf",), 7)
+    pruned = [
+        finished(0, "ekf", [1.0] * 32),
+        finished(1, "kf", [1.4] * 8, TrialState.PRUNED),
+        finished(2, "enkf", [1.3] * 8, TrialState.PRUNED),
+        finished(3, "pf", [3.0] * 32),
+    ]
+    assert race_of(PLAN, pruned).running == ("ekf", "enkf")  # 1.3 times the best on the same seeds
+    two = PLAN._replace(objectives=("score", "cost"))
+    assert set(race_of(two, [finished(i, name, [1.0]) for i, name in enumerate(FEW)]).running) == set(FEW)
+
+
+def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
+    result = studied(PLAN._replace(prune=False), 26)
+    for trial in result.trials[10:]:
+        before = [one for one in result.trials if one.number < trial.number]
+        enqueued = {UNTUNED, ESTIMATED_Q, ESTIMATED, TRANSFERRED, RESCALED, SMALLER} & trial.user_attrs.keys()
+        assert enqueued or trial.params[FILTER_TYPE] in race_of(PLAN, before).running
+    late = [trial.params[FILTER_TYPE] for trial in result.trials[18:]]
+    assert len(set(late)) <= 2 and any(NEAR_BEST in trial.user_attrs for trial in result.trials[10:])
+
+
+def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(monkeypatch, priced):
+    plans = []
+    monkeypatch.setattr("tuning.api.tune.run_tuning", lambda plan, *others, **named: plans.append(plan))
+    with pytest.warns(UserWarning, match="no budget .* may take 10 microseconds of one core, the default of 2 st"):
+        tuning.tune(MISMATCH, "auto", progress=False)
+    tuning.tune(MISMATCH, "auto", budget=3.0, progress=False)
+    tuning.tune(MISMATCH, "auto", objective=["score", "cost"], progress=False)
+    tuning.tune(MISMATCH, "ekf", progress=False)
+    assert [plan.budget for plan in plans] == [10.0, 3.0, None, None]
+    with pytest.warns(UserWarning, match="7 trials are fewer than 5 for each of 4 filter types: --trials 20"):
+        warn_of_few_trials(PLAN, 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_few_trials(PLAN, 20)
+        warn_of_few_trials(Plan("ekf", (MISMATCH,)), 1)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 from thruster_env.numerics.checks import short_repr
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
-from tuning.api.run import aim_of, run_tuning
+from tuning.api.run import aim_of, run_tuning, with_budget
 from tuning.api.study import Study
 from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.plan import Plan
@@ -86,7 +86,8 @@ def tune(
             (not tuned), "Q11 = 1e-6..1e-2" (its range).
         augment: constants of the model, such as "voltage_gain", that the filter also estimates, as further states
             whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
-        budget: time limit of a step of the filter [microseconds of one core].
+        budget: time limit of a step of the filter [microseconds of one core]; for "auto" by default 2.5 times the
+            square of the number of states.
         sampler: Optuna's sampler: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
         method: "optuna"; or "gradient", for Kalman filters except kf-steady, gsf, imm, mmae, mhe, fuzzy: maximum
@@ -146,6 +147,7 @@ def tune(
         where=(where,) if isinstance(where, str) else tuple(where),
         worst=worst,
     )
+    plan = with_budget(plan)
     place = None if storage is None else storage_text(storage)
     console = console_for(progress)
     return Study(run_tuning(plan, trials, console, place, name, by_gradient=aim, way=way, workers=workers))

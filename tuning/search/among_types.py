@@ -1,20 +1,25 @@
-"""Trials that a study over several filter types begins with, and those that compare the types.
+"""The race of a study over several filter types: the first trials of each, and which type has the next one.
 
 NIS is the normalised innovation squared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import optuna
+from optuna.distributions import BaseDistribution
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.baselines import noise_estimated
 from tuning.search.cost import COST
 from tuning.search.gradient_noise import noise_by_gradient
-from tuning.search.new_trials import is_near
-from tuning.search.outcome import best_trial, is_over_budget
+from tuning.search.local import near
+from tuning.search.new_trials import enqueue_new, is_near
+from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.parameters import R
 from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, ends_of, trial_parameters, untuned_choice, within_ranges
@@ -25,7 +30,10 @@ ESTIMATED_Q = "estimated Q of"  # the filter that has the Q of noise estimation,
 ESTIMATED = "estimated noise of"  # the filter that has both from noise estimation
 SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
 TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
-FIRST_ROUND = 3  # trials for each filter type, after which the noise of the best trial is tried with all types
+REMAINING = 3  # of so many filter types in a round of the race one goes on to the next ...
+MORE = 2  # ... in which it has so many times as many new trials
+INCONSISTENT = 0.05  # part of its objective by which a trial outside the NIS band counts as worse in the race
+NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
 ROOM = 0.9  # part of the budget that a smaller ensemble may take
 
 
@@ -38,7 +46,7 @@ def enqueue_next_type(study: optuna.Study, plan: Plan) -> None:
     trials = study.get_trials(deepcopy=False)
     if any(one.state == TrialState.WAITING for one in trials) or (trials and UNTUNED not in trials[0].user_attrs):
         return  # a study that begins with something else has enqueued all at once
-    for key, name in _first_trials(plan):
+    for key, name in _first_trials(plan, trials):
         if not any(one.user_attrs.get(key) == name for one in trials):
             parameters = _first_parameters(study, plan, key, name)
             if parameters is not None and not any(is_near(one.params, parameters) for one in trials):
@@ -46,8 +54,85 @@ def enqueue_next_type(study: optuna.Study, plan: Plan) -> None:
                 return
 
 
-def _first_trials(plan: Plan) -> Iterator[tuple[str, str]]:
+def is_race(plan: Plan) -> bool:
+    """Whether filter types leave a study: not one of two objectives, whose front may need each of them."""
+    return len(plan.filter_types) > 1 and len(plan.objectives) == 1
+
+
+class Race(NamedTuple):
+    """Where a race among filter types stands."""
+
+    round: int  # from 0
+    running: tuple[str, ...]  # the types that are still in it, the best first
+    trials: int  # that each of them shall have at the end of the round
+
+
+def race_of(plan: Plan, trials: Sequence[FrozenTrial]) -> Race:
+    """The race after some trials by successive halving: the best third of the types has twice as many new trials.
+
+    It depends on finished trials alone, so a study that is continued and each of several workers go on with it.
+    A type's rank is that of its best trial; that of a pruned trial is its error over the best trial's on the same
+    seeds. A type that is over the budget leaves.
+
+    Source: Jamieson, Talwalkar (2016), "Non-stochastic best arm identification and hyperparameter optimization",
+    International Conference on Artificial Intelligence and Statistics.
+    """
+    finished: dict[str, list[FrozenTrial]] = {name: [] for name in plan.filter_types}
+    for one in trials:
+        if one.state in (TrialState.COMPLETE, TrialState.PRUNED):
+            finished[one.params[FILTER_TYPE]].append(one)
+    best = best_trial([one for some in finished.values() for one in some])
+    rank = {name: min((_in_race(one, best) for one in some), default=math.inf) for name, some in finished.items()}
+    running = [name for name, some in finished.items() if not some or not all(map(is_over_budget, some))]
+    place, wanted = 0, 1
+    while len(running) > 1 and all(len(finished[name]) >= wanted for name in running):
+        if is_race(plan):
+            running = sorted(running, key=rank.__getitem__)[: -(-len(running) // REMAINING)]
+        place, wanted = place + 1, wanted + MORE ** (place + 1)
+    return Race(place, tuple(sorted(running, key=rank.__getitem__)), wanted)
+
+
+def _in_race(trial: FrozenTrial, best: FrozenTrial | None) -> float:
+    """The first objective of a trial, which counts as worse outside the NIS band; of a pruned one by its seeds."""
+    if trial.state == TrialState.COMPLETE:
+        value = trial.values[0]
+        return value if is_consistent(trial) else value + INCONSISTENT * abs(value)
+    seeds = trial.intermediate_values.keys() & best.intermediate_values.keys() if best is not None else set()
+    if best is None or not seeds:
+        return math.inf
+    own, other = (sum(one.intermediate_values[seed] for seed in seeds) for one in (trial, best))
+    return best.values[0] * own / other
+
+
+def next_in_race(plan: Plan, trials: Sequence[FrozenTrial]) -> str:
+    """The filter type of the next trial: of those in the race the one with the fewest, the best of these first."""
+    begun = Counter(one.params.get(FILTER_TYPE) for one in trials if one.state != TrialState.WAITING)
+    return min(race_of(plan, trials).running or plan.filter_types, key=begun.__getitem__)
+
+
+def choose_type_by_race(sampler: optuna.samplers.BaseSampler, plan: Plan) -> optuna.samplers.BaseSampler:
+    """The sampler, whose trials have the filter type that is next in the race."""
+    of_all, of_one = sampler.infer_relative_search_space, sampler.sample_independent
+
+    def without_type(study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return {name: one for name, one in of_all(study, trial).items() if name != FILTER_TYPE}
+
+    def sample(
+        study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        if param_name == FILTER_TYPE:
+            return next_in_race(plan, study.get_trials(deepcopy=False))
+        return of_one(study, trial, param_name, param_distribution)
+
+    sampler.infer_relative_search_space = without_type  # type: ignore[method-assign]  # of this sampler alone
+    sampler.sample_independent = sample  # type: ignore[method-assign]
+    return sampler
+
+
+def _first_trials(plan: Plan, trials: Sequence[FrozenTrial]) -> Iterator[tuple[str, str]]:
     """The first filter type untuned; then of several types each with what noise estimation says of Q, and of both.
+
+    Both are for the types that are in the second round of the race.
 
     Untuned filters do not show which type is best. The R of noise estimation contains all that the sensor does,
     outliers included: a filter that models these does better with that of the data sheet.
@@ -55,7 +140,8 @@ def _first_trials(plan: Plan) -> Iterator[tuple[str, str]]:
     yield UNTUNED, plan.filter_types[0]
     if len(plan.filter_types) > 1:
         yield from ((ESTIMATED_Q, name) for name in plan.filter_types)
-        yield from ((ESTIMATED, name) for name in plan.filter_types)
+        race = race_of(plan, trials)
+        yield from ((ESTIMATED, name) for name in race.running if race.round or not is_race(plan))
 
 
 def _first_parameters(study: optuna.Study, plan: Plan, key: str, name: str) -> dict | None:
@@ -105,14 +191,13 @@ def enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial,
         study.enqueue_trial({**last.params, names[0]: size}, user_attrs={SMALLER: last.number})
 
 
-def ends_a_round(trials: int, filter_types: int) -> bool:
-    """Whether a study of so many filter types has 3, 6, 12, ... times as many trials."""
-    doublings, rest = divmod(trials, FIRST_ROUND * filter_types)
-    return rest == 0 and doublings > 0 and doublings & (doublings - 1) == 0
+def ends_a_round(plan: Plan, trials: Sequence[FrozenTrial], last: FrozenTrial) -> bool:
+    """Whether a round of the race ended with the last trial."""
+    return race_of(plan, trials).round > race_of(plan, [one for one in trials if one.number != last.number]).round
 
 
-def enqueue_transferred_noise(study: optuna.Study) -> None:
-    """Enqueue the Q and R of the best trial with every other filter type that has been within the budget.
+def enqueue_transferred_noise(study: optuna.Study, plan: Plan) -> None:
+    """Enqueue the Q and R of the best trial with every other filter type that is in the race.
 
     Untuned filters do not show which type is best, and a sampler soon keeps to the type that it tuned first.
     """
@@ -121,6 +206,18 @@ def enqueue_transferred_noise(study: optuna.Study) -> None:
     if best is None:
         return
     latest = {trial.params[FILTER_TYPE]: trial for trial in finished if not is_over_budget(trial)}
-    for name, trial in latest.items():
-        if name != best.params[FILTER_TYPE]:
-            study.enqueue_trial({**trial.params, **_shared(best.params)}, user_attrs={TRANSFERRED: best.number})
+    for name in race_of(plan, finished).running:
+        if name != best.params[FILTER_TYPE] and name in latest:
+            parameters = {**latest[name].params, **_shared(best.params)}
+            enqueue_new(study, parameters, {TRANSFERRED: best.number})
+
+
+def enqueue_near_in_race(study: optuna.Study, plan: Plan, number: int) -> None:
+    """Enqueue a trial near the best one of the type that is next, once all other enqueued trials have been run."""
+    trials = study.get_trials(deepcopy=False)
+    if any(one.state == TrialState.WAITING for one in trials):
+        return
+    name = next_in_race(plan, trials)
+    best = best_trial([one for one in trials if one.params.get(FILTER_TYPE) == name])
+    if best is not None:
+        enqueue_new(study, near(best.params, plan.space(), plan, number), {NEAR_BEST: best.number})

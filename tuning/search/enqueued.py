@@ -12,11 +12,14 @@ from optuna.trial import FrozenTrial, TrialState
 from tuning.evaluation.baselines import competing_baselines
 from tuning.likelihood.goal import OF_STATES
 from tuning.search.among_types import (
+    NEAR_BEST,
     UNTUNED,
     ends_a_round,
+    enqueue_near_in_race,
     enqueue_next_type,
     enqueue_smaller_ensemble,
     enqueue_transferred_noise,
+    is_race,
 )
 from tuning.search.gradient_noise import BY_GRADIENT, MAXIMUM_LIKELIHOOD, MOST_FOR_STARTS, noise_by_gradient
 from tuning.search.local import is_local, near
@@ -30,7 +33,6 @@ from tuning.search.trials import NIS
 
 # Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
 RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
-NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
 BASELINE = "baseline"  # the name of the baseline that the trial is
 MOST_RESCALINGS = 2  # nonlinear filters may need a second one
 MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is tried with all else of the best one
@@ -64,12 +66,11 @@ def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
         if best is not None:
             _enqueue_maximum_likelihood(study, plan, best.params)
             _enqueue_minimum(study, plan, best.params)
-    count = len(plan.filter_types)
-    if count > 1 and ends_a_round(last.number + 1, count):
-        enqueue_transferred_noise(study)
+    if len(plan.filter_types) > 1 and ends_a_round(plan, study.get_trials(deepcopy=False), last):
+        enqueue_transferred_noise(study, plan)
     enqueue_next_type(study, plan)
     if is_local(plan, last.number):
-        _enqueue_near(study, plan, last.number)
+        (enqueue_near_in_race if is_race(plan) else _enqueue_near)(study, plan, last.number)
 
 
 def _enqueue_near(study: optuna.Study, plan: Plan, number: int) -> None:

@@ -16,8 +16,8 @@ MOVED = 0.5  # probability that a number is moved
 
 
 def is_local(plan: Plan, number: int) -> bool:
-    """Whether the trial after this number is to be near the best: "tpe" with one objective and filter type."""
-    return plan.sampler == "tpe" and len(plan.objectives) == len(plan.filter_types) == 1 and number % 2 == 1
+    """Whether the trial after this number is to be near the best: every second one of "tpe" with one objective."""
+    return plan.sampler == "tpe" and len(plan.objectives) == 1 and number % 2 == 1
 
 
 def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, number: int) -> dict:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import optuna
@@ -15,6 +14,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
+from tuning.search.among_types import choose_type_by_race, is_race
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_after, enqueue_what_is_left
 from tuning.search.interruption import stop_on_interrupt
@@ -115,11 +115,16 @@ def open_study(
     _check_identity(name, plan.identity, study.user_attrs.get("identity", plan.identity))
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
+    ranges = plan.first_ranges()
+
+    def sampler_of(worker: int) -> optuna.samplers.BaseSampler:
+        sampler = make_sampler(plan.sampler, plan.seed, present, space, worker, ranges)
+        return choose_type_by_race(sampler, plan) if is_race(plan) else sampler
+
     if worker:
-        study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker, plan.first_ranges())
+        study.sampler = sampler_of(worker)
     else:
-        make = partial(make_sampler, plan.sampler, plan.seed, present, space, first=plan.first_ranges())
-        give_sampler(study, lambda worker: make(worker=worker), present)
+        give_sampler(study, sampler_of, present)
     if not present:
         study.set_user_attr("identity", plan.identity)
         if start is not None:
