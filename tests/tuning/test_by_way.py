@@ -18,7 +18,8 @@ from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.space import untuned_choice
+from tuning.search.space import given_choice, untuned_choice
+from tuning.ways.lagged import stationary, steady_gain
 from tuning.ways.registry import WAYS, find_way
 from tuning.ways.task import Budget, Task
 
@@ -148,12 +149,55 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
     problem, options = singular(first_scored_step=50), {"trials": 3, "progress": False}
     storage = tmp_path / "studies.journal"
     study = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
-    assert same_filter(study.choice, untuned_choice("kf", problem))
+    assert same_filter(study.choice, given_choice("kf", problem))
     refused = study.tuning.way.refused
     assert refused.found > refused.given == pytest.approx(study.tuning.result.best_value)
     again = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
     for one in (study, again):
         assert f"worse on these ({refused.found:.4g} for {refused.given:.4g})" in one.tuning.chosen[0]
+
+
+@pytest.mark.parametrize("options", [{}, {"hold_r": True}])
+def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypatch, options):
+    keeps_the_rule_of_thumb = WAYS["scoring"]._replace(follow=lambda task: None)
+    monkeypatch.setitem(WAYS, "scoring", keeps_the_rule_of_thumb)
+    problem = singular(first_scored_step=50)
+    study = tuning.tune(problem, "kf", way="scoring", trials=2, progress=False, **options)
+    own, found = given_choice("kf", problem).model, study.choice.model
+    r = (untuned_choice("kf", problem).model if options else own)["measurement_noise_cov"]
+    np.testing.assert_array_equal(found["process_noise_cov"], own["process_noise_cov"])
+    np.testing.assert_array_equal(found["measurement_noise_cov"], r)
+    refused = study.tuning.way.refused
+    assert refused.given < refused.found and "so what was given is chosen" in study.tuning.chosen[0]
+
+
+@pytest.mark.parametrize(("way", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])
+def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, way, options):
+    rng = np.random.default_rng(0)
+    model = affine_model(
+        a=[[0.9]],
+        b=np.zeros((1, 0)),
+        c=[[1.0], [1.0]],
+        process_noise_cov=[0.01],
+        measurement_noise_cov=[0.04, 0.09],
+        prior_mean=[0.0],
+        prior_cov=[0.1],
+    )
+    runs = [{"measurements": np.column_stack([rng.normal(size=20), np.full(20, np.nan)])} for _ in range(4)]
+    problem = RunsProblem(runs, model, held_out=[2, 3], name="half of it")
+    task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options})
+    WAYS[way].run(way, task)
+    before, after = (
+        np.asarray(one.filter(problem).model.measurement_noise_cov) for one in (task.start, task.best)
+    )
+    assert after[1, 1] == pytest.approx(before[1, 1]) and after[0, 0] > 2 * before[0, 0]
+
+
+def test_ways_by_lags_refuse_a_filter_whose_errors_do_not_decay():
+    linear_model = stationary(singular().model(), "driven", "als")
+    with pytest.raises(ValueError, match="an eigenvalue of A - A L C is 1: its errors do not decay") as refused:
+        steady_gain(linear_model, np.zeros((2, 2)), np.eye(1))
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.slow

@@ -10,14 +10,22 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from filters.registry import filter_type
-from tuning.evaluation.baselines import noise_estimated
+from tuning.evaluation.baselines import noise_estimated, same_filter
 from tuning.likelihood.goal import OF_STATES
 from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
 from tuning.search.parameters import R
 from tuning.search.plan import Plan
-from tuning.search.space import AUTO, Choice, trial_parameters, untuned_choice, within_ranges
+from tuning.search.space import (
+    AUTO,
+    Choice,
+    given_choice,
+    oracle_choice,
+    trial_parameters,
+    untuned_choice,
+    within_ranges,
+)
 from tuning.search.study import FINISHED, OnTrial, StudyResult
 from tuning.search.trials import run_trial
 from tuning.ways.registry import WAYS, find_way
@@ -67,7 +75,7 @@ def follow(
         given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
         passes = sum(len(one.seeds) for one in data)
         given["budget"] = Budget(trials * passes) if find_way(name).by_trials else Budget()
-        task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), **given)
+        task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), given=_given(plan), **given)
         task.seed, task.stop = plan.seed, interrupted
         find_way(name).run(name, task)
         stopped = interrupted()
@@ -101,6 +109,17 @@ def _start(plan: Plan, name: str) -> Choice | None:
     return found._replace(model={**found.model, R: r})
 
 
+def _given(plan: Plan) -> Choice | None:
+    """The model's own numbers; None if there are none, or if they are the plant's, which no study knows."""
+    problem = plan.scenarios[0]
+    own, true = given_choice(plan.filter, problem), oracle_choice(plan.filter, problem)
+    if own is None or (true is not None and same_filter(own, true)):
+        return None
+    if plan.hold_r and R in own.model:
+        own = own._replace(model={**own.model, R: untuned_choice(plan.filter, problem).model[R]})
+    return own
+
+
 def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
     """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
     answer = study.user_attrs[ANSWER]
@@ -121,7 +140,7 @@ def way_sentence(found: Followed, word: str) -> str:
     worse = ""
     if found.refused is not None:
         given, answer = found.refused
-        worse = f" Its answer is worse on these ({answer:.4g} for {given:.4g}), so the start is chosen."
+        worse = f" Its answer is worse on these ({answer:.4g} for {given:.4g}), so what was given is chosen."
     return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
 
 

@@ -26,12 +26,12 @@ def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
         found: list[tuple[np.ndarray, np.ndarray]] = []
         for place, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
             for index in range(len(data.seeds)):
-                model = task.model(task.start, place).replace(process_noise_cov=q, measurement_noise_cov=r)
                 try:
+                    model = task.model(task.start, place).replace(process_noise_cov=q, measurement_noise_cov=r)
                     q, r = _means(make_filter(name, model, **numbers), data.one(index))
                 except ValueError:  # a belief that is none
                     raise ValueError(
-                        f"way {name!r} failed: it took Q or R to zero after {len(found)} runs"
+                        f"way {name!r} failed: its Q or R is no covariance after {len(found)} runs"
                     ) from None
                 task.charge(1)
                 found.append((q, r))

@@ -97,9 +97,10 @@ def counts_of(task: Task) -> tuple[int, np.ndarray]:
 
 
 def _step(goal: Goal, point: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, float]:
-    """Coordinates after a step, which are logarithms, and log L before it."""
+    """Coordinates after a step, which are logarithms, and log L before it; a variance of no terms stays."""
     found = goal(point)
-    factors = 1.0 + 2.0 / counts * found.gradients.sum(axis=0)
+    slopes = found.gradients.sum(axis=0)
+    factors = 1.0 + np.divide(2.0 * slopes, counts, out=np.zeros_like(slopes), where=counts > 0)
     after = point + np.log(np.maximum(factors, LEAST))
     return np.clip(after, goal.coordinates.low, goal.coordinates.high), float(found.values.sum())
 
@@ -127,6 +128,8 @@ def _full(task: Task, goal: Goal) -> None:
 
 
 def _moved(cov: np.ndarray, slope: np.ndarray, count: int, full: bool) -> np.ndarray:
+    if not count:
+        return cov
     step = 2.0 / count * (cov @ slope @ cov if full else np.diag(np.diag(cov) ** 2 * np.diag(slope)))
     after = cov + 0.5 * (step + step.T)
     floor = LEAST * np.diag(cov)

@@ -17,6 +17,7 @@ from tuning.ways.task import Task
 LAGS = 15
 DROPPED = 100  # rows at the beginning, at most a fifth of a run
 ITERATIONS = 3  # the gain of each is that of the Q and R found before
+LEAST_DECAY = 1e-9  # of an error in a step
 ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
 LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
 
@@ -107,12 +108,18 @@ def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
 
 def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """The gain L (n, m) of the stationary Kalman filter."""
+    rule = "ways by lagged covariances need a model with a stationary filter"
     try:
-        return steady_state(linear.a, linear.c, q, r)[1]
+        gain = steady_state(linear.a, linear.c, q, r)[1]
     except np.linalg.LinAlgError as error:
+        raise ValueError(f"{rule}, but {error}") from None
+    radius = float(abs(np.linalg.eigvals(linear.a - linear.a @ gain @ linear.c)).max())
+    if radius >= 1.0 - LEAST_DECAY:
         raise ValueError(
-            f"ways by lagged covariances need a model with a stationary filter, but {error}"
-        ) from None
+            f"{rule}, but an eigenvalue of A - A L C is {radius:.9g}: its errors do not decay; "
+            "give Q noise in each state that does not decay by itself"
+        )
+    return gain
 
 
 def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:

@@ -74,6 +74,7 @@ class Task:
         objective: what ways that search minimise; the score, or without truth the likelihood, if None.
         budget: what the way may take.
         start: where it begins; the rule of thumb if None.
+        given: what one had before, than which an answer must not be worse, as than the start.
         seed: of a way's own random numbers.
     """
 
@@ -87,6 +88,7 @@ class Task:
         objective: str | None = None,
         budget: Budget = Budget(),  # noqa: B008 - a value that nothing changes
         start: Choice | None = None,
+        given: Choice | None = None,
         seed: int = 0,
     ):
         """Begin with the start."""
@@ -95,7 +97,7 @@ class Task:
         self.data = (data,) if isinstance(data, Data) else tuple(data)
         self.options = dict(options or {})
         self.objective = objective or (SCORE if self.has_truth else LIKELIHOOD)
-        self.budget, self.seed = budget, seed
+        self.budget, self.given, self.seed = budget, given, seed
         self.stop: Callable[[], bool] = lambda: False  # whether somebody asked for an end
         self.start = untuned_choice(filter_name, self.problems[0]) if start is None else start
         self.runs, self._excluded = 0.0, 0.0
@@ -177,17 +179,22 @@ class Task:
             raise Spent
 
     def refuse_worse(self) -> None:
-        """Return to the start where the best is worse on the same runs, by the objective and by the likelihood."""
-        if same_filter(self.best, self.start):
-            return
+        """Return to what was given if the best is worse on the same runs, by objective and likelihood."""
+        before = [self.start] if self.given is None else [self.start, self.given]
+        given = [one for one in before if not same_filter(one, self.best)]
+        names = self.objective, LIKELIHOOD
         with self.uncounted():
-            values = {
-                name: [self._value(one, name, self.data) for one in (self.start, self.best)]
-                for name in {self.objective, LIKELIHOOD}
-            }
-        if all(not found <= given + ROUNDING * abs(given) for given, found in values.values()):
-            self.kept.append(Kept(self.runs, self.seconds, self.start))
-            self.refused = Refused(*values[self.objective])
+            found = [self._value(self.best, name, self.data) for name in names]
+            values = [[self._value(one, name, self.data) for name in names] for one in given]
+        worse = [
+            (scores[0], i)
+            for i, scores in enumerate(values)
+            if all(not new <= old + ROUNDING * abs(old) for new, old in zip(found, scores, strict=True))
+        ]
+        if worse:
+            least, i = min(worse, key=lambda one: math.inf if math.isnan(one[0]) else one[0])
+            self.kept.append(Kept(self.runs, self.seconds, given[i]))
+            self.refused = Refused(least, found[0])
 
     @contextmanager
     def uncounted(self) -> Iterator[None]:

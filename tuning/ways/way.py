@@ -69,7 +69,7 @@ class Way(NamedTuple):
         """Follow the way until it is done or the budget spent; ValueError if the task lacks what it needs.
 
         What it found is `task.best`, and what it would have found for less is `task.kept`. What is worse than the
-        start by the task's objective is not the answer: the start is (`task.refused`).
+        start or the model's own numbers is not the answer: these are (`task.refused`).
         """
         self.check(name, task)
         try:
