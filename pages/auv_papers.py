@@ -50,11 +50,10 @@ def members() -> str:
                 _row(scores.rmse("full")),
                 with_interval(scores.nees_interval),
                 f"{printed.seconds:g}" if printed else "",
-                digits(scores.seconds.mean()) if scores.seconds.any() else "",
             ]
         )
-    rows.append(["bound", "", "", _row(iv.bound.pose), "", "", ""])
-    return table(["", "published", "by yaw alone", "full", "NEES", "s, published", "s, ours"], rows)
+    rows.append(["bound", "", "", _row(iv.bound.pose), "", ""])
+    return table(["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
 
 
 def velocities() -> str:
@@ -78,7 +77,6 @@ def paths() -> str:
         places = [POSE.index(name) for name in names]
         errors = [_row(one.scores.rmse(field)[places]) for field in ("planar", "planar_both", "full")]
         printed = one.printed
-        spent = digits(one.scores.seconds.mean()) if one.scores.seconds.any() else ""
         rows.append(
             [
                 f"{one.path} ({', '.join(names)})",
@@ -86,11 +84,10 @@ def paths() -> str:
                 _row(printed.rmse.values()) if printed else "",
                 *errors,
                 f"{printed.seconds:.3g}" if printed else "",
-                spent,
                 one.why,
             ]
         )
-    columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published", "s, ours"]
+    columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published"]
     return table([*columns, "why they differ"], rows)
 
 

@@ -85,8 +85,14 @@ def way_out(tuning: Tuning) -> list[str]:
         next(iter(comparison.ratios.items())) for comparison in tuning.comparisons if comparison.tuned.has_truth
     ]
     worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
-    if not worse or tuning.gradient is not None or tuning.way is not None:
+    if not worse:
         return []
+    if tuning.gradient is not None or tuning.way is not None:
+        option = "--way" if tuning.way is not None else "--method gradient"
+        return [
+            f"What to take: the {worse[0]}, whose Q and R are in the table. The same command without {option} "
+            "runs a study, which ends with the best baseline if no trial is better."
+        ]
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
     pruning += ", or maximum likelihood (--method gradient)" if has_gradient(tuning.plan.filter) else ""
     return [

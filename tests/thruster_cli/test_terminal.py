@@ -204,8 +204,11 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     )
     (said,) = way_out(tuning)
     assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
+    by_way = SimpleNamespace(**{**vars(tuning), "way": "likelihood"})
+    (said,) = way_out(by_way)
+    assert said.startswith("What to take: the scaled default, ") and "without --way runs a study" in said
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
-    assert way_out(tuning) == []
+    assert way_out(tuning) == way_out(by_way) == []
 
 
 def test_a_study_that_is_done_shows_its_best_and_no_time_left():

@@ -18,6 +18,7 @@ from tuning.identification import identify, profile_figure, profiles, validate
 from tuning.identification.family import ModelFamily, with_ranges
 from tuning.identification.result import covariance
 from tuning.identification.runs import runs_of
+from tuning.identification.validation import fall_sentence
 from tuning.identification.values import read_values, with_values, write_values
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
@@ -169,6 +170,9 @@ def test_a_profile_falls_as_the_standard_error_says(found, tmp_path):
 def test_held_out_runs_prove_the_model(found):
     checked = validate(found, recorded(4, first=50))
     assert checked["identified"].log_likelihood > checked["start"].log_likelihood + 50
+    assert fall_sentence(checked) == []
+    (said,) = fall_sentence({"start": checked["identified"], "identified": checked["start"]})
+    assert said.startswith("On the held-out runs the log-likelihood fell by ")
     assert checked["identified"].nis == pytest.approx(1.0, abs=0.1)
     assert checked["identified"].one_step["w"] < checked["start"].one_step["w"]
     assert set(checked["identified"].fit) == {"a", "w"}

@@ -9,7 +9,10 @@ import optuna
 import pytest
 import sqlalchemy
 from optuna.trial import TrialState
+from rich.console import Console
 
+from tuning.api.run import run_tuning
+from tuning.problems.find import find_problem
 from tuning.search import database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
@@ -122,6 +125,23 @@ def test_patience_has_an_end(flaky, monkeypatch):
         pytest.raises(ValueError, match="a database must answer within 1 s, but got: connection lost"),
     ):
         study.set_user_attr("a", 1)
+
+
+def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
+    with pytest.raises(
+        ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in the"
+    ):
+        open_storage("postgresql+pg8000://host/s")
+
+
+def test_several_workers_on_sqlite_are_warned(monkeypatch):
+    monkeypatch.setattr("tuning.api.run.checked", lambda plan: open_storage(""))  # ends here
+    plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
+    with (
+        pytest.warns(UserWarning, match="so 2 workers wait for each other"),
+        pytest.raises(ValueError, match="stor"),
+    ):
+        run_tuning(plan, 3, console, "sqlite:///s.db", workers=2)
 
 
 def test_a_proxy_must_have_a_host():

@@ -124,6 +124,12 @@ def run_tuning(
             f"workers must be 1 without a storage that they share, such as "
             f"storage='studies.journal', but got {workers}"
         )
+    if workers > 1 and str(storage).startswith("sqlite"):
+        warnings.warn(
+            f"SQLite locks the whole database for each write, so {workers} workers wait for each other: a journal "
+            "file is faster on one host, and several hosts need a server (docs/workers.md)",
+            stacklevel=2,
+        )
     name = name or name_of(plan, by_gradient, way)
     if not isinstance(name, str) or "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {short_repr(name)}")

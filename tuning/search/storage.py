@@ -18,6 +18,7 @@ from thruster_env.numerics.checks import short_repr
 from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
 from tuning.search.storage_url import first_line, is_misspelt, public_url, without_secrets
 
+DRIVER = "pip install '.[db]' in the project's folder, and postgresql+psycopg2:// in the URL"
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
 PROCESS, RETRY_OF = (
@@ -44,6 +45,8 @@ def open_storage(storage: Any) -> BaseStorage:
             return open_database(storage, retry_once)
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like
             reason = without_secrets(first_line(error), storage)
+            if isinstance(error, ImportError) and storage.startswith("postgresql"):
+                reason = f"{reason.rstrip('.')}: {DRIVER}"
             raise ValueError(
                 f"storage must be a database that can be reached, but got {public_url(storage)}: {reason}"
             ) from None

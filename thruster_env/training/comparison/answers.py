@@ -40,8 +40,8 @@ def _goal(groups: Groups) -> Iterator[str]:
         least = min(parts, key=lambda value: value.low)
         said = "reached" if least.low >= GOAL else "not reached by all, intervals counted"
         yield (
-            f"PPO on filtered state closes at least {percent(least)} of the gap between PPO on raw measurements "
-            f"and {name_of(BEST, 'true')}; the aim of {100 * GOAL:.0f} % is {said}."
+            f"At medium noise PPO on filtered state closes at least {percent(least)} of the gap between PPO on "
+            f"raw measurements and {name_of(BEST, 'true')}; the aim of {100 * GOAL:.0f} % is {said}."
         )
 
 
