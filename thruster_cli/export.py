@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -62,7 +62,7 @@ def command(
     check_targets((out / "README.md",), json, read=(file,))
     choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
     filter_ = choice.filter(found)
-    options = {"single": single, "monitor": watch, "board": board, "dt": found.dt}
+    options: dict[str, Any] = {"single": single, "monitor": watch, "board": board, "dt": found.dt}
     files = [str(one) for one in write_project(filter_, out, name, **options)]
     lines, error = [f"wrote {one}" for one in files], None
     if single:

@@ -177,7 +177,14 @@ def _damage(
         for one in each
         if len(offsets[kind]) and struct.calcsize(one.form.msg_struct) + HEADER != one.form.len
     )
+    unnamed = (
+        one.form.name
+        for kind, each in formats.items()
+        for one in each
+        if len(offsets[kind]) and sum(map(bool, one.form.columns)) != len(one.form.format)
+    )
     some += [f"the format of {name!r} is not as long as its messages" for name in unlike]
+    some += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
     some += [f"{nameless} messages of the log have no format"] * (nameless > 0)
     some += ["the log is cut off: its last message is not whole"] * (after < 0)
     some += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST or not is_rest)
