@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from filters.pages.traced import MOST, Traced
-from filters.tensors.graphs import order_of, values_of
+from filters.tensors.graphs import order_of, values_of, with_finite_slope
 from filters.tensors.stages import Equation
 from thruster_env.numerics.algebra.graphs import Graph, Number
 from thruster_env.numerics.sources import is_array
@@ -88,6 +88,22 @@ class _NoNumberAsked(TorchFunctionMode):
         return function(*arguments, **(named or {}))
 
 
+ROOTS = {name: name for name in ("sqrt", "hypot", "arcsin", "arccos", "arccosh", "arctan2", "pow")}
+ROOTS |= {"asin": "arcsin", "acos": "arccos", "acosh": "arccosh", "atan2": "arctan2", "__pow__": "pow"}
+"""Functions of torch whose slope is infinite or NaN where they are finite: a root at zero."""
+
+
+class _FiniteSlopes(TorchFunctionMode):
+    """Within this context a root at zero has no slope, as in a graph; autograd's is infinite, and makes NaN."""
+
+    def __torch_function__(self, function, types, arguments=(), named=None):
+        name = ROOTS.get(getattr(function, "__name__", ""))
+        tensors = [one for one in arguments if isinstance(one, Tensor)]
+        if name is None or named or not all(one.is_floating_point() for one in tensors):
+            return function(*arguments, **(named or {}))
+        return with_finite_slope(name, function, arguments)
+
+
 class Called:
     """An equation whose function takes tensors (...,) in the places of floats."""
 
@@ -130,7 +146,9 @@ class Called:
             if function in self._unproven:
                 self._prove(function, parts)  # which is refused at each call, or passes once
                 self._unproven.discard(function)
-            return stacked(function(states, *inputs, self._constants(c)), parts)
+            with _FiniteSlopes():
+                found = function(states, *inputs, self._constants(c))
+            return stacked(found, parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise ValueError(
                 f"{self._name} must accept tensors, or consist of arithmetic without branches, but raised "

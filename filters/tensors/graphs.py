@@ -42,6 +42,7 @@ HAS_SLOPE: dict[str, Callable] = {
     "log1p": lambda x: x > -1.0,
     **dict.fromkeys(("log2", "log10"), lambda x: x > 0.0),
     "arccosh": lambda x: x > 1.0,
+    **dict.fromkeys(("arcsin", "arccos"), lambda x: abs(x) != 1.0),
     "arctanh": lambda x: abs(x) < 1.0,
     **dict.fromkeys(("exp", "expm1", "exp2"), lambda x: torch.isfinite(torch.exp(x))),
     **dict.fromkeys(("sinh", "cosh"), lambda x: torch.isfinite(torch.cosh(x))),
@@ -57,11 +58,12 @@ def _divisor(one: Number) -> Number:
     return one.of[-1 if one.operation == "/" else 0]
 
 
-def _with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor]) -> Tensor:
+def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
     """The result of an operation; a constant where it has no finite slope."""
-    has_slope = HAS_SLOPE[operation](*(a.detach() for a in arguments))
-    moving = function(*(torch.where(has_slope, a, 1.0) for a in arguments))
-    return torch.where(has_slope, moving, function(*(a.detach() for a in arguments)))
+    known = [a.detach() if isinstance(a, Tensor) else a for a in arguments]
+    has_slope = HAS_SLOPE[operation](*known)
+    moving = function(*(torch.where(has_slope, a, 1.0) if isinstance(a, Tensor) else a for a in arguments))
+    return torch.where(has_slope, moving, function(*known))
 
 
 def order_of(wanted: Sequence[Number]) -> list[Number]:
@@ -93,7 +95,7 @@ def values_of(
             values[one.place] = one.value if like.dtype == torch.float64 else as_single(one.value)
         elif one.operation in HAS_SLOPE and not (one.operation in OF_ZERO and _divisor(one).sign == POSITIVE):
             function = WORK.get(one.operation) or getattr(torch, one.operation)
-            values[one.place] = _with_finite_slope(one.operation, function, [*map(tensor, arguments)])
+            values[one.place] = with_finite_slope(one.operation, function, [*map(tensor, arguments)])
         elif one.operation in WORK:
             values[one.place] = WORK[one.operation](*arguments)
         else:

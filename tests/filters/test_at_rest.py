@@ -128,3 +128,24 @@ def test_tensors_have_finite_derivatives_at_rest(make):
     )
     (means**2).sum().backward()
     assert torch.isfinite(q.grad).all() and torch.isfinite(c.grad).all() and c.grad.any()
+
+
+def drag_of_tensors(x, u, c):
+    """The same for torch, whose root at rest has an infinite slope."""
+    speed = torch.sqrt(x[2] * x[2] + x[3] * x[3])
+    low = (x[2] ** 2) ** 0.5 + torch.hypot(x[2], x[3]) + torch.atan2(x[2], x[3]) * torch.acos(1.0 + 0.0 * x[3])
+    ahead, abeam = (DT * (u[k] - (c[0] + 0.0 * low) * speed * x[2 + k]) for k in range(2))
+    return x[0] + DT * x[2], x[1] + DT * x[3], x[2] + ahead, x[3] + abeam
+
+
+def test_functions_of_tensors_have_finite_slopes_at_rest():
+    inputs, z = simulated(at_rest(), 5, count=2, level=2.0)
+    filter_ = make_filter("ekf", at_rest())
+    graph, given = filters.torch(filter_), filters.torch(filter_, transition=drag_of_tensors)
+    found = []
+    for one in (graph, given):
+        c = torch.tensor([0.3], dtype=torch.float64, requires_grad=True)
+        estimates = one.replace(constants=c).run(inputs, z)
+        assert not estimates.divergences.any()
+        found.append((estimates.means.detach(), torch.autograd.grad(estimates.log_likelihoods.sum(), c)[0]))
+    torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)

@@ -100,7 +100,8 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
     Args:
         function: an analytic function of a tuple of `columns` components and the arguments, made of arithmetic and
             numpy functions that take complex numbers. (`abs`, comparisons and `math` are not among them: `abs`
-            would silently give a wrong derivative.)
+            would silently give a wrong derivative.) An entry with a root at zero is 0 as a whole, also that of
+            x - sqrt(x), of which a traced function has the slope 1.
         rows: number of components of its result.
         columns: number of components of x.
         arguments: names of the other arguments, comma separated.
