@@ -1,5 +1,6 @@
 """Two `tune` processes on one journal: at most one trial more than asked for, and none is left waiting."""
 
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import tuning
 from tests.tuning.test_study import PLAN
 from tuning.search.storage import PROCESS, drop_waiting, open_storage
 from tuning.search.study import finished_trials, open_study, run_trials
+from tuning.search.workers import run_in_workers
 
 FINISHED = {TrialState.COMPLETE, TrialState.PRUNED}
 
@@ -69,6 +71,30 @@ def test_a_trial_that_another_process_has_begun_is_not_dropped(tmp_path):
     drop_waiting(study)
     assert [one.state for one in study.trials] == [TrialState.RUNNING, TrialState.FAIL, TrialState.FAIL]
     assert trial.number == 0
+
+
+def after_a_kill(path):
+    """A finished study with a trial that a killed process ran, and one that it enqueued."""
+    study = open_study("s", PLAN, open_storage(path))
+    for _ in range(2):
+        study.tell(study.ask(PLAN.space()), 1.0)
+    study.ask(PLAN.space()).set_user_attr(PROCESS, f"{os.uname().nodename}:{2**22 + 1}")
+    study.enqueue_trial({})
+    return study
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_killed_process_leaves_no_trial_in_a_finished_study(as_python, tmp_path, monkeypatch, workers):
+    path, data = str(tmp_path / "j"), PLAN.training_data()
+    study = after_a_kill(path)
+    if workers == 1:
+        run_trials(open_study("s", PLAN, open_storage(path)), PLAN, data, 2)
+    else:
+        nothing = [sys.executable, "-c", ""]
+        monkeypatch.setattr("tuning.search.workers.start", lambda *_: subprocess.Popen(nothing))
+        run_in_workers(study, PLAN, data, 2, lambda *_: None, storage=path, workers=workers)
+    states = [one.state for one in study.get_trials(deepcopy=False)]
+    assert states.count(TrialState.COMPLETE) == 2 and set(states) == {TrialState.COMPLETE, TrialState.FAIL}
 
 
 @pytest.mark.slow

@@ -272,9 +272,14 @@ def run_trials(
         on_trial: called after each trial with the study and the number of finished trials.
         stop: asked before the first and after each trial whether to end.
         on_choice: called with the choice of each trial.
-        drops_waiting: whether trials that two processes enqueued at once, and nobody needs, are failed at the end.
+        drops_waiting: whether enqueued trials that nobody needs, of two processes or a killed one, are failed at
+            the end.
     """
-    if stop() or finished_trials(study) >= trials:
+    if stop():
+        return False
+    if finished_trials(study) >= trials:
+        if drops_waiting:
+            drop_waiting(study)
         return False
     space, beside_others = plan.space(), False
 

@@ -20,7 +20,7 @@ from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.plan import Plan
 from tuning.search.processes import close_input, end, orders_of, parent_says_stop, plan_of, read_orders, start
-from tuning.search.storage import open_storage, retry_orphans, this_process
+from tuning.search.storage import drop_waiting, open_storage, retry_orphans, this_process
 from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
 
 MODULE = "tuning.search.workers"
@@ -73,6 +73,8 @@ def run_in_workers(
         for process in processes.values():
             end(process)
         retry_orphans(study)
+        if finished_trials(study) >= trials:
+            drop_waiting(study)
 
 
 def _watch(
