@@ -173,9 +173,9 @@ def command(
     chosen.
 
     RMSE alone barely determines Q and R: only their ratio affects the estimate. The study therefore keeps the mean
-    NIS in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score; if it costs
-    more, it chooses the trial with the best log score among the best ones. If no trial is in the band, it chooses
-    the one with the least error, the report and the file say so, and the exit code is 3.
+    NIS in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score. With true
+    states it chooses the trial with the best log score among those within 5 % of the least error. If no trial is
+    in the band, the report and the file say so, and the exit code is 3.
 
     --way selects a published method instead; its samplers end after --trials trials, the other methods by their
     own criterion. With a right model and true states use noise-estimation. With true states use log-score if the

@@ -231,6 +231,7 @@ def as_json(tuning: Tuning) -> dict:
         "best_training_value": result.best_value,
         "best_training_value_without_consistency": result.free_value,
         **consistency(result),
+        "warnings": list(tuning.warnings),
         "blows_up": blown_up(tuning),
         "interrupted": result.interrupted,
         "sizes": [

@@ -1,12 +1,17 @@
 """Baselines: what was given, the rule of thumb, the scaled default, noise estimation and the oracle."""
 
+import json
+
 import numpy as np
 import pytest
 
+from filters import make_filter, run
+from filters.consistency.intervals import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair, thruster
+from thruster_env.numerics.compiled import interpreted
 from thruster_env.studies import lorenz63
 from thruster_env.studies.benchmark import noise_free_problem
 from tuning.evaluation.baselines import (
@@ -28,9 +33,11 @@ from tuning.evaluation.baselines import (
     same_filter,
 )
 from tuning.evaluation.compare import contender
+from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.residuals import noise_estimation, residuals
-from tuning.evaluation.worth import worth
+from tuning.evaluation.summary import summarised, summary
+from tuning.evaluation.worth import warnings_of, worth
 from tuning.problems.parameter import Parameter
 from tuning.reporting.gains import gains
 from tuning.search.correlations import correlations_of, full_covariance
@@ -103,6 +110,32 @@ def test_noise_estimation_finds_the_noise_of_a_simulation_and_what_a_model_lacks
     assert abs(noise_estimation(biased).measurement_mean[0]) < 0.1
     assert noise_estimated("open-loop", problem) is None
     assert noise_estimation(LinearProblem(truth=False)).reason == "there is no truth"
+
+
+def test_a_headline_warns_of_a_nees_that_is_more_than_a_factor_of_three_off():
+    problem = LinearProblem(2, 2, scale=(0.3, np.inf))
+    data = problem.data(range(8))
+    noise = {"process_noise_cov": (2e-4, 2e-4), "measurement_noise_cov": (1e-3, 1e-3)}
+    with interpreted():
+        filters = [make_filter("kf", problem.model(**one)) for one in ({}, noise)]
+        good, bad = (evaluate(one, data, problem.scale) for one in filters)
+        found = run(filters[1], data.filter_keys, data.inputs, data.measurements)
+    errors, variances = (found.means - data.states)[:, 10:], np.einsum("btii->bti", found.covs)[:, 10:]
+    np.testing.assert_allclose(bad.state_nees, (errors**2 / variances).mean((0, 1)), rtol=1e-12)
+    assert warnings_of(good) == [] and list(bad.scored_nees) == ["p [m]"]
+    (said,) = warnings_of(bad)
+    assert said.startswith("Do not rely on the covariance, it is too small: the mean NEES is")
+    assert "where 2 is right, that of p" in said
+    singular = bad._replace(nees=Interval(219381.0, 0.0, 0.0), state_nees=np.array([1.2, 0.9]))
+    assert warnings_of(singular) == [
+        "Do not rely on the covariance, it is too small: the mean NEES is 219381 where 2 is right, that of p [m] "
+        "alone 1.2 where 1 is right. Each variance is about right: P is nearly singular, or its correlations are "
+        "wrong."
+    ]
+    again = summarised(json.loads(json.dumps(summary(bad))), problem)
+    assert warnings_of(again) == warnings_of(bad)
+    old = {name: value for name, value in summary(bad).items() if name != "state_nees"}
+    assert "of p" not in warnings_of(summarised(old, problem))[0]
 
 
 def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():

@@ -31,7 +31,17 @@ from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS,
 from tuning.search.ranges import at_ends, range_words
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.validation import Met, Validation, _best_of, _wins, as_data, choice_from, validate
+from tuning.search.validation import (
+    Met,
+    Validation,
+    _best_of,
+    _by_log_score,
+    _rescaled,
+    _wins,
+    as_data,
+    choice_from,
+    validate,
+)
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -110,6 +120,54 @@ def test_consistency_is_wanted_up_to_five_per_cent_and_then_the_proper_score_dec
     assert _best_of(plan, {"a": good, "b": costly, "c": close}, True) == ("c", pytest.approx(1.74))
     assert _best_of(plan._replace(consistent=False), {"a": good, "b": fair}, True) == ("a", None)
     assert _best_of(plan, {"a": good}, True) == ("a", None) and _best_of(plan, {}, True) == (None, None)
+
+
+def _with_truth(value, proper, nees=1.0, scatter=0.001):
+    """A filter on 50 runs whose objective and log score scatter by so much when a run is left out."""
+    apart = scatter * np.random.default_rng(0).standard_normal(50)
+    return Measured(value, (value * (1 + apart),), proper, (1.0,), (proper + apart,), nees, nees)
+
+
+def test_of_filters_within_five_per_cent_the_best_log_score_wins_and_none_is_worse_than_the_best_baseline():
+    plan = Plan("kf", (LinearProblem(),))
+    singular, right = _with_truth(0.956, -1e5, 5e4), _with_truth(1.0, -3.0, 9.4)
+    assert _by_log_score({"trial 1": singular, GIVEN: right}, "trial 1", GIVEN) == GIVEN
+    better, slower = _with_truth(0.94, -1e5, 5e4), _with_truth(1.004, -2.0, scatter=0.0)
+    assert _by_log_score({"trial 1": better, GIVEN: right}, "trial 1", GIVEN) == "trial 1"  # 6.4 % is too much
+    assert _by_log_score({GIVEN: right, NOISE: slower}, GIVEN, GIVEN) == NOISE  # 0.4 % is practically nothing
+    worse = _with_truth(1.03, -2.0, scatter=0.0)
+    assert _by_log_score({GIVEN: right, NOISE: worse}, GIVEN, GIVEN) == GIVEN
+    apart = (-3.01 + 0.02 * np.random.default_rng(1).standard_normal(50),)
+    unsure, close = _with_truth(0.99, -3.01)._replace(log_scores=apart), _with_truth(1.0, -3.0)
+    assert _by_log_score({"trial 1": unsure, GIVEN: close}, "trial 1", GIVEN) == "trial 1"
+    wrong = unsure._replace(state_nees=0.2)
+    assert _by_log_score({"trial 1": wrong, GIVEN: close}, "trial 1", GIVEN) == GIVEN
+    trials = {"a": singular, "b": _with_truth(0.96, -4.0), "c": _with_truth(1.2, -1.0)}
+    assert _best_of(plan, trials, True, right)[0] == "b" and _best_of(plan, trials, True, right)[1] == 0.0
+    # Of trials that are better than the best baseline: "d" has the best log score, but does not differ from it.
+    assert _best_of(plan, {**trials, "d": _with_truth(1.0, -2.0)}, True, right)[0] == "b"
+
+
+def test_a_rescaled_trial_has_the_estimates_of_the_trial_and_the_right_nees():
+    plan, data = Plan("kf", (LinearProblem(),)), [LinearProblem().data(range(20))]
+    noise = {"process_noise_cov": (2e-5,) * 3, "measurement_noise_cov": (1e-4,) * 2}
+    trial = untuned_choice("kf", LinearProblem())._replace(model=noise)
+    found = _rescaled({"trial 1": trial}, plan, data)
+    before, after = (measured(one, plan, data) for one in (trial, found["trial 1 rescaled"]))
+    assert before.nees > 100.0 and after.nees == pytest.approx(1.0, rel=0.1)
+    assert after.value == pytest.approx(before.value, rel=0.02) and after.proper > before.proper + 100.0
+    assert _rescaled({"trial 1": trial}, plan._replace(hold_r=True), data) == {}
+
+
+def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
+    plan, trial = Plan("kf", (LinearProblem(),)), _met("trial 3", 0.96, 0.95, 0.97, True, -1e5)
+    trial = trial._replace(nees=54845.0, state_nees=2.5)
+    given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(nees=2.35, state_nees=3.5)
+    met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, "trial 3")
+    (said,) = choice_sentences(json.loads(json.dumps(as_data(met))), plan)
+    assert met.gave_way and said.startswith("The given numbers are taken by the log score")
+    assert "1.042 times the score" in said and "that of trial 3 54845 times" in said
+    assert "NEES is 2.35 times its expected value (3.5 times in the farthest state)" in said
 
 
 def test_a_paired_ratio_has_the_interval_of_the_jackknife_and_covers_as_it_says():

@@ -20,7 +20,7 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
-from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.evaluation.worth import scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
@@ -118,7 +118,8 @@ class HeldOut:
         said = metrics(self.comparison)
         if not self.is_tuned:
             del said["tuned"]
-        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said}
+        warned = warnings_of(self.evaluation)
+        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said, "warnings": warned}
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
@@ -199,6 +200,7 @@ class HeldOut:
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         restarts = restart_sentences(self.evaluations)
+        restarts += [] if self.chosen else warnings_of(self.evaluation)  # which a study's sentences have
         if self.is_tuned:
             said = gains(self.comparison, self.problem.seed_word, self.name)
             return [*said, *model_doubts(self.problem, self.comparison), *restarts]

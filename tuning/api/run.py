@@ -18,6 +18,7 @@ from tuning.api.by_way import Followed, answered, check_way, follow, way_sentenc
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.worth import all_warnings
 from tuning.likelihood.family import check_gradient
 from tuning.likelihood.goal import OF_STATES
 from tuning.likelihood.gradient import GradientResult, tune_by_gradient
@@ -71,12 +72,18 @@ class Tuning(NamedTuple):
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """Which trial was chosen and what it replaced, in sentences; none for a choice by gradients."""
+        """Which trial was chosen and what it replaced, in sentences, and what to beware of in the result."""
+        warned = self.warnings
         if self.way is not None:
-            return (way_sentence(self.way, self.scenario.seed_word),)
+            return (way_sentence(self.way, self.scenario.seed_word), *warned)
         if self.gradient is not None:
-            return ()
-        return tuple(choice_sentences(as_data(self.result.validation), self.plan))
+            return warned
+        return (*choice_sentences(as_data(self.result.validation), self.plan), *warned)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to beware of in the tuned filter, on all scenarios: a covariance that is far off."""
+        return tuple(all_warnings(self.comparisons, self.plan.scenarios))
 
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""

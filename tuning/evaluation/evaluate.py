@@ -6,7 +6,7 @@ their expected values are the number of states and the number of measured channe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from tuning.problems.in_parts import estimates_in_parts
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)
+FARTHEST_NEES = 3.0  # factor on the expected mean NEES, beyond which a headline says so
 
 
 class Evaluation(NamedTuple):
@@ -61,6 +62,7 @@ class Evaluation(NamedTuple):
     nees_variance: float = np.nan  # variance over a run's steps, mean over runs, over its expected value, 2 n
     nis_variance: float = np.nan  # the same of the NIS; its expected value is 2 m where nothing is missing
     restarts: Restarts | None = None  # the first restart, and why; None if there is none
+    state_nees: np.ndarray | None = None  # (n,), means of e_i^2 / P_ii, expected value 1; NaN where there is none
 
     @property
     def has_truth(self) -> bool:
@@ -71,6 +73,23 @@ class Evaluation(NamedTuple):
     def scored(self) -> list[int]:
         """Indices of the scored states."""
         return np.flatnonzero(np.isfinite(self.scale)).tolist()
+
+    @property
+    def scored_nees(self) -> dict[str, float]:
+        """Mean e_i^2 / P_ii of each scored state by its label, expected value 1; empty if there is none."""
+        found = () if self.state_nees is None else self.state_nees.tolist()
+        return {self.states[i].short_label: found[i] for i in self.scored if found and not np.isnan(found[i])}
+
+
+def farthest(ratios: Iterable[float]) -> float:
+    """The ratio that is farthest from 1, up or down; NaN if there is none."""
+    known = [ratio for ratio in ratios if ratio >= 0.0]
+    return max(known, key=lambda ratio: abs(np.log(ratio)) if ratio else np.inf, default=np.nan)
+
+
+def is_beyond(ratio: float) -> bool:
+    """Whether a mean NEES over its expected value is off by more than a factor of three, up or down."""
+    return not 1.0 / FARTHEST_NEES <= ratio <= FARTHEST_NEES and not np.isnan(ratio)
 
 
 def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
@@ -154,6 +173,7 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
             "median_nees": np.nan,
             "mean_squares": np.full((len(data.measurements), n), np.nan),
             "scale": np.full(n, np.nan),
+            "state_nees": np.full(n, np.nan),
         }
     n, scale, weights = data.states.shape[-1], _checked(scale, data.states.shape[-1]), runs.weights
     found = without_interval(score(mean_squares, scale, weights))
@@ -172,6 +192,7 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
         "median_nees": float(np.nanmedian(nees)) if np.isfinite(nees).any() else np.nan,
         "mean_squares": mean_squares,
         "scale": scale,
+        "state_nees": None if runs.state_nees is None else pooled_mean(runs.state_nees, weights),
     }
 
 

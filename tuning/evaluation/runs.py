@@ -37,6 +37,7 @@ class RunMetrics(NamedTuple):
     output_mean_squares: Mapping[str, np.ndarray]  # (B, 1) each, by symbol
     counts: np.ndarray  # (B,), number of scored steps
     log_scores: np.ndarray | None = None  # (B, T), log N(x; x^, P); None if not wanted, NaN where there is none
+    state_nees: np.ndarray | None = None  # (B, n), means of e_i^2 / P_ii; NaN without the NEES
 
     @property
     def weights(self) -> np.ndarray | None:
@@ -54,7 +55,8 @@ def metrics_by_run(
 ) -> RunMetrics:
     """Metrics of a filter's estimates on some data, run by run, for the states that the plant has.
 
-    The NEES is NaN unless requested: for forty states it takes a tenth of the filter's own time. Errors of
+    The NEES, joint and of each state, is NaN unless requested: for forty states it takes a tenth of the filter's
+    own time. Errors of
     derived outputs are omitted unless requested; log scores are those of the states with a finite scale,
     and omitted without a scale.
     """
@@ -102,6 +104,7 @@ def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
         output_mean_squares={symbol: np.concatenate([one[symbol] for one in outputs]) for symbol in outputs[0]},
         counts=np.concatenate([one.counts for one in parts]),
         log_scores=_concatenated([one.log_scores for one in parts]),
+        state_nees=_concatenated([one.state_nees for one in parts]),
     )
 
 
@@ -151,15 +154,25 @@ def _against_truth(filter_: Filter, estimates: Estimates, data: Data, wanted: bo
     errors = state_errors(filter_, estimates, data)  # NaN where a step does not count
     n, late = errors.shape[-1], data.late
     late_errors = errors[:, late]
-    nees = np.full(late_errors.shape[:2], np.nan)
+    nees, state_nees = np.full(late_errors.shape[:2], np.nan), np.full((len(errors), n), np.nan)
     if wanted:
-        nees = normalized_squares(late_errors, estimates.covs[:, late, :n, :n])
+        covs = estimates.covs[:, late, :n, :n]
+        nees, state_nees = normalized_squares(late_errors, covs), _state_nees(late_errors, covs)
     mean_squares, start_up = _means(data, late_errors**2), errors[:, :FIRST_SCORED_STEP] ** 2
     return {
         "mean_squares": mean_squares,
         "start_up_squares": start_up,
         "nees": nees,
+        "state_nees": state_nees,
     }
+
+
+def _state_nees(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """Means (B, n) of e_i^2 / P_ii over the steps that have both, NaN of a state without a variance."""
+    variances = np.einsum("btii->bti", covs)
+    with np.errstate(all="ignore"):  # of a filter that has diverged
+        ratios = np.where(variances > 0.0, errors**2 / variances, np.nan)
+        return np.nansum(ratios, axis=1) / (~np.isnan(ratios)).sum(axis=1)
 
 
 def _sums(data: Data, values: np.ndarray) -> np.ndarray:

@@ -18,10 +18,11 @@ def summary(evaluation: Evaluation) -> dict:
     """The results of an evaluation as plain numbers for JSON, None if there is no value."""
     return {
         "rmse": [numbers(value) for value in evaluation.rmse],
-        "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
+        "start_up_rmse": _plain(evaluation.start_up_rmse),
         **{_key(evaluation.outputs[symbol]): numbers(one) for symbol, one in evaluation.output_rmse.items()},
         "score": numbers(evaluation.score),
         "nees": numbers(evaluation.nees),
+        "state_nees": _plain(evaluation.state_nees),
         "nis": numbers(evaluation.nis),
         "log_score": numbers(evaluation.log_score),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
@@ -54,6 +55,7 @@ def summarised(
         score=as_interval(data["score"]),
         output_rmse={symbol: as_interval(data[_key(quantity)]) for symbol, quantity in outputs.items()},
         nees=as_interval(data["nees"]),
+        state_nees=np.array([_number(part) for part in data.get("state_nees") or [None] * len(rmse)]),
         median_nees=_number(median_nees),
         nis=as_interval(data["nis"]),
         expected_nis=_number(expected_nis),
@@ -76,6 +78,11 @@ def numbers(value: Interval) -> list[float] | None:
 def as_interval(data) -> Interval:
     """An interval from plain numbers."""
     return NOTHING if data is None else Interval(*map(float, data))
+
+
+def _plain(values: np.ndarray | None) -> list[float | None]:
+    """An array as plain numbers, None in place of NaN."""
+    return [] if values is None else [None if math.isnan(part) else part for part in values.tolist()]
 
 
 def _restarts(data: Mapping | None) -> Restarts | None:

@@ -14,7 +14,15 @@ from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
 
 TOLERANCE = 1e-9  # relative: the effect of the order of a sum
-LATER = ("scaled", "scaled_default", "given", "noise", "log_score", "restarts")  # keys that older files lack
+LATER = (
+    "scaled",
+    "scaled_default",
+    "given",
+    "noise",
+    "log_score",
+    "restarts",
+    "state_nees",
+)  # keys that older files lack
 
 
 class Difference(NamedTuple):

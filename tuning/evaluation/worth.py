@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from math import isnan
 
 from filters.consistency.intervals import Interval, slightly, span
+from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, ORACLE, RULE, SCALED, called
+from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
+from tuning.problems.problem import Problem
 
 HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
 
@@ -37,6 +40,31 @@ def worth(comparison: Comparison, what: str = "the score") -> str:
         verb, by, much = gain(ratios[name], seeds, what).partition(" by ")
         parts.append((verb, f"{by}{much} against the {called(name)}".strip()))
     return _listed(parts)
+
+
+def warnings_of(evaluation: Evaluation) -> list[str]:
+    """What a headline warns of: a mean NEES, joint or of a scored state, more than a factor of three off."""
+    if not evaluation.has_truth:
+        return []
+    joint, n, states = evaluation.nees.value, len(evaluation.rmse), evaluation.scored_nees
+    far = {name: ratio for name, ratio in states.items() if is_beyond(ratio)}
+    if not far and not is_beyond(joint / n):
+        return []
+    said = [] if isnan(joint) else [f"{rounded(joint)} where {n} is right"]
+    if states:
+        most = farthest(states.values())
+        name = next(name for name, ratio in states.items() if ratio == most)
+        said.append(f"that of {name} alone {rounded(most)} where 1 is right")
+    remark = "" if far else " Each variance is about right: P is nearly singular, or its correlations are wrong."
+    size = "small" if farthest([joint / n, *states.values()]) > 1.0 else "large"
+    return [f"Do not rely on the covariance, it is too {size}: the mean NEES is {', '.join(said)}.{remark}"]
+
+
+def all_warnings(comparisons: Sequence[Comparison], problems: Sequence[Problem]) -> list[str]:
+    """The warnings of a tuned filter on all problems of a study."""
+    places = [f"{one.name}: " if len(problems) > 1 else "" for one in problems]
+    found = [warnings_of(comparison.tuned) for comparison in comparisons]
+    return [f"{place}{said}" for place, some in zip(places, found, strict=True) for said in some]
 
 
 def _likelihood_worth(comparison: Comparison) -> str:

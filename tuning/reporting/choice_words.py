@@ -5,6 +5,7 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
@@ -28,7 +29,7 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     if not found:
         return []
     met = {one["name"]: one for one in found["met"]}
-    candidate, baseline = found["candidate"], found["baseline"]
+    candidate, baseline, chosen = found["candidate"], found["baseline"], found["chosen"]
     likely = plan.objectives[0] in PROPER
     over, what = _over(met[candidate]["over"], likely), _what(plan)
     where = f"{len(_range(found['seeds']))} validation {plan.scenarios[0].seed_word}"
@@ -37,22 +38,24 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     best = f"the best baseline, the {called(baseline)}"
     if candidate == baseline:
         said = [f"The {called(baseline)} {_verb(baseline)} taken: every trial is the same filter as a baseline."]
+    elif found.get("by_error") and found["by_error"] != chosen:
+        said = [_log_score_sentence(met[chosen], met[found["by_error"]], where, what)]
     elif found["gave_way"]:
         said = [
             f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better ({candidate} "
             f"has {over} its {what})."
         ]
-        if baseline in FULL_NOISE:
-            said.append(
-                f"Your own parameters cannot express its Q and R; in {candidate} they are "
-                f"{_own(met[candidate], plan)}."
-            )
     elif _is_even(met[candidate]["over"], likely):
         said = [
             f"{_capital(candidate)} is taken: it has the same {what} as {best}, on {where}, and is consistent."
         ]
     else:
         said = [f"{_capital(candidate)} is taken: on {where} it has {over} the {what} of {best}."]
+    if candidate != chosen and chosen in FULL_NOISE:
+        said.append(
+            f"Your own parameters cannot express its Q and R; in {candidate} they are "
+            f"{_own(met[candidate], plan)}."
+        )
     if found["price"] is not None and found["price"] > MOST_PRICE:
         channels = len(plan.scenarios[0].quantities.measurements)
         said.append(_price_sentence(found, met[candidate], what, channels))
@@ -74,6 +77,28 @@ def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool)
         f"It would be {gained} with {matrices} of noise estimation, which your own parameters cannot express "
         f"({option}), on {where}."
     )
+
+
+def _log_score_sentence(taken: Mapping, by_error: Mapping, where: str, what: str) -> str:
+    """The filter that the log score decided for, beside the one of the least error."""
+    names = [_the(one["name"]) for one in (taken, by_error)]
+    ratio, gained = taken["value"] / by_error["value"], taken["proper"] - by_error["proper"]
+    nees = [_nees_words(one) for one in (taken, by_error)]
+    return (
+        f"{_capital(names[0])} {_verb(taken['name'])} taken by the log score, the log density at the true state: "
+        f"on {where} it is {gained:.3g} a step above that of {names[1]}, at {ratio:.3f} times the {what}. The "
+        f"mean NEES is {nees[0]}, that of {names[1]} {nees[1]}."
+    )
+
+
+def _nees_words(met: Mapping) -> str:
+    """The mean NEES over its expected value, joint and of the farthest state."""
+    joint, single = (math.nan if met.get(name) is None else met[name] for name in ("nees", "state_nees"))
+    return f"{rounded(joint)} times its expected value ({rounded(single)} times in the farthest state)"
+
+
+def _the(name: str) -> str:
+    return name if name.startswith("trial ") else f"the {called(name)}"
 
 
 def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) -> str:

@@ -14,7 +14,7 @@ from filters.consistency.verdicts import rounded
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.worth import scaling_sentence, without_truth, worth
+from tuning.evaluation.worth import all_warnings, scaling_sentence, without_truth, worth
 from tuning.problems.problem import score_label
 from tuning.reporting.alternatives import of_comparison, of_front, of_history, of_importances, of_sizes, of_slices
 from tuning.reporting.choice_words import choice_sentences
@@ -59,8 +59,9 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
             for (name, mean, right, word), place in zip(squares, places, strict=True)
         ]
         parts.append(f"the covariance is {' and '.join(found)}")
+    warned = all_warnings(comparisons, plan.scenarios)
     doubts = [model_doubts(*pair) for pair in zip(plan.scenarios, comparisons, strict=True)]
-    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *sum(doubts, [])])
+    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])
 
 
 def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[Comparison]) -> Section:

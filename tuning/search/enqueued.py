@@ -41,7 +41,7 @@ MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is trie
 def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
     """Enqueue what an interrupted study still lacks: the rescaled last trial, and the next filter type."""
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if finished and _rescales(plan):
+    if finished and plan.rescales:
         _enqueue_rescaled(study, plan, finished[-1])
     enqueue_next_type(study, plan)
 
@@ -53,7 +53,7 @@ def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     other parameters of the best trial. Further trials have rescaled Q and R, a smaller ensemble, or its Q
     and R for other filter types; then comes the next filter type.
     """
-    if _rescales(plan):
+    if plan.rescales:
         _enqueue_rescaled(study, plan, last)
     if plan.budget is not None:
         enqueue_smaller_ensemble(study, plan, last, plan.budget)
@@ -78,10 +78,6 @@ def _enqueue_near(study: optuna.Study, plan: Plan, number: int) -> None:
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if best is not None and not study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
         enqueue_new(study, near(best.params, plan.space(), plan, number), {NEAR_BEST: best.number})
-
-
-def _rescales(plan: Plan) -> bool:
-    return plan.is_constrained and not plan.hold_r and plan.tunes_noise
 
 
 def _enqueue_rescaled(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:

@@ -9,10 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from tuning.evaluation.evaluate import Evaluation, compute_metrics, mse, score
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, farthest, mse, score
 from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data
-from tuning.search.objectives import DIVERGENCE_PENALTY, LARGEST, LOG_SCORE, MSE, OUTPUT, PROPER, nis_ratio
+from tuning.search.objectives import (
+    DIVERGENCE_PENALTY,
+    LARGEST,
+    LOG_SCORE,
+    MSE,
+    OUTPUT,
+    PROPER,
+    nees_ratio,
+    nis_ratio,
+)
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
@@ -26,6 +35,11 @@ class Measured(NamedTuple):
     left_out: tuple[np.ndarray, ...]  # (B,) of each problem: the whole objective without that problem's run b
     proper: float  # mean log score of the state a step; without truth log-likelihood of the innovations of a run
     nis: tuple[float, ...]  # mean NIS over the number of channels, on each problem
+    log_scores: tuple[
+        np.ndarray, ...
+    ] = ()  # `proper` with each run left out, (B,); empty unless it is a log score
+    nees: float = math.nan  # mean NEES over the number of states, on the problem where it is farthest from 1
+    state_nees: float = math.nan  # that of a scored state over 1, where it is farthest
 
 
 def measured(choice: Choice, plan: Plan, data: Sequence[Data]) -> Measured:
@@ -38,23 +52,29 @@ def measured(choice: Choice, plan: Plan, data: Sequence[Data]) -> Measured:
     else:
         value = float(np.mean(wholes))
         parts = tuple(value + (parts - whole) / len(found) for whole, parts, *_ in found)
-    proper = float(np.mean([proper for _, _, proper, _ in found]))
-    return Measured(value, parts, proper, tuple(nis for *_, nis in found))
+    evaluations = [evaluation for _, _, evaluation, _ in found]
+    scored = not any(math.isnan(one.log_score.value) for one in evaluations)
+    proper = float(np.mean([one.log_score.value if scored else one.log_likelihood for one in evaluations]))
+    others = [proper + (others - one.log_score.value) / len(found) for *_, one, others in found] if scored else ()
+    states = [ratio for one in evaluations for ratio in one.scored_nees.values()]
+    nees = farthest(map(nees_ratio, evaluations)), farthest(states)
+    return Measured(value, parts, proper, tuple(map(nis_ratio, evaluations)), tuple(others), *nees)
 
 
-def _on(choice: Choice, problem, data: Data, plan: Plan) -> tuple[float, np.ndarray, float, float]:
-    """The objective, the same without each run (B,), the proper score and the mean NIS over its expected value."""
+def _on(choice: Choice, problem, data: Data, plan: Plan) -> tuple[float, np.ndarray, Evaluation, np.ndarray]:
+    """The objective, the same without each run (B,), all metrics, and the log score without each run (B,)."""
     filter_ = choice.filter(problem)
     by_output = plan.found_objectives()[0].output
-    all_runs = metrics_of_all(filter_, data, False, bool(by_output), problem.scale)
+    all_runs = metrics_of_all(filter_, data, True, bool(by_output), problem.scale)
     evaluation = compute_metrics(filter_, all_runs, data, problem.scale, False, False)
     value, parts = _values(plan.objectives[0], by_output, all_runs, evaluation)
     restarts = all_runs.divergences
     value += DIVERGENCE_PENALTY * restarts.sum()
     parts = parts + DIVERGENCE_PENALTY * (restarts.sum() - restarts)
-    proper = evaluation.log_score.value
-    proper = evaluation.log_likelihood if math.isnan(proper) else proper
-    return value, parts, proper, nis_ratio(evaluation)
+    log_scores = np.asarray(math.nan)
+    if not math.isnan(evaluation.log_score.value):
+        log_scores = -_values(LOG_SCORE, "", all_runs, evaluation)[1]
+    return value, parts, evaluation, log_scores
 
 
 def _values(objective: str, output: str, runs: RunMetrics, evaluation: Evaluation) -> tuple[float, np.ndarray]:
@@ -101,17 +121,30 @@ def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
 
     Source: Efron, Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3).
     """
-    from scipy.special import stdtrit
 
     def between(a, b):
         return np.log(a / b) if ratio else a - b
 
-    value, variance, freedom = float(between(one.value, other.value)), 0.0, 0
-    for a, b in zip(one.left_out, other.left_out, strict=True):
-        each, count = between(a, b), len(a)
+    each = [between(a, b) for a, b in zip(one.left_out, other.left_out, strict=True)]
+    ends = _jackknife(float(between(one.value, other.value)), each)
+    return Interval(*(math.exp(min(end, 700.0)) if ratio else end for end in ends))
+
+
+def log_score_gain(one: Measured, other: Measured) -> Interval:
+    """The log score of the true states [nat a step] of one filter minus another's, with the interval of `over`."""
+    each = [a - b for a, b in zip(one.log_scores, other.log_scores, strict=True)]
+    return _jackknife(one.proper - other.proper, each)
+
+
+def _jackknife(value: float, left_out: Sequence[np.ndarray]) -> Interval:
+    """A value with Student's interval, from the values without each run of each problem."""
+    from scipy.special import stdtrit
+
+    variance, freedom = 0.0, 0
+    for each in left_out:
+        count = len(each)
         variance += (count - 1) / count * float(((each - each.mean()) ** 2).sum())
         freedom += count - 1
     quantile = float(stdtrit(freedom, 1.0 - LEVEL / 2.0)) if freedom else math.inf
     half = quantile * math.sqrt(variance) if freedom else math.inf
-    ends = value, value - half, value + half
-    return Interval(*(math.exp(min(end, 700.0)) if ratio else end for end in ends))
+    return Interval(value, value - half, value + half)

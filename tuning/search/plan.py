@@ -93,6 +93,11 @@ class Plan(NamedTuple):
         return self.consistent and self._has_covariance and self.objectives[0] != LOG_SCORE
 
     @property
+    def rescales(self) -> bool:
+        """Whether Q and R may be multiplied by a common factor to make a filter consistent."""
+        return self.is_constrained and not self.hold_r and self.tunes_noise
+
+    @property
     def _has_covariance(self) -> bool:
         return all(filter_type(name).has_covariance for name in self.filter_types)
 

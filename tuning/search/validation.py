@@ -6,6 +6,7 @@ NIS is the normalised innovation squared.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import isfinite, nan
 from typing import NamedTuple
 
 from optuna.trial import FrozenTrial, TrialState
@@ -14,9 +15,10 @@ from filters.consistency.intervals import Interval, slightly
 from filters.registry import filter_type
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, GIVEN, competing_baselines, full_noise, same_filter
+from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
-from tuning.search.measures import Measured, measured, over
-from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
+from tuning.search.measures import Measured, log_score_gain, measured, over
+from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
@@ -26,6 +28,7 @@ from tuning.search.trials import cost_of
 
 VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
 BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones
+NEES = ("nees", "state_nees")  # fields of `Met` that need truth
 EQUAL = 1e-4  # of the score, within which two filters are surely one in error, and consistency decides
 
 
@@ -39,6 +42,8 @@ class Met(NamedTuple):
     proper: float  # log score of the state a step; without truth log-likelihood of a run; more is better
     nis: float  # the mean NIS over the number of channels; of several problems the one farthest from 1
     consistent: bool  # whether it is in its band on all problems
+    nees: float = nan  # mean NEES over the number of states, of several problems the one farthest from 1
+    state_nees: float = nan  # mean e_i^2 / P_ii of the scored state where it is farthest from 1
 
 
 class Validation(NamedTuple):
@@ -49,14 +54,15 @@ class Validation(NamedTuple):
     met: tuple[Met, ...]  # the baselines first
     baseline: str  # name of the best baseline
     candidate: str  # name of the best trial; that of the baseline where no trial is another filter
-    chosen: str  # which of the two the filter is that a study gives
+    chosen: str  # the filter that a study gives
     price: float | None  # error of the best consistent trial over that of the best one, less 1
     full: Met | None = None  # noise estimation's full Q where it is better than the choice of own parameters
+    by_error: str = ""  # which of the two the objective alone would choose; empty where the log score has no say
 
     @property
     def gave_way(self) -> bool:
         """Whether the trials gave way to a baseline."""
-        return self.chosen == self.baseline
+        return self.chosen != self.candidate or self.candidate == self.baseline
 
     def named(self, name: str) -> Met:
         """One of those that met."""
@@ -79,11 +85,12 @@ def validate(
 ) -> Validation | None:
     """Let the best trials and the baselines meet, and choose.
 
-    The best baseline is the one with the least objective. The best trial is the one with the least objective among
-    the consistent ones, if these cost at most 5 % more than the best of all; else the one with the best proper
-    score of those within 5 % of the best. The best trial is taken if it is significantly better than the best
-    baseline (Student's 95 % interval of the jackknife), or if it alone is consistent and surely loses less than
-    1e-4 of the error. Otherwise it gives way, also where parameters of the user's own cannot give the baseline.
+    The best baseline is the one with the least objective. The best trial is the one with the best log score of
+    the true states among those within 5 % of the least error; without truth it is the one with the least
+    objective among the consistent ones, if these cost at most 5 % more than the best of all. The best trial is
+    taken if it is significantly better than the best baseline (Student's 95 % interval of the jackknife), or if it
+    alone is consistent and surely loses less than 1e-4 of the error. Otherwise it gives way, also where parameters
+    of the user's own cannot give the baseline. At last the log score may decide for another: `_by_log_score`.
     The interval is not widened for the number of trials: a trial that is taken by chance is one that hardly
     differs, and held out it is significantly worse in less than 1 % of studies.
 
@@ -109,11 +116,12 @@ def validate(
         for name, choice in finalists.items()
         if not any(same_filter(choice, one) for one in before.values())
     }
+    finalists |= _rescaled(finalists, plan, training)
     everyone = {**before, **finalists}
     found = {name: measured(one, plan, data) for name, one in everyone.items()}
     baseline = min(before, key=lambda name: found[name].value)
     ratio = plan.objectives[0] not in PROPER
-    candidate, price = _best_of(plan, {name: found[name] for name in finalists}, ratio)
+    candidate, price = _best_of(plan, {name: found[name] for name in finalists}, ratio, found[baseline])
     if candidate is not None:
         sized = resize(finalists[candidate], _is_consistent(found[candidate], plan))
         if not same_filter(sized, finalists[candidate]):
@@ -127,6 +135,8 @@ def validate(
             one.proper,
             max(one.nis, key=lambda part: abs(part - 1.0)),
             _is_consistent(one, plan),
+            one.nees,
+            one.state_nees,
         )
         for name, one in found.items()
     )
@@ -134,7 +144,11 @@ def validate(
     own = not set(seeds) & set(training[0].seeds)
     validation = Validation(seeds, own, met, baseline, candidate or baseline, baseline, price)
     wins = candidate is not None and _wins(validation.named(candidate), validation.named(baseline), plan, ratio)
-    validation = validation._replace(chosen=candidate or baseline) if wins else validation
+    chosen = candidate if wins and candidate is not None else baseline
+    validation = validation._replace(chosen=chosen)
+    if ratio and plan.consistent and found[chosen].log_scores:
+        decided = {name: found[name] for name in (*before, *([candidate] if candidate else []))}
+        validation = validation._replace(chosen=_by_log_score(decided, chosen, baseline), by_error=chosen)
     return validation._replace(full=_better_with_full_noise(plan, found[validation.chosen], of_kind, training))
 
 
@@ -178,6 +192,26 @@ def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]
     return {f"trial {one.number + 1}": plan.choice_of(one.params) for one in chosen}
 
 
+def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Data]) -> dict[str, Choice]:
+    """The first two trials with Q and R multiplied by their mean NEES over n; none where that is not free.
+
+    A common factor on Q and R leaves the gain of a linear filter as it is, and divides its NEES: of all factors
+    this one has the best log score. Without truth there are none.
+    """
+    found: dict[str, Choice] = {}
+    parameters = [one for one in model_parameters(plan.scenarios[0], **plan.options) if one.place.is_variance]
+    for name in list(finalists)[:BY_CONSISTENCY] if plan.rescales else ():
+        choice, factor = finalists[name], measured(finalists[name], plan, training).nees
+        if not 0.0 < factor < LARGEST:
+            continue
+        for one in parameters:
+            value = one.get(choice)
+            if value is not None:
+                choice = one.set(choice, min(max(factor * value, one.low), one.high))
+        found[f"{name} rescaled"] = choice
+    return found
+
+
 def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
     """The baselines of a kind of filter but the oracle, within the budget; of several problems those of the first.
 
@@ -203,22 +237,43 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     return found
 
 
-def _best_of(plan: Plan, found: dict[str, Measured], ratio: bool) -> tuple[str | None, float | None]:
+def _best_of(
+    plan: Plan, found: dict[str, Measured], ratio: bool, baseline: Measured | None = None
+) -> tuple[str | None, float | None]:
     """The name of the best trial, and what a mean NIS within its band costs; None where there is none."""
     if not found:
         return None, None
     free = min(found, key=lambda name: found[name].value)
+    near = [name for name, one in found.items() if one.value <= (1.0 + MOST_PRICE) * found[free].value]
+    better = (
+        [] if baseline is None else [name for name in near if over(found[name], baseline, ratio=ratio).high < 1]
+    )
     inside = [name for name, one in found.items() if _is_consistent(one, plan)]
+    best = min(inside, key=lambda name: found[name].value, default=free)
+    price = found[best].value / found[free].value - 1.0 if ratio and plan.is_constrained and inside else None
+    if ratio and plan.consistent and found[free].log_scores:
+        return max(better or near, key=lambda name: found[name].proper), price
     if not plan.is_constrained or not inside:
         return free, None
-    best = min(inside, key=lambda name: found[name].value)
-    if not ratio:  # the objective is a proper score itself
+    if price is None:  # the objective is a proper score itself
         return (best if over(found[best], found[free], ratio=False).low <= 0 else free), None
-    price = found[best].value / found[free].value - 1.0
-    if price <= MOST_PRICE:
-        return best, price
-    near = [name for name, one in found.items() if one.value <= (1.0 + MOST_PRICE) * found[free].value]
-    return max(near, key=lambda name: found[name].proper), price
+    return (best if price <= MOST_PRICE else max(near, key=lambda name: found[name].proper)), price
+
+
+def _by_log_score(found: Mapping[str, Measured], chosen: str, baseline: str) -> str:
+    """Of the filters within 5 % of the least error, the one with the best log score of the true states.
+
+    It replaces the choice by error if its log score is significantly better, or better where the NEES of that
+    choice, joint or of a state, is more than a factor of three off. A filter that is significantly worse in error
+    than the best baseline, by 0.5 % or more, is not taken.
+    """
+    most = (1.0 + MOST_PRICE) * min(one.value for one in found.values())
+    ratios = {name: over(one, found[baseline], ratio=True) for name, one in found.items() if one.value <= most}
+    near = [name for name, ratio in ratios.items() if ratio.low <= 1.0 or slightly(ratio)]
+    best = max(near, key=lambda name: found[name].proper, default=chosen)
+    gained = log_score_gain(found[best], found[chosen])
+    wrong = any(is_beyond(one) for one in (found[chosen].nees, found[chosen].state_nees))
+    return best if gained.low > 0.0 or (wrong and gained.value > 0.0) else chosen
 
 
 def _wins(candidate: Met, baseline: Met, plan: Plan, ratio: bool) -> bool:
@@ -246,13 +301,18 @@ def as_data(found: Validation | None) -> dict | None:
         "seeds": [found.seeds[0], found.seeds[-1] + 1],
         "own_seeds": found.own,
         "price": found.price,
+        "by_error": found.by_error,
         "met": list(map(_met_as_data, found.met)),
         "full": found.full and _met_as_data(found.full),
     }
 
 
 def _met_as_data(one: Met) -> dict:
-    return {**one._asdict(), "over": list(one.over), "choice": one.choice._asdict()}
+    nees = {
+        name: value if isfinite(value) else None
+        for name, value in zip(NEES, (one.nees, one.state_nees), strict=True)
+    }
+    return {**one._asdict(), **nees, "over": list(one.over), "choice": one.choice._asdict()}
 
 
 def choice_from(data: Mapping) -> Choice:
