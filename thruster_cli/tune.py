@@ -90,6 +90,14 @@ def command(
             rich_help_panel=SEARCH,
         ),
     ] = None,
+    forget: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Longest time constant of the filter's gain that is allowed: a smaller Q is raised to it.",
+            rich_help_panel=SEARCH,
+        ),
+    ] = None,
     augment: Annotated[
         list[str] | None,
         typer.Option(
@@ -219,6 +227,7 @@ def command(
         full_r=full_r,
         where=tuple(where or ()),
         worst=worst,
+        forget=forget,
     )
     plan = with_budget(plan)
     tuning = tune(plan, trials, storage, study, out, by_gradient=aim, way=way, workers=workers)

@@ -18,6 +18,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.summary import numbers
 from tuning.evaluation.tuned import consistency, metrics
+from tuning.evaluation.worth import memory_sentence
 from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
@@ -60,7 +61,8 @@ def report(tuning: Tuning) -> list[RenderableType]:
             choice_table(choices, scenario),
             comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
         ]
-        shown += [consistency_sentence(comparison), *residual_sentences(scenario, plan.seed)]
+        shown += [consistency_sentence(comparison), memory_sentence(comparison.tuned, scenario)]
+        shown += residual_sentences(scenario, plan.seed)
     shown += at_ends(result.choice, plan)
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)

@@ -122,20 +122,20 @@ def test_a_headline_warns_of_a_nees_that_is_more_than_a_factor_of_three_off():
         found = run(filters[1], data.filter_keys, data.inputs, data.measurements)
     errors, variances = (found.means - data.states)[:, 10:], np.einsum("btii->bti", found.covs)[:, 10:]
     np.testing.assert_allclose(bad.state_nees, (errors**2 / variances).mean((0, 1)), rtol=1e-12)
-    assert warnings_of(good) == [] and list(bad.scored_nees) == ["p [m]"]
-    (said,) = warnings_of(bad)
+    assert warnings_of(good, problem) == [] and list(bad.scored_nees) == ["p [m]"]
+    (said,) = warnings_of(bad, problem)
     assert said.startswith("Do not rely on the covariance, it is too small: the mean NEES is")
     assert "where 2 is right, that of p" in said
     singular = bad._replace(nees=Interval(219381.0, 0.0, 0.0), state_nees=np.array([1.2, 0.9]))
-    assert warnings_of(singular) == [
+    assert warnings_of(singular, problem) == [
         "Do not rely on the covariance, it is too small: the mean NEES is 219381 where 2 is right, that of p [m] "
         "alone 1.2 where 1 is right. Each variance is about right: P is nearly singular, or its correlations are "
         "wrong."
     ]
     again = summarised(json.loads(json.dumps(summary(bad))), problem)
-    assert warnings_of(again) == warnings_of(bad)
+    assert warnings_of(again, problem) == warnings_of(bad, problem)
     old = {name: value for name, value in summary(bad).items() if name != "state_nees"}
-    assert "of p" not in warnings_of(summarised(old, problem))[0]
+    assert "of p" not in warnings_of(summarised(old, problem), problem)[0]
 
 
 def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():

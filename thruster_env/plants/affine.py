@@ -141,6 +141,24 @@ def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray)
     return columns.T
 
 
+def slopes_of_step(
+    model: StateSpaceModel, x: np.ndarray, u: np.ndarray, by_input: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes of a whole step at a state x (n,) and an input u (p,).
+
+    Returns:
+        df/dx (n, n) and df/du (n, p) over all substeps, the latter zero unless asked for; and f(x, u), (n,).
+    """
+    a, b, point = np.eye(model.n), np.zeros((model.n, model.inputs)), as_value(x)
+    scales, v, functions, c = as_value(model.scales), as_value(u), model.functions, model.given_constants
+    slopes = transition_slopes(functions, model.shape)
+    for _ in range(model.substeps):
+        f = np.array(slopes(point, scales, v, c)).reshape(a.shape)
+        a, b = f @ a, f @ b + (_slopes_by_input(model, point, scales, u) if by_input else 0.0)
+        point = functions.transition(point, v, c)
+    return a, b, np.array(point)
+
+
 def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     """Linearise a model about a state x* (n,) and an input u* (p,); the offsets are kept.
 
@@ -159,22 +177,14 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     if isinstance(model, AffineModel):
         return model
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.given_constants
-    n, p = model.n, model.inputs
-    a, b, point, v = np.eye(n), np.zeros((n, p)), as_value(x), as_value(u)
-    scales = as_value(model.scales)
-    functions = model.functions
-    step = transition_slopes(functions, model.shape)
-    for _ in range(model.substeps):
-        f = np.array(step(point, scales, v, c))
-        a, b = f @ a, f @ b + _slopes_by_input(model, point, scales, u)
-        point = functions.transition(point, v, c)
-    h = np.array(observation_slopes(functions, model.shape)(as_value(x), scales, c))
+    a, b, point = slopes_of_step(model, x, u, by_input=True)
+    h = np.array(observation_slopes(model.functions, model.shape)(as_value(x), as_value(model.scales), c))
     return affine_model(
         a=a,
         b=b,
         c=h,
-        state_offset=np.array(point) - a @ x - b @ u,
-        measurement_offset=np.array(functions.observe(as_value(x), c)) - h @ x,
+        state_offset=point - a @ x - b @ u,
+        measurement_offset=np.array(model.functions.observe(as_value(x), c)) - h @ x,
         process_noise_cov=model.process_noise_cov,
         measurement_noise_cov=model.measurement_noise_cov,
         prior_mean=model.prior_mean,

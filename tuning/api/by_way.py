@@ -124,7 +124,7 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
     answer = study.user_attrs[ANSWER]
     found, refused = answer["choice"], answer.get("refused")
-    choice = Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"]))
+    choice = plan.forgetting(Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"])))
     value = measured(choice, plan, plan.training_data()).value
     nothing: dict[str, Any] = {"consistent": None, "nis": (), "validation": None, "sizes": [], "free_value": None}
     return (

@@ -20,7 +20,7 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
-from tuning.evaluation.worth import scaling_sentence, warnings_of, without_truth
+from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
@@ -118,7 +118,7 @@ class HeldOut:
         said = metrics(self.comparison)
         if not self.is_tuned:
             del said["tuned"]
-        warned = warnings_of(self.evaluation)
+        warned = warnings_of(self.evaluation, self.problem)
         return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said, "warnings": warned}
 
     def to_frame(self) -> pandas.DataFrame:
@@ -200,7 +200,9 @@ class HeldOut:
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         restarts = restart_sentences(self.evaluations)
-        restarts += [] if self.chosen else warnings_of(self.evaluation)  # which a study's sentences have
+        if not self.chosen:  # a study's sentences have them
+            restarts += warnings_of(self.evaluation, self.problem)
+        restarts.append(memory_sentence(self.evaluation, self.problem))
         if self.is_tuned:
             said = gains(self.comparison, self.problem.seed_word, self.name)
             return [*said, *model_doubts(self.problem, self.comparison), *restarts]

@@ -168,7 +168,7 @@ def run_tuning(
             data, options = plan.training_data(), plan.options
             gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=by_gradient, options=options)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
-        result = result._replace(choice=gradient.choice, consistent=None, nis=())
+        result = result._replace(choice=plan.forgetting(gradient.choice), consistent=None, nis=())
     try:
         with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
             comparisons = tuple(
@@ -260,6 +260,7 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
     parts += ["full-r"] * plan.full_r
     parts += [re.sub(r"[^\w.+-]+", "", one.replace("=", "-")) for one in plan.where]
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
+    parts += [] if plan.forget is None else [f"forget{plan.forget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]
     parts += [] if way is None else ["way", way]

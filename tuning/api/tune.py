@@ -29,6 +29,7 @@ def tune(
     full_q: bool = False,
     full_r: bool = False,
     where: Sequence[str] = (),
+    forget: float | None = None,
     augment: Sequence[str] | Mapping[str, Any] = (),
     budget: float | None = None,
     sampler: str = "tpe",
@@ -84,6 +85,7 @@ def tune(
         full_r: tune the correlations of R, too.
         where: relations that parameters must obey, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
             (not tuned), "Q11 = 1e-6..1e-2" (its range).
+        forget: the longest time constant of the filter's gain that is allowed [s]; a smaller Q is raised to it.
         augment: constants of the model, such as "voltage_gain", that the filter also estimates, as further states
             whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
         budget: time limit of a step of the filter [microseconds of one core]; for "auto" by default 2.5 times the
@@ -146,6 +148,7 @@ def tune(
         full_r=full_r,
         where=(where,) if isinstance(where, str) else tuple(where),
         worst=worst,
+        forget=forget,
     )
     plan = with_budget(plan)
     place = None if storage is None else storage_text(storage)

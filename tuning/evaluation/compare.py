@@ -26,6 +26,7 @@ from tuning.evaluation.evaluate import (
     median_score_ratio,
     score_ratio,
     with_restarts,
+    with_time_constants,
 )
 from tuning.evaluation.knowledge import KNOWLEDGE
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
@@ -258,6 +259,7 @@ def compare(
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
     runs, seconds = timed_runs(filter_, data, board.scenario.scale)
     evaluation = with_restarts(compute_metrics(filter_, runs, data, board.scenario.scale), filter_, runs, data)
+    evaluation = with_time_constants(evaluation, filter_, data)
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
     return Row(

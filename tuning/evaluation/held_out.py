@@ -26,7 +26,14 @@ from tuning.evaluation.baselines import (
     same_filter,
     scaled_default,
 )
-from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import (
+    NOTHING,
+    Evaluation,
+    evaluate,
+    likelihood_gain,
+    score_ratio,
+    with_time_constants,
+)
 from tuning.evaluation.regression import gain_over_regression
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
@@ -121,6 +128,7 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     found = {role: None if one is None else _found(one, done) for role, one in choices.items()}
     untuned, tuned = found.pop("untuned"), found.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
+    tuned = with_time_constants(tuned, choice.filter(scenario), data)
     bound, rule, lacks = scenario.bound(data), rule_label(scenario), scenario.lacks_ranges
     over_regression = NOTHING
     if data.states is None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from filters.consistency.intervals import Interval
+from filters.consistency.time_constants import TimeConstants
 from filters.restarts import Restarts
 from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.evaluate import NOTHING, Evaluation
@@ -27,6 +28,7 @@ def summary(evaluation: Evaluation) -> dict:
         "log_score": numbers(evaluation.log_score),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
+        **({"time_constants": _time_constants(evaluation.time_constants)} if evaluation.time_constants else {}),
         **({"restarts": evaluation.restarts._asdict()} if evaluation.restarts else {}),
     }
 
@@ -66,6 +68,7 @@ def summarised(
         restarts=_restarts(data.get("restarts")),
         mean_squares=np.array([[value.value**2 for value in rmse]]),
         log_score=as_interval(data.get("log_score")),
+        time_constants=_as_time_constants(data.get("time_constants")),
         scale=np.array([math.nan] * len(rmse) if problem.scale is None else problem.scale, dtype=np.float64),
     )
 
@@ -91,6 +94,22 @@ def _restarts(data: Mapping | None) -> Restarts | None:
         return None
     counts = {name: int(data[name]) for name in ("times", "runs", "of_runs", "run", "step")}
     return Restarts(**counts, states=tuple(map(str, data["states"])), cause=str(data["cause"]))
+
+
+def _time_constants(found: TimeConstants) -> dict:
+    """Time constants as plain numbers, None in place of an infinite one."""
+    steps = [part if math.isfinite(part) else None for part in (*found.steps, found.uptake)]
+    lists = {"steps": steps[:-1], "unobservable": list(found.unobservable)}
+    return {**found._asdict(), **lists, "uptake": steps[-1]}
+
+
+def _as_time_constants(data: Mapping | None) -> TimeConstants | None:
+    """Time constants from plain numbers; None of a file that says nothing of them."""
+    if data is None:
+        return None
+    *steps, uptake = (math.inf if part is None else float(part) for part in (*data["steps"], data["uptake"]))
+    unobservable = tuple(map(int, data["unobservable"]))
+    return TimeConstants(tuple(steps), int(data["slowest"]), uptake, unobservable, int(data["length"]))
 
 
 def _number(value) -> float:

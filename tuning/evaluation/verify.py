@@ -22,6 +22,7 @@ LATER = (
     "log_score",
     "restarts",
     "state_nees",
+    "time_constants",
 )  # keys that older files lack
 
 

@@ -5,7 +5,7 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isnan
 
 from filters.consistency.intervals import Interval, slightly, span
@@ -15,6 +15,8 @@ from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
 
+MOST_OF_A_RUN = 0.2  # that a time constant may take without a warning
+MOST_TIMES = 4  # time constants in a sentence
 HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
 
 
@@ -42,8 +44,13 @@ def worth(comparison: Comparison, what: str = "the score") -> str:
     return _listed(parts)
 
 
-def warnings_of(evaluation: Evaluation) -> list[str]:
-    """What a headline warns of: a mean NEES, joint or of a scored state, more than a factor of three off."""
+def warnings_of(evaluation: Evaluation, problem: Problem) -> list[str]:
+    """What a headline warns of in a filter: a NEES that is far off, and a gain that hardly moves the estimate."""
+    return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem)]
+
+
+def _nees_warning(evaluation: Evaluation) -> list[str]:
+    """A mean NEES, joint or of a scored state, more than a factor of three off."""
     if not evaluation.has_truth:
         return []
     joint, n, states = evaluation.nees.value, len(evaluation.rmse), evaluation.scored_nees
@@ -60,10 +67,67 @@ def warnings_of(evaluation: Evaluation) -> list[str]:
     return [f"Do not rely on the covariance, it is too {size}: the mean NEES is {', '.join(said)}.{remark}"]
 
 
+def _memory_warning(evaluation: Evaluation, problem: Problem) -> list[str]:
+    """A time constant that is longer than a fifth of a run, or a gain of practically zero."""
+    found = evaluation.time_constants
+    if found is None or not found.steps:
+        return []
+    limit, short = found.length * MOST_OF_A_RUN, _times([found.length * MOST_OF_A_RUN], problem)
+    run, forget = _times([found.length], problem), f"--forget {short.split()[0]} raises Q so that it is not"
+    if problem.dt is None:
+        forget = "a larger Q shortens it"
+    if found.steps[0] > limit:
+        state = problem.model().states[found.slowest].short_label.split(" [")[0]
+        return [
+            f"The filter hardly forgets: an error of {state} lasts for {_times(found.steps[:1], problem)} (the "
+            f"longest time constant of its gain), longer than a fifth of a run ({run}): {forget}."
+        ]
+    if found.uptake > found.length:
+        return [
+            f"The gain is practically zero: updates take {_times([found.uptake], problem)} to take up 63 % of an "
+            f"innovation, longer than a run ({run}), so the filter ignores what its model does not know: raise Q."
+        ]
+    return []
+
+
+def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
+    """The time constants of a filter's gain, the longest first; "-" for a filter without a gain."""
+    found = evaluation.time_constants
+    if found is None or not found.steps:
+        return "Time constants of the gain: -."
+    states = problem.model().states
+    some, more = found.steps[:MOST_TIMES], len(found.steps) - MOST_TIMES
+    rest = f" and {more} shorter ones" if more > 0 else ""
+    said = (
+        f"Time constants of the gain: {_times(some, problem)}{rest}, the longest of {states[found.slowest].symbol}"
+    )
+    if found.unobservable:
+        names = ", ".join(states[place].symbol for place in found.unobservable)
+        said += f"; of {names} the measurements tell nothing by themselves, whatever the gain"
+    return f"{said}."
+
+
+def slowest_sentence(evaluations: Mapping[str, Evaluation], problem: Problem) -> str:
+    """The longest time constant of each filter's gain; "-" for a filter without a gain."""
+    found = {name: one.time_constants for name, one in evaluations.items()}
+    said = [
+        f"{name} {_times(one.steps[:1], problem) if one is not None and one.steps else '-'}"
+        for name, one in found.items()
+    ]
+    return f"Longest time constant of the gain: {', '.join(said)}."
+
+
+def _times(steps: Sequence[float], problem: Problem) -> str:
+    """Numbers of steps as times [s], or as steps where there is no sample time."""
+    dt = 1.0 if problem.dt is None else problem.dt
+    return f"{', '.join(rounded(one * dt) for one in steps)} {'steps' if problem.dt is None else 's'}"
+
+
 def all_warnings(comparisons: Sequence[Comparison], problems: Sequence[Problem]) -> list[str]:
     """The warnings of a tuned filter on all problems of a study."""
     places = [f"{one.name}: " if len(problems) > 1 else "" for one in problems]
-    found = [warnings_of(comparison.tuned) for comparison in comparisons]
+    pairs = zip(comparisons, problems, strict=True)
+    found = [warnings_of(comparison.tuned, problem) for comparison, problem in pairs]
     return [f"{place}{said}" for place, some in zip(places, found, strict=True) for said in some]
 
 

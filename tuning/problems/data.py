@@ -142,6 +142,12 @@ class Data(NamedTuple):
         return self
 
 
+def runs_of(data: Data, count: int = 2) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Keys (1, 2), inputs (1, K, p) and measurements (1, K + 1, m) of the first runs, without padding."""
+    found = [data.one(place) for place in range(min(count, len(data.seeds)))]
+    return [(one.filter_keys, one.inputs, one.measurements) for one in found if one.steps > 1]
+
+
 def where_true(mask: np.ndarray, values: np.ndarray, other: float) -> np.ndarray:
     """Values (B, T, ...) where a mask (B, T) is true, elsewhere a number."""
     return np.where(mask.reshape(mask.shape + (1,) * (values.ndim - mask.ndim)), values, other)

@@ -14,7 +14,7 @@ from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import belief_sentences, noise_sentence
 from tuning.evaluation.tuned import summary
-from tuning.evaluation.worth import without_truth
+from tuning.evaluation.worth import slowest_sentence, without_truth
 from tuning.reporting.error_tables import (
     ABOVE,
     MOST_COLUMNS,
@@ -45,6 +45,7 @@ def report(board: Leaderboard) -> list[RenderableType]:
     beliefs = belief_sentences(board.rows)
     hint = ["--augment NAME:STD:WALK changes these assumptions."] if beliefs else []
     restarts = restart_sentences({row.label: row.evaluation for row in board.rows})
+    restarts.append(slowest_sentence({row.label: row.evaluation for row in board.rows}, scenario))
     return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, *restarts, f"{winners(board)}\n"]
 
 

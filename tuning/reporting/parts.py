@@ -14,7 +14,7 @@ from filters.consistency.verdicts import rounded
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.worth import all_warnings, scaling_sentence, without_truth, worth
+from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, without_truth, worth
 from tuning.problems.problem import score_label
 from tuning.reporting.alternatives import of_comparison, of_front, of_history, of_importances, of_sizes, of_slices
 from tuning.reporting.choice_words import choice_sentences
@@ -68,17 +68,17 @@ def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[C
     """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
     parts: list[Part] = []
     for scenario, comparison in zip(subject.plan.scenarios, comparisons, strict=True):
-        restarts = restart_sentences(comparison.evaluations)
+        restarts = [*restart_sentences(comparison.evaluations), memory_sentence(comparison.tuned, scenario)]
         if not comparison.tuned.has_truth:
             parts += [Words([without_truth(scenario.name)]), errors_table(scenario, comparison)]
-            parts += [Words(restarts)] if restarts else []
+            parts.append(Words(restarts))
             continue
         where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
         bound = ", and the bound" if isfinite(comparison.bound).any() else ""
         name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
         scaling = scaling_sentence(comparison)
         said = [*([scaling] if scaling else []), *restarts]
-        parts += [errors_table(scenario, comparison), *([Words(said)] if said else [])]
+        parts += [errors_table(scenario, comparison), Words(said)]
         caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
         parts.append(book.picture(draw_comparison(comparison, place, name), caption, of_comparison(comparison)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)

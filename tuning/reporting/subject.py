@@ -136,6 +136,7 @@ def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
             full_r=identity.get("full_r", False),
             where=tuple(identity.get("where", ())),
             worst=identity.get("worst", False),
+            forget=identity.get("forget"),
         )
     except (KeyError, TypeError):
         raise ValueError(f"a report needs the plan of the study, but {where} has {short_repr(identity)}") from None

@@ -19,6 +19,7 @@ from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
+from tuning.search.forgetting import forgetting
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
 from tuning.search.space import (
     AUTO,
@@ -29,6 +30,7 @@ from tuning.search.space import (
     has_search_space,
     joint_distributions,
     joint_parameters,
+    untuned_choice,
 )
 
 TRAINING_SEEDS = 32
@@ -53,6 +55,7 @@ class Plan(NamedTuple):
     full_r: bool = False  # whether R has correlations, of one channel none; the same
     worst: bool = False  # of several problems the worst one counts, and not their mean
     where: tuple[str, ...] = ()  # relations among the numbers of the model, such as "Q22 = 4 Q11"
+    forget: float | None = None  # the longest time constant of the gain that is allowed [s]
 
     @property
     def identity(self) -> dict:
@@ -63,6 +66,7 @@ class Plan(NamedTuple):
             **({"worst": True} if self.worst else {}),
             **({"full_r": True} if self.full_r else {}),
             **({"where": list(self.where)} if self.where else {}),
+            **({} if self.forget is None else {"forget": self.forget}),
             "filter": self.filter,
             "kinds": list(self.filter_types),
             "budget": self.budget,
@@ -136,6 +140,8 @@ class Plan(NamedTuple):
         if self.where and not self._has_covariance:
             raise ValueError(f"relations need a filter with a covariance, but got {self.filter!r}")
         self.space()  # relations are checked
+        if self.forget is not None:
+            self._check_forget()
         if self.budget is not None:
             positive("budget", self.budget)
         elif self.filter == AUTO and "cost" not in self.objectives:
@@ -144,6 +150,21 @@ class Plan(NamedTuple):
                 "enkf of 30 members 0.7, a pf of 1000 particles 20) or the objective 'cost', but got neither"
             )
         return self
+
+    def _check_forget(self) -> None:
+        """Raise ValueError unless Q can be raised so that the filter forgets in time."""
+        if not self._has_covariance:
+            raise ValueError(f"forget (--forget) needs a filter with a Q, but got {self.filter!r}")
+        for problem in self.scenarios:
+            if problem.dt is None:
+                raise ValueError(f"forget (--forget) needs a sample time, but {problem.name} has none")
+            if not positive("forget", self.forget) >= problem.dt:
+                raise ValueError(
+                    f"forget must be at least the sample time, {problem.dt:g} s, but got {self.forget:g}"
+                )
+        if len({one.model().n for one in self.scenarios}) > 1:
+            raise ValueError("forget (--forget) needs problems with the same number of states")
+        self.forgetting(untuned_choice(self.filter_types[0], self.scenarios[0]))
 
     def _check_full_r(self) -> None:
         """Raise ValueError unless R may have correlations."""
@@ -204,7 +225,14 @@ class Plan(NamedTuple):
 
     def choice_of(self, values: Mapping[str, Any]) -> Choice:
         """The choice of a trial's parameters."""
-        return choice_of(self.filter, values, self.scenarios[0], self.where)
+        return self.forgetting(choice_of(self.filter, values, self.scenarios[0], self.where))
+
+    def forgetting(self, choice: Choice) -> Choice:
+        """The choice with a Q that is raised, where it has to be, to keep time constants below `forget`."""
+        if self.forget is None:
+            return choice
+        seeds = [one.training_seeds(self.seed, TRAINING_SEEDS) for one in self.scenarios]
+        return forgetting(choice, self.scenarios, seeds, self.forget)
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""

@@ -60,7 +60,7 @@ def run_trial(
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
             so far.
     """
-    choice = suggest(trial, plan.filter, plan.scenarios[0], space, plan.where)
+    choice = plan.forgetting(suggest(trial, plan.filter, plan.scenarios[0], space, plan.where))
     on_choice(choice)
     microseconds = math.nan
     if plan.asks_for_cost:

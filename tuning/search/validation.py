@@ -208,7 +208,7 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
             value = one.get(choice)
             if value is not None:
                 choice = one.set(choice, min(max(factor * value, one.low), one.high))
-        found[f"{name} rescaled"] = choice
+        found[f"{name} rescaled"] = plan.forgetting(choice)
     return found
 
 
@@ -231,6 +231,7 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     if plan.full_q and problem.parameters is not None:
         full = _full_noise(plan, kind, training)
         found |= {name: one for name, one in full.items() if plan.full_r or name == FULL_Q}
+    found = {name: plan.forgetting(one) for name, one in found.items()}
     budget = plan.budget
     if budget is not None:
         found = {name: one for name, one in found.items() if cost_of(one, plan, training) <= budget}

@@ -1,0 +1,289 @@
+"""How long a filter remembers: time constants of its gain, and the process noise by which it forgets sooner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.batch import Estimates, run
+from filters.filter import Filter
+from thruster_env.numerics.sources import as_value
+from thruster_env.plants.affine import AffineModel, slopes_of_step
+from thruster_env.plants.shape import observation_slopes
+from thruster_env.plants.state_space import StateSpaceModel
+
+STEPS = 24  # up to each of the places in a run, at which slopes are taken
+PLACES = (0.75, 1.0)  # in a run: filters have settled there
+BLIND = 1e-10  # eigenvalue of the observability Gramian's correlations, below which nothing is observed
+DOUBLINGS = 60  # of a path, at most: then even slow covariances have settled
+SETTLED = 1e-12  # relative change of a covariance that has settled
+LARGEST = 1e100  # a transition that is larger has settled, too
+FACTORS = 40  # powers of two, up and down, within which the factor on a floor is searched
+WITHIN = 1e-3  # relative tolerance of that factor
+Run = tuple[np.ndarray, np.ndarray, np.ndarray]  # keys (1, 2), inputs (1, K, p), measurements (1, K + 1, m)
+
+
+class Path(NamedTuple):
+    """A model's slopes along estimates, at L steps.
+
+    Attributes:
+        transitions: F = df/dx over a whole step, (L, n, n).
+        observations: H = dh/dx at the predicted mean, (L, m, n); rows of zeros where a channel is missing.
+        covs: P of the estimates before these steps, (L, n, n).
+        innovation_covs: S of the steps, (L, m, m).
+        q_factors: factors on Q, (L,): 1, or the ratio of a step's length to the model's.
+    """
+
+    transitions: np.ndarray
+    observations: np.ndarray
+    covs: np.ndarray
+    innovation_covs: np.ndarray
+    q_factors: np.ndarray
+
+
+class TimeConstants(NamedTuple):
+    """Time constants of a filter's gain in steps, of the observable part of its state.
+
+    Attributes:
+        steps: the longest first; infinite where an error never fades.
+        slowest: index of the state with the largest part in the longest one, in units of its deviation.
+        uptake: steps within which updates take up 63 % of what the channel that counts most says; infinite for a
+            gain of zero.
+        unobservable: indices of states of which measurements tell nothing, whatever the gain.
+        length: steps of a run.
+    """
+
+    steps: tuple[float, ...]
+    slowest: int
+    uptake: float
+    unobservable: tuple[int, ...]
+    length: int
+
+
+def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None:
+    """How long an error of a filter's estimate lasts on some runs.
+
+        A = (I - K H) F,   K = (F P F' + Q) H' S^-1,   tau = -1 / log|lambda(A)| steps
+        uptake = -1 / log(1 - kappa),   kappa the largest eigenvalue of the mean of H K
+
+    P and S are the filter's own covariances of state and innovation, of an ensemble those of its members, at some
+    steps up to three quarters and up to the end of each run. |lambda| is the mean growth of errors in a step along
+    the runs; with the steady gain of a linear model these are the moduli of A's eigenvalues.
+
+    Args:
+        filter_: the filter.
+        runs: as `filters.run` takes one each.
+
+    Returns:
+        None for a filter without a covariance, and where no estimate is finite.
+
+    Source: Anderson, Moore (1979), Optimal Filtering, section 4.4; Benettin, Galgani, Giorgilli, Strelcyn (1980),
+    "Lyapunov characteristic exponents for smooth dynamical systems", for the mean growth.
+    """
+    if not filter_.has_covariance:
+        return None
+    path = slopes_along(filter_, runs)
+    if path is None:
+        return None
+    model, n = filter_.kernel_model, filter_.kernel_model.n
+    scales = _scales(model, path)
+    closed, taken = np.empty_like(path.transitions), np.zeros((model.m, model.m))
+    for i, (f, h, p, s, factor) in enumerate(zip(*path, strict=True)):
+        seen = h.any(axis=1)
+        h, s = h[seen], s[np.ix_(seen, seen)]
+        predicted = f @ p @ f.T + factor * model.process_noise_cov
+        gain = np.linalg.solve(s, h @ predicted).T
+        closed[i] = (np.eye(n) - gain @ h) @ f
+        taken[np.ix_(seen, seen)] += h @ gain / len(closed)
+    observable, blind = observable_part(path, scales, model.measurement_noise_cov)
+    closed = observable.T @ (closed / scales[:, None] * scales) @ observable
+    growth, direction = _growth(closed)
+    kappa = min(float(np.linalg.eigvals(taken).real.max(initial=0.0)), 1.0)
+    slowest = int(np.abs(observable @ direction).argmax()) if len(growth) else 0
+    length = max(inputs.shape[1] for _, inputs, _ in runs)
+    return TimeConstants(tuple(map(_steps_of, growth)), slowest, _steps_of(1.0 - kappa), blind, length)
+
+
+def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
+    """Slopes of a filter's model along its estimates, at consecutive steps late in each run; None if lost."""
+    model, parts, constant = filter_.kernel_model, [], None
+    slopes = observation_slopes(model.functions, model.shape)
+    for keys, inputs, measurements in runs:
+        found: Estimates = run(filter_, keys, inputs, measurements)
+        ends = (int(place * inputs.shape[1]) for place in PLACES)
+        for k in sorted({k for end in ends for k in range(max(end - STEPS, 0) + 1, end + 1)}):
+            x, p, s = found.means[0, k - 1], found.covs[0, k - 1], found.innovation_covs[0, k]
+            if constant is None or not isinstance(model, AffineModel):
+                f, _, after = slopes_of_step(model, x, inputs[0, k - 1])
+                h = np.array(slopes(as_value(after), as_value(model.scales), model.given_constants))
+                constant = f, h.reshape(model.m, model.n)
+            f, h = constant[0], constant[1].copy()
+            h[np.isnan(measurements[0, k])] = 0.0
+            if all(np.isfinite(part).all() for part in (f, h, p, s)):
+                factor = inputs[0, k - 1, -1] if model.shape.step_ratio else 1.0
+                parts.append((f, h, p, s, factor))
+    return Path(*map(np.array, zip(*parts, strict=True))) if parts else None
+
+
+def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+    """An orthonormal basis (n, o) of the observable part of a state in units of scales, and states outside it.
+
+    The rest is the null space of the observability Gramian of the path, sum over steps of Phi' H' R^-1 H Phi.
+    """
+    n = len(scales)
+    gramian, phi = np.zeros((n, n)), np.eye(n)
+    for f, h in zip(path.transitions, path.observations, strict=True):
+        for _ in range(n if len(path.transitions) == 1 else 1):
+            phi = (f / scales[:, None] * scales) @ phi
+            phi /= max(np.abs(phi).max(), 1.0)
+            observed = h * scales @ phi
+            gramian += observed.T @ np.linalg.solve(r, observed)
+    roots = np.sqrt(gramian.diagonal())
+    seen = roots > 0.0
+    correlations = gramian[np.ix_(seen, seen)] / roots[seen, None] / roots[seen]
+    values, vectors = np.linalg.eigh(correlations)
+    null = np.zeros((n, n - int(seen.sum()) + int((values < BLIND).sum())))
+    null[~seen, : n - int(seen.sum())] = np.eye(n - int(seen.sum()))
+    null[seen, n - int(seen.sum()) :] = vectors[:, values < BLIND] / roots[seen, None]
+    basis = np.linalg.qr(null, mode="complete")[0]
+    count = null.shape[1]
+    outside = np.abs(basis[:, :count]).max(axis=1, initial=0.0) > 1e-6
+    return basis[:, count:], tuple(np.flatnonzero(outside).tolist())
+
+
+def forgetting_noise(path: Path, model: StateSpaceModel, seconds: float, dt: float = 1.0) -> np.ndarray:
+    """Q (n, n) of a model, with the least multiple of a floor for which no time constant exceeds some seconds.
+
+        Q + c (alpha^2 - 1) mean of F P F',   alpha = exp(dt / seconds)
+
+    P is the steady covariance of the filter with fading memory, in whose prediction F is alpha F: as its gain
+    makes alpha (I - K H) F stable, errors fade faster than exp(-t / seconds). Where F and H are constant the
+    floor is the noise by which a Kalman filter has this gain, and c at most 1: it is the least factor that is
+    enough. The time constant is that of the steady gain along the path, repeated for ever, of the observable part
+    of the state.
+
+    Args:
+        path: slopes of the model, from `slopes_along`.
+        model: its Q and R.
+        seconds: the longest time constant that is allowed [s].
+        dt: sample time [s].
+
+    Raises:
+        ValueError: if nothing is observable, or no multiple is enough.
+
+    Source: Anderson, Moore (1979), Optimal Filtering, section 6.2 (exponential data weighting).
+    """
+    scales, r = _scales(model, path), model.measurement_noise_cov
+    basis, _ = observable_part(path, scales, r)
+    if not basis.shape[1]:
+        raise ValueError(
+            "a filter that forgets (--forget) must observe a state, but its measurements tell of none"
+        )
+    steps = seconds / dt
+    root = np.linalg.cholesky(r)
+    f = basis.T @ (path.transitions / scales[:, None] * scales) @ basis
+    h = np.linalg.solve(root, path.observations * scales) @ basis
+    q = basis.T @ (model.process_noise_cov / scales[:, None] / scales) @ basis
+
+    def slowest(noise: np.ndarray) -> float:
+        a, p, j = _steady(f, h, noise, path.q_factors)
+        growth = np.abs(np.linalg.eigvals(np.linalg.solve(np.eye(len(p)) + j @ p, a.T).T)).max()
+        return _steps_of(growth ** (1.0 / len(f)))
+
+    if slowest(q) <= steps * (1.0 + WITHIN):
+        return model.process_noise_cov
+    alpha = math.exp(1.0 / steps)
+    floor = _floor(alpha * f, h, q, path.q_factors) * (1.0 - alpha**-2)
+    high = next((i for i in range(FACTORS) if slowest(q + 2.0**i * floor) <= steps), None)
+    if high is None:
+        least = slowest(q + 2.0**FACTORS * floor)
+        raise ValueError(
+            f"a time constant (--forget) must be one that some Q reaches, at least {least * dt:.3g} s, but got "
+            f"{seconds:.3g} s: allow a longer one, or measure more"
+        )
+    low, high = -float(FACTORS), float(high)
+    while high - low > WITHIN:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if slowest(q + 2.0**middle * floor) <= steps else (middle, high)
+    lifted = basis @ (2.0**high * floor) @ basis.T * scales[:, None] * scales
+    found = model.process_noise_cov + lifted
+    return 0.5 * (found + found.T)
+
+
+def _floor(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """The mean of F P F' along a path, (n, n), P the steady covariance after each update."""
+    p, total = _steady(f, h, q, factors)[1], np.zeros_like(q)
+    for one, seen, factor in zip(f, h, factors, strict=True):
+        moved = one @ p @ one.T
+        total += moved / len(f)
+        predicted = moved + factor * q
+        gain = np.linalg.solve(np.eye(len(seen)) + seen @ predicted @ seen.T, seen @ predicted).T
+        left = np.eye(len(q)) - gain @ seen
+        p = left @ predicted @ left.T + gain @ gain.T
+    return 0.5 * (total + total.T)
+
+
+def _steady(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of a path that is repeated for ever: A of one pass, the steady covariance P at its end, and J of one pass.
+
+    A pass takes P to A (I + P J)^-1 P A' + C. Its steps are composed by pairs, and then it is doubled.
+
+    Source: Sarkka, Garcia-Fernandez (2021), "Temporal parallelization of Bayesian smoothers", IEEE TAC 66(1).
+    """
+    noise, unit = factors[:, None, None] * q, np.eye(len(q))
+    s = np.eye(h.shape[1]) + h @ noise @ h.transpose(0, 2, 1)
+    weighted = np.linalg.solve(s, h)  # S^-1 H
+    left = unit - noise @ h.transpose(0, 2, 1) @ weighted
+    seen = h @ f
+    part = left @ f, left @ noise, seen.transpose(0, 2, 1) @ np.linalg.solve(s, seen)
+    while len(part[0]) > 1:
+        half = len(part[0]) // 2
+        rest = [one[2 * half :] for one in part]
+        pairs = _composed([one[: 2 * half : 2] for one in part], [one[1 : 2 * half : 2] for one in part])
+        part = tuple(np.concatenate([one, more]) for one, more in zip(pairs, rest, strict=True))
+    a, c, j = (one[0] for one in part)
+    first, p = (a, j), unit
+    for _ in range(DOUBLINGS):
+        before, p = p, a @ np.linalg.solve(unit + j, a.T) + c  # from the identity
+        if np.abs(p - before).max() <= SETTLED * np.abs(p).max() or np.abs(a).max() > LARGEST:
+            break
+        a, c, j = (one[0] for one in _composed(*[(a[None], c[None], j[None])] * 2))
+    return first[0], 0.5 * (p + p.T), first[1]
+
+
+def _composed(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """(A, C, J) of one part of a path and then another."""
+    (a, c, j), (b, d, k) = one, other
+    through = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, b.swapaxes(1, 2)).swapaxes(1, 2)  # B (I + C K)^-1
+    inner = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, k @ a)
+    joined = through @ c @ b.swapaxes(1, 2) + d, a.swapaxes(1, 2) @ inner + j
+    return through @ a, *(0.5 * (part + part.swapaxes(1, 2)) for part in joined)
+
+
+def _growth(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean growth factors (n,) along steps (L, n, n), the largest first, and the direction of the largest."""
+    values, vectors = np.linalg.eig(steps.mean(axis=0))
+    q = np.linalg.qr(vectors[:, np.argsort(-np.abs(values))])[0]
+    total = np.zeros(len(values))
+    with np.errstate(divide="ignore"):
+        for a in steps:
+            q, upper = np.linalg.qr(a @ q)
+            total += np.log(np.abs(upper.diagonal()))
+    order = np.argsort(-total)
+    return np.exp(total[order] / len(steps)), q[:, order[0]] if len(order) else np.zeros(0)
+
+
+def _steps_of(growth: float) -> float:
+    """The time constant in steps of a growth factor."""
+    if growth <= 0.0:
+        return 0.0
+    return -1.0 / math.log(growth) if growth < 1.0 - SETTLED else math.inf
+
+
+def _scales(model: StateSpaceModel, path: Path) -> np.ndarray:
+    """Deviations of the states along a path; the model's scales of states that have none."""
+    deviations = np.sqrt(np.einsum("kii->ki", path.covs).clip(min=0.0).mean(axis=0))
+    return np.where(deviations > 0.0, deviations, model.scales)
