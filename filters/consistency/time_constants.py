@@ -197,14 +197,14 @@ def forgetting_noise(path: Path, model: StateSpaceModel, seconds: float, dt: flo
         return model.process_noise_cov
     alpha = math.exp(1.0 / steps)
     floor = _floor(alpha * f, h, q, path.q_factors) * (1.0 - alpha**-2)
-    high = next((i for i in range(FACTORS) if slowest(q + 2.0**i * floor) <= steps), None)
-    if high is None:
+    high = next((float(i) for i in range(FACTORS) if slowest(q + 2.0**i * floor) <= steps), math.nan)
+    if math.isnan(high):
         least = slowest(q + 2.0**FACTORS * floor)
         raise ValueError(
             f"a time constant (--forget) must be one that some Q reaches, at least {least * dt:.3g} s, but got "
             f"{seconds:.3g} s: allow a longer one, or measure more"
         )
-    low, high = -float(FACTORS), float(high)
+    low = -float(FACTORS)
     while high - low > WITHIN:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if slowest(q + 2.0**middle * floor) <= steps else (middle, high)
@@ -238,7 +238,7 @@ def _steady(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) ->
     weighted = np.linalg.solve(s, h)  # S^-1 H
     left = unit - noise @ h.transpose(0, 2, 1) @ weighted
     seen = h @ f
-    part = left @ f, left @ noise, seen.transpose(0, 2, 1) @ np.linalg.solve(s, seen)
+    part: tuple[np.ndarray, ...] = left @ f, left @ noise, seen.transpose(0, 2, 1) @ np.linalg.solve(s, seen)
     while len(part[0]) > 1:
         half = len(part[0]) // 2
         rest = [one[2 * half :] for one in part]
