@@ -163,7 +163,7 @@ def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
     plan, trial = Plan("kf", (LinearProblem(),)), _met("trial 3", 0.96, 0.95, 0.97, True, -1e5)
     trial = trial._replace(nees=54845.0, state_nees=2.5)
     given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(nees=2.35, state_nees=3.5)
-    met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, "trial 3")
+    met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, by_error="trial 3")
     (said,) = choice_sentences(json.loads(json.dumps(as_data(met))), plan)
     assert met.gave_way and said.startswith("The given numbers are taken by the log score")
     assert "1.042 times the score" in said and "that of trial 3 54845 times" in said
