@@ -44,6 +44,14 @@ STEPS = (
 OTHERWISE = Step("Otherwise", ("ekf",), "the least cost, gradients, C code")
 
 
+def as_text() -> str:
+    """The same as a numbered list, which a phone shows in letters large enough."""
+    return "\n".join(
+        f"{place}. {step.question} {', '.join(f'`{name}`' for name in step.filters)}: {step.why}."
+        for place, step in enumerate((*STEPS, OTHERWISE), 1)
+    )
+
+
 def draw(folder: Path) -> Path:
     """Draw all questions, from the top; the first yes decides."""
     rows = len(STEPS) + 1
@@ -72,3 +80,4 @@ def draw(folder: Path) -> Path:
 
 if __name__ == "__main__":
     print(draw(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS))
+    print(as_text())

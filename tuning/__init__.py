@@ -16,6 +16,7 @@ a `Problem`, "module:object", or a pair (model, data) of a model and recorded ru
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from tuning.api.report import report
     from tuning.api.train_estimator import train_estimator
     from tuning.api.tune import tune
+
+warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's in notebooks: Optuna imports it, unused
 
 __all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "train_estimator", "tune"]
 

@@ -61,6 +61,14 @@ def test_a_comparison_shows_itself(comparison):
         assert repr(other) == repr(comparison)
 
 
+def test_rows_have_the_labels_of_a_mapping(comparison):
+    own = tuning.compare({"mine": "kf", "theirs": "ekf"}, SHORT, seeds=6, progress=False)
+    mine, theirs = (
+        dict(zip(one["filter"], one["score"], strict=True)) for one in (own.to_frame(), comparison.to_frame())
+    )
+    assert mine == {"mine": theirs["kf"], "theirs": theirs["ekf"]}
+
+
 def test_scores_are_drawn_with_their_intervals(comparison):
     figure = comparison.plot_scores()
     assert isinstance(figure, matplotlib.figure.Figure)

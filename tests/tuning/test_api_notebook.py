@@ -1,6 +1,7 @@
 """Progress in a notebook: one output that is drawn anew, with ipywidgets or without."""
 
 import io
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -66,3 +67,8 @@ def test_who_shows_progress(terminal, jupyter, asked, quiet, monkeypatch):
     assert found.quiet == quiet
     if jupyter and progress.importlib.util.find_spec("ipywidgets") is None:
         assert isinstance(found.file, NotebookLine)
+
+
+def test_a_notebook_without_widgets_hears_nothing_of_tqdm():
+    code = "import tuning, warnings; warnings.warn('IProgress not found. Please update jupyter and ipywidgets.')"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

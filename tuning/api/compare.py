@@ -60,8 +60,8 @@ def compare(
 
     Args:
         filters: names of filters, tuned files, `Study`s, other packages' estimators, or your own: a filter such as
-            `make_filter("ekf", model)` or a model with its Q and R, in a list; the others are compared with the
-            first.
+            `make_filter("ekf", model)` or a model with its Q and R, in a list, or in a mapping from the labels of
+            their rows; the others are compared with the first.
         problem: a problem as for `tuning.tune`, or a list of several; by default that of the first tuned file or
             study, or "nominal".
         seeds: number of held-out seeds.
@@ -83,11 +83,14 @@ def compare(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any row is done.
     """
-    some = list(filters) if isinstance(filters, list | tuple) else [filters]
+    labels = list(filters) if isinstance(filters, Mapping) else []
+    some = list(filters.values()) if labels else list(filters) if isinstance(filters, list | tuple) else [filters]
     problems = problems_of(_default(some) if problem is None else problem, preset)
     each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
     sizes = {name: size for name, size in each.items() if size is not None}
-    some, left_out = without_unfit(some, problems)
+    asked = some
+    some, left_out = without_unfit(asked, problems)
+    labels = [label for label, one in zip(labels, asked, strict=False) if not _is_named(one) or one in some]
     if trials is not None:
         if knows is not None:
             raise ValueError(
@@ -98,7 +101,15 @@ def compare(
             for one in some
         ]
     knows = knowledge_on(problems) if knows is None else knows
-    contenders = contenders_of(some, knows, unknowns_of(augment or {}), sizes, seed)
+    given = knows, unknowns_of(augment or {}), sizes, seed
+    contenders = contenders_of(some, *given)
+    if labels:
+        of_each = [(label, contenders_of([one], *given)) for label, one in zip(labels, some, strict=True)]
+        contenders = [
+            one._replace(label=one.label.replace(made[0].label, str(label), 1))
+            for label, made in of_each
+            for one in made
+        ]
     return replace(compared(contenders, problems, seed, seeds, console_for(progress)), left_out=left_out)
 
 
