@@ -28,6 +28,7 @@ from thruster_env.numerics.algebra.graphs import Graph, Number
 from thruster_env.numerics.algebra.programs import Place, Program, callable_of, program_of, values_of, work_names
 from thruster_env.numerics.algebra.tracing import traced
 from thruster_env.numerics.compiled import compiled
+from thruster_env.numerics.python_floats import with_python_floats
 from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -290,6 +291,45 @@ def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
                 agree(found[k][known], expected[known], sizes[known], one.text)
                 counts["expressions"] += 1
     return _line("compiled arithmetic", counts)
+
+
+def python_arithmetic(rng: np.random.Generator, seconds: float) -> str:
+    """Random expressions that run as Python: Python's values; where it raises those of graphs or NumPy's scalars.
+
+    Graphs have no sign of zero, and so other infinities.
+    """
+    counts: Counter = Counter()
+    for _ in _until(seconds):
+        expressions, points = drawn(rng, SIZE), points_of(rng)
+        _, numbers = traced_together(expressions)
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            graph_values = values_of(numbers, points)
+            for k, one in enumerate(expressions):
+                of_python, sizes = one.values(points)
+                called = with_python_floats(_of_vector(one.function))
+                for i, point in enumerate(points.T):
+                    try:
+                        found = np.array([called(tuple(point))[0]], dtype=float)
+                    except (ArithmeticError, ValueError, TypeError):  # of constants and whole numbers alone
+                        counts["refused"] += 1
+                        continue
+                    size = np.nan_to_num(sizes[i], nan=1.0)
+                    if not np.isnan(sizes[i]):
+                        agree(found, of_python[[i]], size, one.text)
+                    elif not np.isclose(found, graph_values[k][i], rtol=1e-12, equal_nan=True):
+                        try:
+                            agree(found, np.array([float(one.function(*point))]), size, one.text)
+                        except (ArithmeticError, ValueError):  # it takes floats of NumPy's scalars
+                            expected = graph_values[k][[i]]
+                            if np.isfinite([*found, *expected]).all():
+                                agree(abs(found), abs(expected), size, (one.text, point))
+                    counts["values"] += 1
+    return _line("python arithmetic", counts)
+
+
+def _of_vector(function: Callable) -> Callable:
+    return lambda x: (function(*x),)
 
 
 def filtered_arithmetic(rng: np.random.Generator, seconds: float) -> str:

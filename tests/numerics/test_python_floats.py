@@ -249,6 +249,10 @@ def test_a_function_s_own_error_is_raised_and_not_replaced(as_python):
 
     with pytest.raises(ValueError, match="level must be low"):
         hears_nothing(refuses, **WITHOUT_SLOPES)
+    of_condition = with_python_floats(lambda x: 1.0 / (x[0] > 1.0))
+    assert of_condition((np.float64(1.0),)) == math.inf
+    with pytest.raises(ZeroDivisionError):  # of NumPy's truth values the rest were 0, in machine code it is NaN
+        with_python_floats(lambda x: (x[0] > 0.0) % (x[0] > 1.0))((np.float64(1.0),))
     f = with_python_floats(lambda x: 1.0 / len(x[1:]))
     with pytest.raises(ZeroDivisionError):
         f((1.0,))

@@ -217,16 +217,16 @@ def fastmath_of(function: Callable) -> set[str]:
     if (function.__module__ or "").partition(".")[0] in OURS:
         return set(FASTMATH)
     code = getattr(function, "__code__", None)  # an object that is called has none
-    return {"nsz"} if code is not None and _jumps(code) else set(FASTMATH - {"arcp"})
+    return {"nsz"} if code is not None and rounds(code) else set(FASTMATH - {"arcp"})
 
 
-def _jumps(code: types.CodeType) -> bool:
+def rounds(code: types.CodeType) -> bool:
     """Whether a function rounds numbers, or takes rests."""
     signs = {"%", "//", "%=", "//="}
     return (
         not JUMPS.isdisjoint(code.co_names)
         or any(one.opname == "BINARY_OP" and one.argrepr in signs for one in dis.get_instructions(code))
-        or any(_jumps(one) for one in code.co_consts if isinstance(one, types.CodeType))
+        or any(rounds(one) for one in code.co_consts if isinstance(one, types.CodeType))
     )
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.numerics.algebra.tracing import OTHER_NAMES
-from thruster_env.numerics.compiled import compiled_in_place_of, inlined
+from thruster_env.numerics.compiled import compiled_in_place_of, inlined, rounds
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.user_functions import (
     Copies,
@@ -224,7 +224,7 @@ def with_python_floats(function: Callable) -> Callable:
 
 
 def _by_numpy(function: Callable, arguments: tuple) -> Any:
-    """What a function makes of NumPy's scalars, for which 1/(x > 0) has a value, too."""
-    if needs_python(function):
+    """What a function makes of NumPy's scalars, of which 1/(x > 0) has a value; rests of conditions are wrong."""
+    if needs_python(function) or any(rounds(one.__code__) for one in functions_in(function)):
         raise TypeError
     return function(*with_floats(np.float64, arguments))
