@@ -150,7 +150,7 @@ class BlockOptions:
         int | None,
         typer.Option(
             "--blocks",
-            help="Number of blocks per run; about 24 in total by default.",
+            help="Number of blocks per run; about 72 in total by default.",
             rich_help_panel=INPUT,
         ),
     ] = None

@@ -178,7 +178,7 @@ def command(
     flags a parameter at an end of its range. Besides sampled trials the study tries the baselines (given, rule of
     thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials are
     compared with the baselines on 100 validation seeds. If none is significantly better, the best baseline is
-    chosen.
+    chosen, and the report names the runs in which what was given fails.
 
     RMSE alone barely determines Q and R: only their ratio affects the estimate. The study therefore keeps the mean
     NIS in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score. With true

@@ -5,16 +5,27 @@ import pytest
 from scipy.stats import binom
 
 from filters.consistency.intervals import Interval
+from pages.tuning_choice import (
+    CASES,
+    GIVEN,
+    TRUTH_CASES,
+    after,
+    before,
+    case_rates,
+    choice_size,
+    measured_of,
+    plan_of,
+)
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
-from tuning.search.measures import Measured, over
+from tuning.search.measures import Measured, Runs, logs_with_loss, over, signed_rank
 from tuning.search.plan import HELD_OUT_SEEDS, VALIDATION_SEEDS, Plan
 from tuning.search.space import untuned_choice
-from tuning.search.validation import Met, _best_of, _wins
+from tuning.search.validation import Choosing, Met, _wins
 
 PLAN = Plan("kf", (LinearProblem(),))
 CHOICE = untuned_choice("kf", LinearProblem())
-STUDIES, LEVEL = 600, 1e-4
+STUDIES, LEVEL = 400, 1e-4
 OWN = 0.1  # part of a run's squares that filters have not in common
 UNIT = 0.5 * OWN * np.sqrt(2.0 / VALIDATION_SEEDS)  # standard error of log(V_1 / V_2), exponential parts
 
@@ -27,7 +38,8 @@ def _squares(levels, runs, generator):
 
 def _measured(squares):
     rest = (squares.sum() - squares) / (len(squares) - 1)
-    return Measured(np.sqrt(squares.mean()), (np.sqrt(rest),), 0.0, (1.0,))
+    runs = Runs(squares[:, None], squares, squares)
+    return Measured(np.sqrt(squares.mean()), (np.sqrt(rest),), 0.0, (1.0,), runs=(runs,), decisive=(0,))
 
 
 def _rates(candidates, baselines):
@@ -44,14 +56,11 @@ def _rates(candidates, baselines):
             [_measured(one) for one in _squares(levels, runs, generator)]
             for runs in (VALIDATION_SEEDS, HELD_OUT_SEEDS)
         )
-        baseline = min(range(count), key=lambda at: met[at].value)
-        best, _ = _best_of(PLAN, {str(at): met[at] for at in range(count, len(met))}, True)
-        told = (
-            Met("", CHOICE, met[at].value, over(met[at], met[baseline], ratio=True), 0.0, 1.0, True)
-            for at in (int(best), baseline)
-        )
-        wins = _wins(*told, PLAN, True)
-        chosen = held_out[int(best) if wins else baseline]
+        of = {str(at): one for at, one in enumerate(met)}
+        trials = {name: of.pop(name) for name in list(of)[count:]}
+        choosing = Choosing(PLAN, of, trials)
+        name = next((name for name in choosing.order() if choosing.wins(name)), choosing.baseline)
+        wins, chosen = int(name) >= count, held_out[int(name)]
         worse = any(over(chosen, held_out[at], ratio=True).low > 1.0 for at in range(count))
         taken, by_trial, by_any = taken + wins, by_trial + (wins and worse), by_any + worse
     return taken, by_trial, by_any
@@ -92,3 +101,95 @@ def test_consistency_alone_wins_only_where_nothing_can_be_lost():
     assert not _wins(_met((1.00001, 0.999, 1.001)), wrong, PLAN, True)
     assert not _wins(_met((1.00001, 0.99998, 1.00004), consistent=False), wrong, PLAN, True)
     assert not _wins(_met((1.00001, 0.99998, 1.00004)), wrong, PLAN._replace(consistent=False), True)
+
+
+def _blocks(*logs):
+    """Filters by their differences in blocks of logs, (B,) each, and one with none."""
+    values, numbers = np.concatenate(logs), np.repeat(range(len(logs)), [len(one) for one in logs])
+    return measured_of(values, False, numbers), measured_of(np.zeros_like(values), False, numbers)
+
+
+def _choosing(one, other):
+    return Choosing(plan_of(False), {GIVEN: other}, {"trial 1": one})
+
+
+def test_signed_ranks_are_those_of_scipy_and_shared_by_ties():
+    from scipy.stats import wilcoxon
+
+    generator = np.random.default_rng(3)
+    for shift in (0.0, -0.5, 1.0):
+        differences = generator.standard_normal(24) + shift
+        found = signed_rank(*_blocks(differences), ratio=False)
+        a, b = (one._replace(runs=(one.runs[0]._replace(logs=None),)) for one in _blocks(differences))
+        expected = wilcoxon(differences, alternative="less", correction=True, method="approx").pvalue
+        assert signed_rank(a, b, ratio=False) == pytest.approx(expected, rel=1e-9) and found >= expected * 0.999
+    tied = _blocks(np.array([-1.0, -1.0, 2.0, 0.0]))
+    assert signed_rank(*tied, ratio=False) == pytest.approx(float(wilcoxon_by_hand([-2.5, -2.5, 4.0])))
+    assert signed_rank(tied[1], tied[1], ratio=False) == 1.0
+
+
+def wilcoxon_by_hand(ranks):
+    from scipy.stats import norm
+
+    return norm.cdf((sum(ranks) + 1.0) / np.sqrt(np.square(ranks).sum()))
+
+
+def test_one_block_in_which_the_given_filter_fails_does_not_protect_it():
+    calm = np.random.default_rng(0).normal(-6.0, 4.0, 16)
+    failing = calm.copy()
+    failing[11] = -2500.0  # a trial is better by this
+    one, other = _blocks(failing[:8], failing[8:])
+    assert over(one, other, ratio=False).high > 0.0 > over(one, other, ratio=False).value
+    choosing = _choosing(one, other)
+    assert choosing.wins("trial 1") and after(choosing) == "trial 1" and before(choosing) == GIVEN
+    against = np.abs(calm)
+    against[11] = -2500.0  # better in this block alone: the next log may have none
+    assert not _choosing(*_blocks(against[:8], against[8:])).wins("trial 1")
+
+
+def test_what_suits_one_log_alone_is_not_taken():
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (2, 12))
+    one, other = _blocks(noise[0] + 2.0, noise[1] - 30.0)
+    assert over(one, other, ratio=False).high < 0.0  # by the mean it is significantly better
+    assert logs_with_loss(one, other, ratio=False) == [(0, 0)] and not _choosing(one, other).wins("trial 1")
+    both = _blocks(noise[0] - 2.0, noise[1] - 30.0)
+    assert logs_with_loss(*both, ratio=False) == [] and _choosing(*both).wins("trial 1")
+    rest = np.concatenate([noise[0] - 3.0, [40.0]])  # better in each block but one
+    assert logs_with_loss(*_blocks(rest, noise[1] - 30.0), ratio=False) == []
+
+
+def test_of_the_worst_problem_alone_runs_are_compared():
+    generator = np.random.default_rng(2)
+    easy, hard = generator.exponential(size=(2, 30)) + [[0.1], [5.0]]
+
+    def filter_(a, b):
+        parts = [measured_of(some, True) for some in (a, b)]
+        return Measured(
+            parts[1].value,
+            (parts[1].left_out[0],) * 2,
+            0.0,
+            (1.0,),
+            runs=(*parts[0].runs, *parts[1].runs),
+            decisive=(1,),
+        )
+
+    one, other = filter_(easy * 4.0, hard * 0.8), filter_(easy, hard)
+    assert signed_rank(one, other, ratio=True) < 1e-5
+    assert signed_rank(one._replace(decisive=(0, 1)), other, ratio=True) > 0.1
+
+
+@pytest.mark.parametrize(("heavy", "time"), [(False, 60.0), (True, 240.0)])
+def test_dependent_blocks_do_not_pass_for_so_many_independent_ones(heavy, time):
+    all_blocks, apart, _, chosen = choice_size(time, heavy, 400)
+    most = {60.0: 0.035, 240.0: 0.09}[time]
+    assert chosen <= 100.0 / 400 * binom.isf(LEVEL, 400, most) and chosen < all_blocks / 2.0
+    assert time < 100.0 or chosen < apart
+
+
+def test_a_filter_that_fails_in_one_place_is_replaced_and_one_that_is_right_stays():
+    old, new = case_rates(CASES[7], False, 40)
+    assert old.changed < 70.0 < 75.0 < new.changed and new.false_keeps < old.false_keeps
+    assert new.false_changes <= 100.0 / 40 * binom.isf(LEVEL, 40, 0.01)
+    for case, truth in ((CASES[10], False), (TRUTH_CASES[2], True)):
+        _, new = case_rates(case, truth, 40)
+        assert new.changed <= 100.0 / 40 * binom.isf(LEVEL, 40, 0.04)

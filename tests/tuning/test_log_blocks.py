@@ -13,6 +13,7 @@ from thruster_env.plants.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.identify import split_runs
 from tuning.logs.problem import log_problem
+from tuning.problems.log_parts import parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.space import untuned_choice
 
@@ -39,9 +40,9 @@ def test_blocks_without_measurements_are_in_no_score_and_their_number_is_said(ho
     problem = LogProblem(lost, GUESS, hold_gaps=hold)
     data = problem.data(range(len(problem.parts.blocks)))
     scored = (~np.isnan(data.measurements[:, data.first_scored :, 0])).sum(axis=1)
-    assert scored.min() >= np.median(scored) / 4 and len(problem.parts.blocks) + problem.parts.empty == 24
-    assert problem.parts.empty >= 16
-    assert f"{problem.parts.empty} of 24 blocks are left out and in no score" in " ".join(problem.remarks)
+    assert scored.min() >= np.median(scored) / 4 and len(problem.parts.blocks) + problem.parts.empty == 73
+    assert problem.parts.empty >= 50
+    assert f"{problem.parts.empty} of 73 blocks are left out and in no score" in " ".join(problem.remarks)
     held = problem.data(problem.parts.held_out)
     evaluation = evaluate(untuned_choice("kf", problem).filter(problem), held, None)
     assert (evaluation.log_likelihoods != 0.0).all()
@@ -137,7 +138,17 @@ def test_short_logs_have_shorter_lead_ins_and_blocks_and_it_is_said(rows, lead):
 
 def test_a_lead_in_that_is_given_stays():
     problem = LogProblem(logs_of(23, 24, 20), GUESS, lead=0)
-    assert problem.parts.lead == 0 and sum(block.rows for block in problem.parts.blocks) == 24 + 25 + 21
+    assert problem.parts.lead == 0 and [block.rows for block in problem.parts.blocks] == [6] * 11  # of 70 rows
+
+
+@pytest.mark.parametrize(("steps", "count"), [((1500, 1500, 1500), 72), ((900, 130, 400), 51), ((4000,), 73)])
+def test_blocks_of_all_logs_have_one_length_and_few_rows_are_left_out(steps, count):
+    parts = parts_of(logs_of(*steps), sizes=True)
+    lengths = {block.rows for block in parts.blocks}
+    assert len(lengths) == 1 and len(parts.blocks) == count
+    assert sum(steps) - 50 * len(steps) - count * (lengths.pop() - 50) <= 0.1 * sum(steps)
+    assert len(parts.sizes) * 3 <= len(parts.training) + len(parts.sizes) < (len(parts.sizes) + 1) * 3
+    assert {parts.blocks[i].run for i in parts.sizes} == {parts.blocks[i].run for i in parts.training}
 
 
 def test_recordings_of_logs_that_were_not_read_are_empty():

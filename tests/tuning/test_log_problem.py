@@ -176,7 +176,7 @@ def test_what_has_ranges_has_a_rule_of_thumb():
 
 def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ensemble_size():
     logs = logs_of(600, 500, truth=True)
-    problem = checked_problem(LogProblem(logs, MODEL, lead=LEAD))
+    problem = checked_problem(LogProblem(logs, MODEL, lead=LEAD, blocks=12))
     data = problem.data(problem.training_seeds(0, 32))
     assert problem.scale[0] == pytest.approx(data.states[data.scored].std(), rel=1e-12)
     assert problem.parts.sizes and not {*problem.parts.sizes} & {*problem.parts.training, *problem.parts.held_out}

@@ -1,5 +1,6 @@
 """The choice at the end: the best trials meet the baselines on seeds of their own, and may give way."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -14,10 +15,12 @@ from filters.tuned_file import read_tuned_file
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
+from tests.tuning.test_log_problem import MODEL, logs_of
 from tuning.api.user_choice import user_choice
 from tuning.evaluation.baselines import FULL_Q, GIVEN, NOISE, ORACLE, RULE, SCALED
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.excitation import Steps
+from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.reporting.choice_words import choice_sentences
@@ -32,6 +35,7 @@ from tuning.search.ranges import at_ends, range_words
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.validation import (
+    Failure,
     Met,
     Validation,
     _best_of,
@@ -40,6 +44,7 @@ from tuning.search.validation import (
     _wins,
     as_data,
     choice_from,
+    finalists_of,
     validate,
 )
 
@@ -236,6 +241,44 @@ def test_candidates_stay_within_own_parameters_and_a_full_q_is_an_option_that_th
         assert (
             f"{100 * (1 - met.full.over.value):.1f} % [" in said and "(--full-q), on 100 validation seeds." in said
         )
+
+
+def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_not():
+    plan = Plan("kf", (LinearProblem(truth=False),), objectives=("likelihood",))
+    trial = _met("trial 3", -610.0, -1740.0, 523.0)._replace(chance=0.004)
+    failure = Failure("run2.csv from 12 to 13.5 s", 8.9, 1.4)
+    given = _met(GIVEN, 0.0, 0.0, 0.0)
+    meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", "trial 3", None)
+    meeting = meeting._replace(tested=GIVEN, failures=(failure,), failed=1, runs=48)
+    assert choice_sentences(as_data(meeting), plan) == [
+        "Trial 3 is taken: on 2 validation seeds it has +610 [-523, +1.74e+03] beside the log-likelihood of a run "
+        "of the best baseline, the given numbers, and is better in most of them (Wilcoxon's signed ranks, p = "
+        "0.004).",
+        "The given numbers fail in 1 of 48 seeds, run2.csv from 12 to 13.5 s with a mean NIS of 17.8 (trial 3: "
+        "2.8), where 2 is right.",
+    ]
+    lost = trial._replace(worse_in=("run1.csv",))
+    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    assert "no trial is significantly better and in no log worse (trial 3 has" in said[0]
+    assert said[0].endswith("and is worse in run1.csv).")
+
+
+def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
+    logs = logs_of(900, 900, 900)
+    disturbed = logs[1].measurements.copy()
+    disturbed[600:640, 0] += 9.0 * np.sign(np.sin(np.arange(40)))
+    logs[1] = dataclasses.replace(logs[1], measurements=disturbed, start=100.0)
+    problem = LogProblem(logs, MODEL.replace(process_noise_cov=[0.3]))
+    study = tuning.tune(problem, "kf", trials=6, progress=False)
+    met, first = study.tuning.result.validation, 100.0 + 0.1 * 600
+    assert met.tested == GIVEN and 1 <= met.failed <= 3 and met.runs == len(problem.parts.blocks) * 2 // 3
+    for one in met.failures:
+        name, _, start, _, end, _ = one.run.split()
+        assert name == "run1" and float(start) <= first + 4.0 and float(end) >= first and one.nis > 2.0
+    likely = {f"trial {one.number + 1}" for one in study.trials if MAXIMUM_LIKELIHOOD in one.user_attrs}
+    assert likely and likely <= {*finalists_of(study.tuning.plan, study.trials)}
+    assert any("The given numbers fail in" in sentence for sentence in study.tuning.chosen)
+    assert met.met[0].name == GIVEN
 
 
 def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_said():

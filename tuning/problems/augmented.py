@@ -220,6 +220,14 @@ class AugmentedProblem(Problem):
         """Those of the problem."""
         return self.problem.held_out_seeds(seed, count)
 
+    def logs_of(self, seeds: Sequence[int]) -> np.ndarray | None:
+        """Those of the problem."""
+        return self.problem.logs_of(seeds)
+
+    def run_label(self, seed: int) -> str:
+        """That of the problem."""
+        return self.problem.run_label(seed)
+
     def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
         """As the problem does."""
         self.problem.check_tuned_for(plant, file)
@@ -229,6 +237,7 @@ class AugmentedProblem(Problem):
         return {"of": {"digest": self.problem.digest, "content": self.problem.as_mapping()}}
 
     remarks = property(lambda self: self.problem.remarks)
+    log_names = property(lambda self: self.problem.log_names)
     lacks_ranges = property(lambda self: self.problem.lacks_ranges)
     scale_about = property(lambda self: self.problem.scale_about)
     counts_start_up = property(lambda self: self.problem.counts_start_up)

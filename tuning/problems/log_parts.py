@@ -11,7 +11,7 @@ from thruster_env.numerics.checks import at_least, short_repr
 from thruster_env.plants.logs.log import Log
 
 LEAD = 50  # steps at the start of a block that are filtered and not scored
-WANTED = 24  # approximate number of blocks that logs are cut into: standard errors need several
+WANTED = 72  # approximate number of blocks that logs are cut into: tests and standard errors need many
 SHORTEST = 25  # scored rows of a block
 SIZES = (
     (LEAD, SHORTEST),
@@ -20,8 +20,11 @@ SIZES = (
     (6, 4),
     (2, 3),
 )  # lead-ins and scored rows: short logs have later ones
-EVERY_THIRD, EVERY_FOURTH = 3, 4
+EVERY_THIRD = 3
+LENGTHS = 64  # lengths of a block that are tried, to lose few rows
+MOST_LOST = 0.05  # share of rows that blocks of one length may leave out, if shorter ones leave out fewer
 FEWEST = 2  # training blocks, and as many held-out blocks
+FEWEST_APART = 3  # blocks that are set aside, if any are
 SHARE = 4  # a block has at least the usual share of rows with a measurement divided by this
 
 
@@ -92,18 +95,19 @@ def parts_of(
     """Cut logs into blocks for training, for the choice of the ensemble size, and for held-out evaluation.
 
     Each run is cut at its gaps (`thruster_env.plants.logs.log.Log.pieces`), and each piece into consecutive blocks
-    of nearly equal length; a block's lead-in are the rows before it. A block that is measured in less than a
+    of one length, so that they can be compared with one another; a block's lead-in are the rows before it, and the
+    first rows of a piece that make no block belong to its first lead-in. A block that is measured in less than a
     quarter of the usual share of its rows is left out. Held out are the named runs, else every third run of three
     or more, else every third block.
 
     Args:
         logs: of at least one run.
         lead: rows of a lead-in; if None 50, of short logs fewer, as many as let them have blocks.
-        blocks: number of blocks of each run; if None there are about 24 in all, each of 25 rows or more, of short
-            logs 3 or more.
+        blocks: number of blocks of each run, of nearly one length; if None there are about 72 in all, each of 25
+            rows or more, of short logs 3 or more.
         held_out: names of the held-out runs.
         hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
-        sizes: whether every fourth of the other blocks is set aside for the choice at the end.
+        sizes: whether every third of the other blocks is set aside for the choice at the end.
         known: which rows of each log have a truth, (rows,) bool; a block without any that is scored is left out.
         shortest: scored rows of a block; if None 25, of short logs fewer.
 
@@ -141,8 +145,13 @@ def _parts(
 ) -> Parts:
     """The blocks with a lead-in and a least number of scored rows; ValueError where there are too few."""
     long = [piece for piece in pieces if piece.rows >= lead + shortest]
-    counts = _counts(logs, long, lead, shortest, blocks)
-    cut = [block for piece, count in zip(long, counts, strict=True) for block in _cut(piece, lead, count)]
+    _check_lengths(logs, long, lead, shortest, 1 if blocks is None else blocks)
+    if blocks is None:
+        length = _length(long, lead, shortest)
+        cut = [block for piece in long for block in _cut_equally(piece, lead, length)]
+    else:
+        counts = _counts(long, lead, blocks)
+        cut = [block for piece, count in zip(long, counts, strict=True) for block in _cut(piece, lead, count)]
     if known is not None:
         rows = [known[one.run][one.first + lead : one.first + one.rows] for one in cut]
         cut = [block for block, there in zip(cut, rows, strict=True) if there.any()]
@@ -152,8 +161,8 @@ def _parts(
     held = _held(logs, all_blocks, held_out)
     held_blocks = [block for block, out in zip(all_blocks, held, strict=True) if out]
     left = [block for block, out in zip(all_blocks, held, strict=True) if not out]
-    choosing = left[EVERY_FOURTH - 1 :: EVERY_FOURTH] if sizes else []
-    if len(choosing) < FEWEST:
+    choosing = left[EVERY_THIRD - 1 :: EVERY_THIRD] if sizes else []
+    if len(choosing) < FEWEST_APART:
         choosing = []
     training = [block for block in left if block not in choosing]
     for some, what in ((training, "to learn from"), (held_blocks, "held out")):
@@ -170,23 +179,40 @@ def _parts(
     return Parts(whole, *ranges, lead, shortest, empty=empty, short_pieces=short)
 
 
-def _counts(
-    logs: Sequence[Log], pieces: Sequence[Piece], lead: int, shortest: int, blocks: int | None
-) -> list[int]:
-    """The number of blocks of each piece; ValueError where a run is too short for any."""
-    scored = np.array([piece.rows - lead for piece in pieces])
-    count = 1 if blocks is None else blocks
+def _check_lengths(logs: Sequence[Log], pieces: Sequence[Piece], lead: int, shortest: int, count: int) -> None:
+    """Raise ValueError where a run is too short for so many blocks."""
     for run, log in enumerate(logs):
-        most = sum(rows // shortest for piece, rows in zip(pieces, scored, strict=True) if piece.run == run)
+        most = sum((piece.rows - lead) // shortest for piece in pieces if piece.run == run)
         if most < count:
             raise ValueError(
                 f"a log must have at least {lead + shortest * count} rows, {lead} of a lead-in and {shortest} of "
                 f"each block, but {log.name} has {log.steps + 1}"
                 + (f" in {len(log.pieces)} pieces between gaps" if len(log.pieces) > 1 else "")
             )
-    if blocks is None:
-        length = max(shortest, scored.sum() / WANTED)
-        return [max(1, min(round(rows / length), rows // shortest)) for rows in scored.tolist()]
+
+
+def _length(pieces: Sequence[Piece], lead: int, shortest: int) -> int:
+    """The length of blocks: about 72 in all, two or more of each run that is long enough, few rows left over."""
+    rows = np.array([piece.rows - lead for piece in pieces])
+    runs = np.array([piece.run for piece in pieces])
+    longest = min(int(rows[runs == run].max()) for run in set(runs.tolist()))
+    usual = max(shortest, min(int(rows.sum()) // WANTED, longest // FEWEST))
+    lengths = np.unique(np.linspace(shortest, usual, LENGTHS).astype(int))[::-1]
+    lost = [float((rows % length).sum() / rows.sum()) for length in lengths.tolist()]
+    few = [length for length, share in zip(lengths.tolist(), lost, strict=True) if share <= MOST_LOST]
+    return few[0] if few else int(lengths[int(np.argmin(lost))])
+
+
+def _cut_equally(piece: Piece, lead: int, length: int) -> list[Block]:
+    """As many blocks of a length as a piece has, up to its last row."""
+    last = piece.first + piece.rows
+    starts = range(last - (piece.rows - lead) // length * length, last, length)
+    return [Block(piece.run, start - lead, length + lead) for start in starts]
+
+
+def _counts(pieces: Sequence[Piece], lead: int, blocks: int) -> list[int]:
+    """The number of blocks of each piece, of so many of each run."""
+    scored = [piece.rows - lead for piece in pieces]
     of_runs = [sum(r for piece, r in zip(pieces, scored, strict=True) if piece.run == one.run) for one in pieces]
     return [max(1, round(blocks * rows / all_rows)) for rows, all_rows in zip(scored, of_runs, strict=True)]
 

@@ -44,8 +44,9 @@ class LogProblem(AssumedProblem):
 
     The problem decides which blocks are for training and which are held out, whatever the seed of the study: see
     `tuning.problems.log_parts`. A block has a lead-in that filters run through and that is not scored, and no gap:
-    runs are cut there, and blocks with too few measurements are left out; `remarks` says so. Blocks may differ in
-    length, and each counts in full; where true states are known at some steps only, these are scored.
+    runs are cut there, and blocks with too few measurements are left out; `remarks` says so. A given number of
+    blocks may differ in length, and each counts in full; where true states are known at some steps only, these
+    are scored.
 
     Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.plants.steps`), without
     true states, and a tuned file is for the model of a step of dt.
@@ -57,7 +58,7 @@ class LogProblem(AssumedProblem):
         logs: recorded runs with the same sample time, with the model's inputs and measurements.
         assumed: the model that filters assume, or a function of `parameters` that makes it.
         lead: steps of a lead-in; 50 if None, of short logs fewer.
-        blocks: number of blocks of each run; if None there are about 24 in all.
+        blocks: number of blocks of each run; if None there are about 72 of one length in all.
         hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
         start: where blocks begin: "prior", as the model's prior says, or "measurement", where their first
             measurement does (`filters.starts.cov_of_measured_starts`), the prior elsewhere.
@@ -191,6 +192,23 @@ class LogProblem(AssumedProblem):
     def held_out_seeds(self, seed: int, count: int) -> range:
         """Numbers of all held-out blocks, for any count."""
         return self.parts.held_out
+
+    def logs_of(self, seeds: Sequence[int]) -> np.ndarray:
+        """The number of each block's log: neighbouring blocks of one log depend on each other."""
+        return np.array([self.parts.blocks[seed].run for seed in seeds])
+
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """The names of the logs."""
+        return tuple(log.name for log in self.logs)
+
+    def run_label(self, seed: int) -> str:
+        """The log of a block, and the times of its scored rows by the log's own clock."""
+        block = self.parts.blocks[seed]
+        log = self.recorded[block.run]
+        first, last = block.first + self.parts.lead, block.first + block.rows - 1
+        start, end = (log.start + log.times[row] for row in (first, last))
+        return f"{log.name} from {start:.6g} to {end:.6g} s"
 
     @property
     def range_seeds(self) -> range:

@@ -79,6 +79,19 @@ class Problem(ABC):
         """Seeds that a study with a given seed never sees."""
         return seeds.held_out_seeds(seed, count)
 
+    def logs_of(self, seeds: Sequence[int]) -> np.ndarray | None:
+        """The number of the log of each block, (B,), whose neighbours are dependent; None for independent runs."""
+        return None
+
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """The names of the logs, by the numbers of `logs_of`; none without logs."""
+        return ()
+
+    def run_label(self, seed: int) -> str:
+        """A run in a sentence: "seed 1007", or the log and the times of a block."""
+        return f"seed {seed}"
+
     @property
     @abstractmethod
     def untuned(self) -> Mapping:

@@ -22,7 +22,7 @@ PARTS = ("inputs", "measurements", "states")
 class RunsProblem(LogProblem):
     """Runs as arrays, each of which begins where the model's prior does; the seed of a run is its number.
 
-    Every third run of three or more is held out; of those with truth every fourth of the others is for the choice
+    Every third run of three or more is held out; of those with truth every third of the others is for the choice
     of an ensemble size. Each run counts in full: errors are pooled over all scored steps of all runs.
 
     Args:

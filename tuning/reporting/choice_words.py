@@ -13,6 +13,7 @@ from typing import Any
 from filters.consistency.intervals import Interval, span
 from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, called
+from tuning.search.measures import LEVEL
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, PROPER
 from tuning.search.validation import choice_from
 
@@ -20,7 +21,7 @@ FULL_NOISE = {FULL_Q: "--full-q", FULL_QR: "--full-q --full-r"}  # by the option
 
 
 def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
-    """The choice and its reason, then the price of a mean NIS within its band where it was too high.
+    """The choice and its reason, the runs in which what was given fails, and what a mean NIS in its band costs.
 
     Args:
         found: from `tuning.search.validation.as_data`, or of a tuned file; nothing is said of None.
@@ -41,9 +42,16 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     elif found.get("by_error") and found["by_error"] != chosen:
         said = [_log_score_sentence(met[chosen], met[found["by_error"]], where, what)]
     elif found["gave_way"]:
+        lost = met[candidate].get("worse_in")
+        but = f", and is worse in {_listed(lost)}" if lost else ""
         said = [
-            f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better ({candidate} "
-            f"has {over} its {what})."
+            f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better{_also(lost)} "
+            f"({candidate} has {over} its {what}{but})."
+        ]
+    elif _is_even(met[candidate]["over"], likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
+        said = [
+            f"{_capital(candidate)} is taken: on {where} it has {over} the {what} of {best}, and is better in "
+            f"most of them (Wilcoxon's signed ranks, p = {met[candidate]['chance']:.2g})."
         ]
     elif _is_even(met[candidate]["over"], likely):
         said = [
@@ -56,8 +64,10 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
             f"Your own parameters cannot express its Q and R; in {candidate} they are "
             f"{_own(met[candidate], plan)}."
         )
+    channels = len(plan.scenarios[0].quantities.measurements)
+    if found.get("failures"):
+        said.append(_failures_sentence(found, plan.scenarios[0].seed_word, channels))
     if found["price"] is not None and found["price"] > MOST_PRICE:
-        channels = len(plan.scenarios[0].quantities.measurements)
         said.append(_price_sentence(found, met[candidate], what, channels))
     if found.get("full"):
         said.append(_full_sentence(found["full"], what, where, likely))
@@ -101,6 +111,26 @@ def _the(name: str) -> str:
     return name if name.startswith("trial ") else f"the {called(name)}"
 
 
+def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
+    """Where what was given fails, and how the best trial does there."""
+    failed, runs = found["failed_runs"]
+    named = [
+        f"{one['run']} with a mean NIS of {rounded(channels * one['nis'])}"
+        + (
+            ""
+            if found["candidate"] == found["tested"]
+            else f" ({found['candidate']}: {rounded(channels * one['candidate'])})"
+        )
+        for one in found["failures"]
+    ]
+    most = "" if failed == len(named) else "most of all in "
+    tested = found["tested"]
+    return (
+        f"The {called(tested)} {'fail' if _verb(tested) == 'are' else 'fails'} in {failed} of {runs} {word}, "
+        f"{most}{_listed(named)}, where {channels} is right."
+    )
+
+
 def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) -> str:
     """The price of the band, with both sides of the choice."""
     inside = [one for one in found["met"] if one["consistent"] and one["name"].startswith("trial ")]
@@ -142,6 +172,14 @@ def _what(plan: Any) -> str:
         LIKELIHOOD: "log-likelihood of a run",
     }
     return named.get(plan.objectives[0], "error")
+
+
+def _also(lost: Sequence[str] | None) -> str:
+    return " and in no log worse" if lost else ""
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
 
 
 def _range(ends: Sequence[int]) -> range:

@@ -1,4 +1,7 @@
-"""Filters on validation seeds: an objective with each run left out once, for paired comparisons by jackknife."""
+"""Filters on validation seeds: an objective with each run left out once and of each run, for paired comparisons.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,18 @@ from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
 LEVEL = 0.05  # of a two-sided interval
+ONE_ERROR = 0.16  # one-sided level: a loss of about one standard error
+FEWEST = 3  # runs of a log, of which a loss or an autocorrelation is computed
+MOST_CORRELATED = 0.8  # autocorrelation of neighbouring blocks, as far as an effective number is computed
+
+
+class Runs(NamedTuple):
+    """A filter in each of the B runs of a problem."""
+
+    values: np.ndarray  # (B, 1), the objective of each run; of errors (B, k), square errors of states over scale
+    nis: np.ndarray  # (B,), sum over scored steps
+    channels: np.ndarray  # (B,), number of measured values, the expected sum
+    logs: np.ndarray | None = None  # (B,), the log of each block, in order of time; None for independent runs
 
 
 class Measured(NamedTuple):
@@ -40,52 +55,63 @@ class Measured(NamedTuple):
     ] = ()  # `proper` with each run left out, (B,); empty unless it is a log score
     nees: float = math.nan  # mean NEES over the number of states, on the problem where it is farthest from 1
     state_nees: float = math.nan  # that of a scored state over 1, where it is farthest
+    runs: tuple[Runs, ...] = ()  # of each problem
+    decisive: tuple[int, ...] = ()  # the problems that determine the objective: all, or the worst one
 
 
 def measured(choice: Choice, plan: Plan, data: Sequence[Data]) -> Measured:
     """Run a choice on all data and measure the plan's first objective, with its penalty for each restart."""
     found = [_on(choice, problem, one, plan) for problem, one in zip(plan.scenarios, data, strict=True)]
     wholes = [whole for whole, *_ in found]
+    decisive = (int(np.argmax(wholes)),) if plan.worst else tuple(range(len(found)))
     if plan.worst:
         rest = [max((*wholes[:i], *wholes[i + 1 :]), default=-math.inf) for i in range(len(found))]
         value, parts = max(wholes), tuple(np.maximum(one[1], rest[i]) for i, one in enumerate(found))
     else:
         value = float(np.mean(wholes))
         parts = tuple(value + (parts - whole) / len(found) for whole, parts, *_ in found)
-    evaluations = [evaluation for _, _, evaluation, _ in found]
+    evaluations = [evaluation for _, _, evaluation, *_ in found]
     scored = not any(math.isnan(one.log_score.value) for one in evaluations)
     proper = float(np.mean([one.log_score.value if scored else one.log_likelihood for one in evaluations]))
-    others = [proper + (others - one.log_score.value) / len(found) for *_, one, others in found] if scored else ()
+    others = (
+        [proper + (others - one.log_score.value) / len(found) for *_, one, others, _ in found] if scored else ()
+    )
     states = [ratio for one in evaluations for ratio in one.scored_nees.values()]
     nees = farthest(map(nees_ratio, evaluations)), farthest(states)
-    return Measured(value, parts, proper, tuple(map(nis_ratio, evaluations)), tuple(others), *nees)
+    nis, runs = tuple(map(nis_ratio, evaluations)), tuple(runs for *_, runs in found)
+    return Measured(value, parts, proper, nis, tuple(others), *nees, runs, decisive)
 
 
-def _on(choice: Choice, problem, data: Data, plan: Plan) -> tuple[float, np.ndarray, Evaluation, np.ndarray]:
-    """The objective, the same without each run (B,), all metrics, and the log score without each run (B,)."""
+def _on(choice: Choice, problem, data: Data, plan: Plan) -> tuple[float, np.ndarray, Evaluation, np.ndarray, Runs]:
+    """The objective, the same without each run (B,), all metrics, the log score without each run, and the runs."""
     filter_ = choice.filter(problem)
     by_output = plan.found_objectives()[0].output
     all_runs = metrics_of_all(filter_, data, True, bool(by_output), problem.scale)
     evaluation = compute_metrics(filter_, all_runs, data, problem.scale, False, False)
-    value, parts = _values(plan.objectives[0], by_output, all_runs, evaluation)
+    value, parts, each = _values(plan.objectives[0], by_output, all_runs, evaluation)
     restarts = all_runs.divergences
     value += DIVERGENCE_PENALTY * restarts.sum()
     parts = parts + DIVERGENCE_PENALTY * (restarts.sum() - restarts)
     log_scores = np.asarray(math.nan)
     if not math.isnan(evaluation.log_score.value):
         log_scores = -_values(LOG_SCORE, "", all_runs, evaluation)[1]
-    return value, parts, evaluation, log_scores
+    sums = np.nansum(all_runs.nis, axis=1), all_runs.present.sum(axis=1)
+    runs = Runs(each + DIVERGENCE_PENALTY * restarts[:, None], *sums, problem.logs_of(data.seeds))
+    return value, parts, evaluation, log_scores, runs
 
 
-def _values(objective: str, output: str, runs: RunMetrics, evaluation: Evaluation) -> tuple[float, np.ndarray]:
-    """An objective of all runs, and of all but each one (B,), both finite."""
+def _values(
+    objective: str, output: str, runs: RunMetrics, evaluation: Evaluation
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """An objective of all runs, of all but each one (B,), and its parts in each run (B, k), all finite."""
     if objective in PROPER:
         totals, counts = -runs.log_likelihoods, np.ones(len(runs.divergences))
         if objective == LOG_SCORE:  # over steps, of which runs may have more or fewer
             steps = np.asarray(runs.log_scores)
             totals, counts = -np.nansum(steps, axis=1), (~np.isnan(steps)).sum(axis=1)
         others = np.maximum(counts.sum() - counts, 1)
-        return _finite(totals.sum() / counts.sum()), _finite((totals.sum() - totals) / others)
+        each = _finite(totals / np.maximum(counts, 1))[:, None]
+        return _finite(totals.sum() / counts.sum()), _finite((totals.sum() - totals) / others), each
     squares, scale = runs.mean_squares, evaluation.scale
     if objective.startswith(OUTPUT) or output:
         squares, scale = runs.output_mean_squares[output], np.ones(1)
@@ -96,10 +122,12 @@ def _values(objective: str, output: str, runs: RunMetrics, evaluation: Evaluatio
         others = ((weights * squares).sum(axis=0) - weights * squares) / (weights.sum() - weights)
     counted = np.isfinite(scale)
     with np.errstate(invalid="ignore"):
-        relative = np.maximum(others[:, counted], 0.0) / scale[counted] ** 2
+        relative, each = (np.maximum(some[:, counted], 0.0) / scale[counted] ** 2 for some in (others, squares))
         parts = relative.sum(axis=1) if objective == MSE else np.sqrt(relative).mean(axis=1)
+    if objective == MSE:
+        each = each.sum(axis=1, keepdims=True)
     error = mse if objective == MSE else score
-    return _finite(error(squares, scale, runs.weights)), _finite(parts)
+    return _finite(error(squares, scale, runs.weights)), _finite(parts), _finite(each)
 
 
 def _finite(value):
@@ -126,25 +154,121 @@ def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
         return np.log(a / b) if ratio else a - b
 
     each = [between(a, b) for a, b in zip(one.left_out, other.left_out, strict=True)]
-    ends = _jackknife(float(between(one.value, other.value)), each)
+    ends = _jackknife(float(between(one.value, other.value)), each, one.runs)
     return Interval(*(math.exp(min(end, 700.0)) if ratio else end for end in ends))
 
 
 def log_score_gain(one: Measured, other: Measured) -> Interval:
     """The log score of the true states [nat a step] of one filter minus another's, with the interval of `over`."""
     each = [a - b for a, b in zip(one.log_scores, other.log_scores, strict=True)]
-    return _jackknife(one.proper - other.proper, each)
+    return _jackknife(one.proper - other.proper, each, one.runs)
 
 
-def _jackknife(value: float, left_out: Sequence[np.ndarray]) -> Interval:
+def _jackknife(value: float, left_out: Sequence[np.ndarray], runs: Sequence[Runs]) -> Interval:
     """A value with Student's interval, from the values without each run of each problem."""
     from scipy.special import stdtrit
 
     variance, freedom = 0.0, 0
-    for each in left_out:
-        count = len(each)
-        variance += (count - 1) / count * float(((each - each.mean()) ** 2).sum())
+    for i, each in enumerate(left_out):
+        count, logs = len(each), runs[i].logs if runs else None
+        variance += (count - 1) / count * float(((each - each.mean()) ** 2).sum()) * _inflation(each, logs)
         freedom += count - 1
     quantile = float(stdtrit(freedom, 1.0 - LEVEL / 2.0)) if freedom else math.inf
     half = quantile * math.sqrt(variance) if freedom else math.inf
     return Interval(value, value - half, value + half)
+
+
+def signed_rank(one: Measured, other: Measured, *, ratio: bool) -> float:
+    """One-sided p-value of "one filter is no better than the other in most runs", by Wilcoxon's signed ranks.
+
+        d_b = v_1b - v_2b   or, of errors,   d_b = sum_i (m_1bi - m_2bi) / sqrt(mean_b m_1bi + mean_b m_2bi),
+        T = sum_b sign(d_b) rank(|d_b|),   p = Phi((T + 1) / sqrt(f sum_b rank^2)),   f = (1 + r)/(1 - r)
+
+    with the objective v or the mean square errors m_i of states over their scale in run b. The second is the part
+    of a run in the difference of scores, to first order: the median of ratios favours filters that are better in
+    easy runs. A single run counts as one rank however much it differs, so that a heavy tail does not hide what all
+    other runs say. Of blocks of logs r is the autocorrelation of neighbours.
+
+    Args:
+        one: of one filter.
+        other: of the other, on the same runs.
+        ratio: whether objectives are errors, compared by their ratio; otherwise by their difference.
+
+    Sources: F. Wilcoxon (1945), "Individual comparisons by ranking methods", Biometrics Bulletin 1(6); G. V.
+    Bayley, J. M. Hammersley (1946), "The 'effective' number of independent observations in an autocorrelated time
+    series", Suppl. J. Royal Statistical Society 8(2).
+    """
+    return _rank_chance(_differences(one, other, ratio)) if one.runs else 1.0
+
+
+def is_better(one: Measured, other: Measured, *, ratio: bool) -> bool:
+    """Whether a filter is significantly better by the interval of `over`, or as a whole and by signed ranks."""
+    found, equal = over(one, other, ratio=ratio), 1.0 if ratio else 0.0
+    return found.high < equal or (found.value < equal and signed_rank(one, other, ratio=ratio) < LEVEL / 2.0)
+
+
+def logs_with_loss(one: Measured, other: Measured, *, ratio: bool) -> list[tuple[int, int]]:
+    """The logs, as (problem, log), in which one filter is worse by a standard error, in the mean or by ranks.
+
+    Blocks of another log, to come, may resemble those of any one log and not their mixture.
+    """
+    from scipy.special import stdtr
+
+    lost, places = [], _places(one, other)
+    for place, (each, logs) in zip(places, _differences(one, other, ratio), strict=True):
+        for log in [] if logs is None else np.unique(logs).tolist():
+            gain = -each[logs == log]
+            if len(gain) < FEWEST or not gain.any():
+                continue
+            error = gain.std(ddof=1) / math.sqrt(len(gain))
+            by_mean = stdtr(len(gain) - 1, gain.mean() / error) if error > 0 else float(gain[0] > 0)
+            if min(by_mean, _rank_chance([(gain, None)])) < ONE_ERROR:
+                lost.append((place, log))
+    return lost
+
+
+def _places(one: Measured, other: Measured) -> list[int]:
+    return sorted({*one.decisive, *other.decisive})
+
+
+def _differences(one: Measured, other: Measured, ratio: bool) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """Differences of runs (B,), negative where the first filter is better, and their logs, by decisive problem."""
+    found = []
+    for place in _places(one, other):
+        a, b = one.runs[place].values, other.runs[place].values
+        weights = a.mean(axis=0) + b.mean(axis=0) if ratio else np.ones(a.shape[1])
+        weights = np.where(weights > 0.0, weights, 1.0)  # a state without any error
+        found.append((((a - b) / np.sqrt(weights)).sum(axis=1), one.runs[place].logs))
+    return found
+
+
+def _rank_chance(parts: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> float:
+    """The p-value of the signed ranks of differences and their logs; ties share ranks, equal runs have none."""
+    from scipy.special import ndtr
+
+    differences = np.concatenate([each for each, _ in parts])
+    _, places, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
+    ranks = np.sign(differences) * (np.cumsum(counts) - (counts - 1) / 2.0)[places]
+    ends = np.cumsum([len(each) for each, _ in parts])[:-1]
+    split = zip(np.split(ranks, ends), parts, strict=True)
+    variance = sum(float(some @ some) * _inflation(some, logs) for some, (_, logs) in split)
+    return float(ndtr((ranks.sum() + 1.0) / math.sqrt(variance))) if variance else 1.0
+
+
+def _inflation(values: np.ndarray, logs: np.ndarray | None) -> float:
+    """The number of blocks over their effective number, (1 + r)/(1 - r); 1 for independent runs.
+
+    The autocorrelation r of neighbouring blocks of a log, about the mean of that log and with its bias 1/B
+    removed, counts where it exceeds its own standard error 1/sqrt(B).
+    """
+    if logs is None:
+        return 1.0
+    products = squares = 0.0
+    for log in np.unique(logs):
+        rest = values[logs == log]
+        if len(rest) >= FEWEST:
+            rest = rest - rest.mean()
+            squares += float(rest @ rest)
+            products += float(rest[1:] @ rest[:-1]) + float(rest @ rest) / len(rest)
+    r = min(products / squares, MOST_CORRELATED) if squares > 0 else 0.0
+    return (1.0 + r) / (1.0 - r) if r > 1.0 / math.sqrt(len(values)) else 1.0

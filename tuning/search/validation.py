@@ -5,10 +5,11 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import isfinite, nan
 from typing import NamedTuple
 
+import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.intervals import Interval, slightly
@@ -17,7 +18,17 @@ from filters.tuned_file import NOISE as NOISE_ARGUMENTS
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, GIVEN, competing_baselines, full_noise, same_filter
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
-from tuning.search.measures import Measured, log_score_gain, measured, over
+from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
+from tuning.search.measures import (
+    LEVEL,
+    Measured,
+    is_better,
+    log_score_gain,
+    logs_with_loss,
+    measured,
+    over,
+    signed_rank,
+)
 from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.parameters import model_parameters
@@ -30,6 +41,9 @@ VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outpu
 BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones
 NEES = ("nees", "state_nees")  # fields of `Met` that need truth
 EQUAL = 1e-4  # of the score, within which two filters are surely one in error, and consistency decides
+FAILS = 2.0  # mean NIS of a run over the number of channels, beyond which a filter fails there ...
+RARE = 1e-4  # ... if a consistent one has it more seldom than this
+WORST = 3  # runs in which a filter fails are named
 
 
 class Met(NamedTuple):
@@ -44,6 +58,16 @@ class Met(NamedTuple):
     consistent: bool  # whether it is in its band on all problems
     nees: float = nan  # mean NEES over the number of states, of several problems the one farthest from 1
     state_nees: float = nan  # mean e_i^2 / P_ii of the scored state where it is farthest from 1
+    chance: float = 1.0  # p-value of signed ranks: that it is no better than the best baseline in most runs
+    worse_in: tuple[str, ...] = ()  # logs in which it is worse than that by more than a standard error
+
+
+class Failure(NamedTuple):
+    """A run in which a baseline fails: its mean NIS over the number of channels, and that of the best trial."""
+
+    run: str  # in words: "seed 7", or the log and the times of a block
+    nis: float
+    candidate: float
 
 
 class Validation(NamedTuple):
@@ -58,6 +82,10 @@ class Validation(NamedTuple):
     price: float | None  # error of the best consistent trial over that of the best one, less 1
     full: Met | None = None  # noise estimation's full Q where it is better than the choice of own parameters
     by_error: str = ""  # which of the two the objective alone would choose; empty where the log score has no say
+    tested: str = ""  # the baseline whose failures these are: what was given, where there is any
+    failures: tuple[Failure, ...] = ()  # the worst of them, worst first
+    failed: int = 0  # number of runs in which it fails ...
+    runs: int = 0  # ... of so many, training and validation
 
     @property
     def gave_way(self) -> bool:
@@ -87,12 +115,20 @@ def validate(
 
     The best baseline is the one with the least objective. The best trial is the one with the best log score of
     the true states among those within 5 % of the least error; without truth it is the one with the least
-    objective among the consistent ones, if these cost at most 5 % more than the best of all. The best trial is
-    taken if it is significantly better than the best baseline (Student's 95 % interval of the jackknife), or if it
-    alone is consistent and surely loses less than 1e-4 of the error. Otherwise it gives way, also where parameters
-    of the user's own cannot give the baseline. At last the log score may decide for another: `_by_log_score`.
-    The interval is not widened for the number of trials: a trial that is taken by chance is one that hardly
-    differs, and held out it is significantly worse in less than 1 % of studies.
+    objective among the consistent ones, if these cost at most 5 % more than the best of all. The
+    maximum-likelihood trials are always among those that meet. A trial can be taken if
+
+    - it is significantly better than the best baseline, by Student's 95 % interval of the jackknife, or by
+      Wilcoxon's signed ranks of the runs if it is also better as a whole: one run in which a baseline fails makes
+      the interval so wide that it protects the baseline; or it alone is consistent and surely loses less than
+      1e-4 of the error;
+    - and in no log it is worse by more than a standard error: the mean over logs may be that of one, and the next
+      log like another.
+
+    If the best trial cannot be taken, the best of those that can is; if there is none, the best baseline. At last
+    the log score may decide for another: `_by_log_score`. The level is not divided by the number of trials: a
+    trial that is taken by chance is one that hardly differs, and held out it is significantly worse in less than
+    1 % of studies, but where failures are rare (docs/tuning.md).
 
     Args:
         plan: of the study.
@@ -119,37 +155,29 @@ def validate(
     finalists |= _rescaled(finalists, plan, training)
     everyone = {**before, **finalists}
     found = {name: measured(one, plan, data) for name, one in everyone.items()}
-    baseline = min(before, key=lambda name: found[name].value)
-    ratio = plan.objectives[0] not in PROPER
-    candidate, price = _best_of(plan, {name: found[name] for name in finalists}, ratio, found[baseline])
-    if candidate is not None:
+    choosing = Choosing(plan, {name: found[name] for name in before}, {name: found[name] for name in finalists})
+    for candidate in choosing.order():
         sized = resize(finalists[candidate], _is_consistent(found[candidate], plan))
         if not same_filter(sized, finalists[candidate]):
-            everyone[candidate], found[candidate] = sized, measured(sized, plan, data)
-    met = tuple(
-        Met(
-            name,
-            everyone[name],
-            one.value,
-            over(one, found[baseline], ratio=ratio),
-            one.proper,
-            max(one.nis, key=lambda part: abs(part - 1.0)),
-            _is_consistent(one, plan),
-            one.nees,
-            one.state_nees,
-        )
-        for name, one in found.items()
-    )
-    seeds = data[0].seeds
+            everyone[candidate], choosing.trials[candidate] = sized, measured(sized, plan, data)
+        if choosing.wins(candidate):
+            break
+    else:
+        candidate = choosing.best
+    wins = bool(candidate) and choosing.wins(candidate)
+    met = tuple(choosing.met(name, choice) for name, choice in everyone.items())
+    seeds, baseline = data[0].seeds, choosing.baseline
     own = not set(seeds) & set(training[0].seeds)
-    validation = Validation(seeds, own, met, baseline, candidate or baseline, baseline, price)
-    wins = candidate is not None and _wins(validation.named(candidate), validation.named(baseline), plan, ratio)
-    chosen = candidate if wins and candidate is not None else baseline
-    validation = validation._replace(chosen=chosen)
-    if ratio and plan.consistent and found[chosen].log_scores:
-        decided = {name: found[name] for name in (*before, *([candidate] if candidate else []))}
+    validation = Validation(
+        seeds, own, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
+    )
+    all_measured = {**choosing.baselines, **choosing.trials}
+    chosen = validation.chosen
+    if choosing.ratio and plan.consistent and all_measured[chosen].log_scores:
+        decided = {name: all_measured[name] for name in (*before, *([candidate] if candidate else []))}
         validation = validation._replace(chosen=_by_log_score(decided, chosen, baseline), by_error=chosen)
-    return validation._replace(full=_better_with_full_noise(plan, found[validation.chosen], of_kind, training))
+    full = _better_with_full_noise(plan, all_measured[validation.chosen], of_kind, training)
+    return _with_failures(validation._replace(full=full), plan, training, all_measured, data)
 
 
 def _better_with_full_noise(plan: Plan, chosen: Measured, kind: str, training: Sequence[Data]) -> Met | None:
@@ -182,13 +210,86 @@ def _full_noise(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Ch
     }
 
 
+class Choosing:
+    """The choice between baselines and trials that were measured on the same runs."""
+
+    def __init__(self, plan: Plan, baselines: Mapping[str, Measured], trials: Mapping[str, Measured]):
+        """Find the best baseline and the best trial; see `validate`."""
+        self.plan, self.ratio = plan, plan.objectives[0] not in PROPER
+        self.baselines, self.trials = dict(baselines), dict(trials)
+        self.baseline = min(baselines, key=lambda name: baselines[name].value)
+        best, self.price = _best_of(plan, self.trials, self.ratio, self.baselines[self.baseline])
+        self.best = best or ""
+
+    def order(self) -> Iterator[str]:
+        """The best trial, then of the others those that can be taken, the best first."""
+        if self.best:
+            yield self.best
+        others = {name: one for name, one in self.trials.items() if name != self.best and self.wins(name)}
+        while others:
+            best, _ = _best_of(self.plan, others, self.ratio)
+            yield str(best)
+            del others[str(best)]
+
+    def met(self, name: str, choice: Choice) -> Met:
+        """A filter beside the best baseline."""
+        one, other = {**self.baselines, **self.trials}[name], self.baselines[self.baseline]
+        nis = max(one.nis, key=lambda part: abs(part - 1.0))
+        lost = [
+            self.plan.scenarios[problem].log_names[log]
+            for problem, log in logs_with_loss(one, other, ratio=self.ratio)
+        ]
+        return Met(
+            name,
+            choice,
+            one.value,
+            over(one, other, ratio=self.ratio),
+            one.proper,
+            nis,
+            _is_consistent(one, self.plan),
+            one.nees,
+            one.state_nees,
+            signed_rank(one, other, ratio=self.ratio),
+            tuple(lost),
+        )
+
+    def wins(self, name: str) -> bool:
+        """Whether a trial can be taken instead of the best baseline."""
+        nothing = Choice("", {}, {})
+        return _wins(self.met(name, nothing), self.met(self.baseline, nothing), self.plan, self.ratio)
+
+
+def _with_failures(
+    found: Validation, plan: Plan, training: Sequence[Data], met: Mapping[str, Measured], data: Sequence[Data]
+) -> Validation:
+    """With the runs in which what was given fails, or the best baseline where nothing was given."""
+    from scipy.special import chdtrc
+
+    tested = found.named(GIVEN if GIVEN in met else found.baseline)
+    pair, failures, count = (tested, found.named(found.candidate)), [], 0
+    sets = [(training, [measured(one.choice, plan, training).runs for one in pair])] if found.own else []
+    for some, (ours, theirs) in [*sets, (data, [met[one.name].runs for one in pair])]:
+        for problem, part, a, b in zip(plan.scenarios, some, ours, theirs, strict=True):
+            count += len(part.seeds)
+            nis, other = (one.nis / np.maximum(one.channels, 1) for one in (a, b))
+            fails = (nis > FAILS) & (chdtrc(np.maximum(a.channels, 1), a.nis) < RARE)
+            failures += [
+                Failure(problem.run_label(part.seeds[i]), float(nis[i]), float(other[i]))
+                for i in np.flatnonzero(fails).tolist()
+            ]
+    worst = sorted(failures, key=lambda one: -one.nis)[:WORST]
+    return found._replace(tested=tested.name, failures=tuple(worst), failed=len(failures), runs=count)
+
+
 def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]:
-    """The trials that meet the baselines, by name: the best ones, and the best consistent ones."""
+    """The trials that meet the baselines, by name: the best, the best consistent, the maximum-likelihood ones."""
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     complete.sort(key=lambda trial: trial.values[0])
     best = best_trial(complete)
     first = [] if best is None else [best]
-    chosen = [*first, *complete[:BY_SCORE], *[one for one in complete if is_consistent(one)][:BY_CONSISTENCY]]
+    consistent = [one for one in complete if is_consistent(one)][:BY_CONSISTENCY]
+    likely = [one for one in complete if MAXIMUM_LIKELIHOOD in one.user_attrs]
+    chosen = [*first, *complete[:BY_SCORE], *consistent, *likely]
     return {f"trial {one.number + 1}": plan.choice_of(one.params) for one in chosen}
 
 
@@ -246,9 +347,7 @@ def _best_of(
         return None, None
     free = min(found, key=lambda name: found[name].value)
     near = [name for name, one in found.items() if one.value <= (1.0 + MOST_PRICE) * found[free].value]
-    better = (
-        [] if baseline is None else [name for name in near if over(found[name], baseline, ratio=ratio).high < 1]
-    )
+    better = [] if baseline is None else [name for name in near if is_better(found[name], baseline, ratio=ratio)]
     inside = [name for name, one in found.items() if _is_consistent(one, plan)]
     best = min(inside, key=lambda name: found[name].value, default=free)
     price = found[best].value / found[free].value - 1.0 if ratio and plan.is_constrained and inside else None
@@ -279,10 +378,14 @@ def _by_log_score(found: Mapping[str, Measured], chosen: str, baseline: str) -> 
 
 def _wins(candidate: Met, baseline: Met, plan: Plan, ratio: bool) -> bool:
     """Whether the best trial is taken and not the best baseline."""
+    if candidate.worse_in:
+        return False
+    by_ranks = candidate.chance < LEVEL / 2.0
     if not ratio:
-        return candidate.over.high < 0.0
+        return candidate.over.high < 0.0 or (by_ranks and candidate.over.value < 0.0)
     alone = plan.is_constrained and candidate.consistent and not baseline.consistent
-    return candidate.over.high < (1.0 + EQUAL if alone else 1.0)
+    least = candidate.over.high < (1.0 + EQUAL if alone else 1.0)
+    return least or (by_ranks and candidate.over.value < 1.0)
 
 
 def _is_consistent(found: Measured, plan: Plan) -> bool:
@@ -305,6 +408,9 @@ def as_data(found: Validation | None) -> dict | None:
         "by_error": found.by_error,
         "met": list(map(_met_as_data, found.met)),
         "full": found.full and _met_as_data(found.full),
+        "tested": found.tested,
+        "failures": [one._asdict() for one in found.failures],
+        "failed_runs": [found.failed, found.runs],
     }
 
 
@@ -313,7 +419,8 @@ def _met_as_data(one: Met) -> dict:
         name: value if isfinite(value) else None
         for name, value in zip(NEES, (one.nees, one.state_nees), strict=True)
     }
-    return {**one._asdict(), **nees, "over": list(one.over), "choice": one.choice._asdict()}
+    lists = {"over": list(one.over), "worse_in": list(one.worse_in)}
+    return {**one._asdict(), **nees, **lists, "choice": one.choice._asdict()}
 
 
 def choice_from(data: Mapping) -> Choice:
