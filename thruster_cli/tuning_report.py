@@ -89,6 +89,11 @@ def way_out(tuning: Tuning) -> list[str]:
     worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
     if not worse:
         return []
+    if tuning.plan.forget is not None:
+        return [
+            f"That is the price of forgetting within {tuning.plan.forget:g} s (--forget): the baselines in the "
+            "table may remember longer."
+        ]
     if tuning.gradient is not None or tuning.way is not None:
         option = "--way" if tuning.way is not None else "--method gradient"
         return [

@@ -86,7 +86,7 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
     if not filter_.has_covariance:
         return None
     path = slopes_along(filter_, runs)
-    if path is None:
+    if path is None or not _is_regular(path):
         return None
     model, n = filter_.kernel_model, filter_.kernel_model.n
     scales = _scales(model, path)
@@ -261,6 +261,13 @@ def _composed(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[n
     inner = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, k @ a)
     joined = through @ c @ b.swapaxes(1, 2) + d, a.swapaxes(1, 2) @ inner + j
     return through @ a, *(0.5 * (part + part.swapaxes(1, 2)) for part in joined)
+
+
+def _is_regular(path: Path) -> bool:
+    """Whether S of all channels that were measured can be solved for."""
+    seen = path.observations.any(axis=2)
+    variances = np.einsum("kii->ki", path.innovation_covs)
+    return bool((variances[seen] > 0.0).all())
 
 
 def _growth(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

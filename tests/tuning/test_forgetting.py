@@ -5,8 +5,9 @@ import pytest
 
 import tuning
 from filters import affine_model, run
+from filters.consistency.intervals import Interval
 from tests.linear_problem import LinearProblem
-from thruster_cli.tuning_report import as_json, report
+from thruster_cli.tuning_report import as_json, report, way_out
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence
 from tuning.problems.model_problem import ModelProblem
@@ -66,6 +67,10 @@ def test_a_filter_that_sleeps_is_warned_of_and_one_that_must_forget_recovers_fro
     error, stated = after_a_push(awake.filter)
     assert error < 3.0 * stated and 0.005 < stated < 0.02
     assert not any("hardly forgets" in one for one in awake.tuning.warnings)
+    (comparison,) = awake.tuning.comparisons
+    worse = comparison._replace(stored_ratios={"scaled default": Interval(2.0, 1.9, 2.1)})
+    (price,) = way_out(awake.tuning._replace(comparisons=(worse,)))
+    assert price.startswith("That is the price of forgetting within 0.5 s (--forget)")
     (entry,) = as_json(awake.tuning)["held_out"].values()
     assert DT * entry["tuned"]["time_constants"]["steps"][0] == pytest.approx(FORGET, rel=0.01)
     assert "Time constants of the gain: 0.5" in memory_sentence(awake.held_out.evaluation, awake.problem)
