@@ -175,8 +175,6 @@ def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path
     assert (
         done.returncode == 2 and "(--preset) must come with scenarios of the thruster's equations" in done.stderr
     )
-    done = thruster("evaluate", "--tuned", "t.json", "--preset", "t200")
-    assert done.returncode == 2 and "(--preset) must come with a problem" in done.stderr
 
 
 def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):  # noqa: F811

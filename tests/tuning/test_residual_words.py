@@ -91,6 +91,9 @@ def test_a_regression_has_the_densities_of_least_squares():
         others[:, 3::3], weights[0] + weights[1] * others[:, 1:-2:3][:, : others[:, 3::3].shape[1]], s
     )
     np.testing.assert_allclose(without[:, 3::3], held, rtol=1e-6)  # from the last value before the gap
+    short = data._replace(measurements=data.measurements[:, :4], inputs=data.inputs[:, :3])  # fewer rows than lags
+    np.testing.assert_allclose(log_densities(training, short, np.array([False]))[..., 0], found[:, :4], rtol=1e-9)
+    assert np.isnan(log_densities(short, data, np.array([False]))).all()
 
 
 def test_a_wrong_model_is_asked_for_and_never_called_consistent():

@@ -109,7 +109,7 @@ def _past(z: np.ndarray, u: np.ndarray) -> np.ndarray:
     """1, then z and u of the last rows, (T, 1 + 8 (m + p)), from z (T, m) and u (T - 1, p); NaN before these."""
     found = np.full((len(z), ORDERS[-1], z.shape[1] + u.shape[1]), np.nan)
     for lag in range(1, ORDERS[-1] + 1):
-        found[lag:, lag - 1] = np.hstack([z[:-lag], u[: len(u) + 1 - lag]])
+        found[lag:, lag - 1] = np.hstack([z[:-lag], u[: max(len(u) + 1 - lag, 0)]])
     return np.hstack([np.ones((len(z), 1)), found.reshape(len(z), -1)])
 
 
@@ -126,7 +126,9 @@ def _fitted(runs: list, i: int) -> tuple[list[int], np.ndarray, float] | None:
     width, best = (rows.shape[1] - 2 - i) // ORDERS[-1], None
     if len(rows) == 0:
         return None
-    triangle = np.linalg.qr(rows, mode="r")  # sums of squares of all these regressions are those of its columns
+    triangle: np.ndarray = np.linalg.qr(
+        rows, mode="r"
+    )  # sums of squares of all these regressions are those of its columns
     for order in ORDERS:
         columns = [*range(1 + order * width), *range(rows.shape[1] - 1 - i, rows.shape[1] - 1)]
         if len(rows) < FEWEST * len(columns):

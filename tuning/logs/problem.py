@@ -205,7 +205,7 @@ def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, An
     options = tune_options(read_tuned_file(tuned))
     if named.get("preset") is None:
         _check_model(options.get("model"), None, tuned)
-    stored = {name: options[name] for name in ("preset", "sensors") if name in options}
+    stored: dict[str, Any] = {name: value for name, value in options.items() if name in ("preset", "sensors")}
     return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
 
 
