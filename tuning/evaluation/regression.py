@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -126,9 +127,8 @@ def _fitted(runs: list, i: int) -> tuple[list[int], np.ndarray, float] | None:
     width, best = (rows.shape[1] - 2 - i) // ORDERS[-1], None
     if len(rows) == 0:
         return None
-    triangle: np.ndarray = np.linalg.qr(
-        rows, mode="r"
-    )  # sums of squares of all these regressions are those of its columns
+    # Sums of squares of all these regressions are those of the triangle's columns.
+    triangle: Any = np.linalg.qr(rows, mode="r")
     for order in ORDERS:
         columns = [*range(1 + order * width), *range(rows.shape[1] - 1 - i, rows.shape[1] - 1)]
         if len(rows) < FEWEST * len(columns):
