@@ -271,7 +271,8 @@ def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
     assert advice(choice, plan, [comparison]).endswith(
         "the covariance is consistent (mean NIS 1.76, expected 1.81)."
     )
-    said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [comparison]).parts
+    said, table, memory = held_out_section(None, Subject("s", plan, choice, None, 8, True), [comparison]).parts
+    assert memory.sentences[0].startswith("Time constants of the gain: ")
     assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
     assert table == errors_table(problem, comparison)
     assert ensemble_sizes(oracle_choice("enkf", problem), plan, []) == []

@@ -16,7 +16,7 @@ import pytest
 import tuning
 from filters import EstimateState
 from filters.engine.batch import run
-from filters.tuned_file import NOISE, read_tuned_file
+from filters.tuned_file import read_tuned_file
 from tests import pendulum_problem
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite
@@ -190,7 +190,7 @@ def test_a_problem_that_has_changed_is_not_what_a_file_was_tuned_on(tuned, tmp_p
         ValueError, match=f"must be the one it was tuned on, {problem.name} of digest {problem.digest}"
     ):
         read_tuned(path, [changed])
-    assert read_choice(path, changed).model.keys() == {"sigma", *NOISE}, "it may be evaluated there all the same"
+    assert read_choice(path, changed).model.keys() == {"sigma"}, "it may be evaluated there all the same"
     with pytest.raises(ValueError, match="was tuned for states theta"):
         read_choice(path, find_scenario("nominal"))
     with pytest.raises(ValueError, match="must be the same in all processes, of digest 0, but here it has "):
