@@ -37,10 +37,10 @@ tuning.compare(["ekf", "kf", "ukf", "enkf", "pf", "open-loop"], "nominal", seeds
 # ----------------
 #
 # With outliers in the sensor the ranking changes. No filter's model includes them; ``ekf-robust`` gives unlikely
-# measurements less weight.
+# measurements less weight. All have the plant's own Q and R here (``knows="true"``).
 
 comparison = tuning.compare(
-    ["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS
+    ["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS, knows="true"
 )
 comparison
 

@@ -109,6 +109,7 @@ comparison = tuning.compare(
     ["ekf", "ukf", "enkf", "pf", "ekf-robust", MaximumCorrentropyFilter],
     "outliers",
     seeds=SEEDS,
+    knows="true",
 )
 comparison
 

@@ -15,8 +15,10 @@ from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from thruster_env.numerics.checks import at_least
-from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on, without_unfit
+from tuning.api.compare import run_comparison
 from tuning.api.comparison import INTERRUPTED, left_out_lines
+from tuning.evaluation.fitting import DEFAULT_FILTERS, MOST_STATES
+from tuning.evaluation.knowledge import KNOWS
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.augmented import unknown_in
 from tuning.problems.find import find_problem
@@ -35,7 +37,7 @@ def command(
         list[str] | None,
         filter_option(
             f"{', '.join(FILTERS)}, or module:object for an estimator of another package; may be repeated. "
-            f"Without a filter or a file: {', '.join(DEFAULT_FILTERS)}."
+            f"Without a filter or a file: {', '.join(DEFAULT_FILTERS)} (pf for up to {MOST_STATES} states)."
         ),
     ] = None,
     scenarios: Annotated[
@@ -45,12 +47,11 @@ def command(
     preset: OfPresetOption = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     knows: Annotated[
-        str | None,
-        typer.Option(
-            help="The Q and R of filters named by --filter: true (oracle), scaled (scaled default), untuned (rule "
-            "of thumb) or given (the model's own). By default true, or scaled if the plant's Q and R are unknown.",
-            rich_help_panel=FILTER,
-        ),
+        str | None, typer.Option(help=f"{KNOWS[0].upper()}{KNOWS[1:]}", rich_help_panel=FILTER)
+    ] = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Number of trials of --knows study, which it implies.", rich_help_panel=FILTER),
     ] = None,
     augment: Annotated[
         list[str] | None,
@@ -82,27 +83,22 @@ def command(
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
-    trained = [str(file) for file in files or [] if is_trained(file)]
-    files = [file for file in files or [] if not is_trained(file)]
-    chosen = [find_problem(name) for name in scenarios or []] or [_default(files)]
+    chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
     chosen = [of_preset(one, preset) for one in chosen]
-    for file, problem in product(files, chosen):
-        read_choice(file, problem)  # a clear error for a file that is for another plant
-    names = [*trained, *(filters or ([] if files or trained else DEFAULT_FILTERS))]
+    for file, problem in product(files or [], chosen):
+        if not is_trained(file):
+            read_choice(file, problem)  # a clear error for a file that is for another plant
+    some = [*sorted(files or [], key=is_trained), *(filters or [])]
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(unknown_in, augment or []))
-    knows = knowledge_on(chosen) if knows is None else knows
-    some, left_out = without_unfit([*files, *names], chosen)
-    contenders = contenders_of(some, knows, unknown, sizes, seed)
-    for problem in chosen:
-        problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs
     announce_compilation()
-    found = compared(contenders, chosen, seed, seeds, progress_console)
+    options = {"knows": knows, "trials": trials, "unknown": unknown, "sizes": sizes}
+    found = run_comparison(some or None, chosen, seed, seeds, progress_console, **options)
     boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]
-    shown += left_out_lines(left_out)
+    shown += left_out_lines(found.left_out)
     if interrupted:
         shown.append(INTERRUPTED)
-    told = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": left_out}
+    told = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": found.left_out}
     emit(shown, {**told, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)
@@ -110,7 +106,8 @@ def command(
 
 def _default(files: list[Path]) -> Problem:
     """The default problem: that of the first file, or nominal."""
-    return [read_tuned(file)[1] for file in files][0] if files else find_problem("nominal")
+    tuned = [file for file in files if not is_trained(file)]
+    return read_tuned(tuned[0])[1] if tuned else find_problem("nominal")
 
 
 def _size(text: str) -> tuple[str | None, int]:

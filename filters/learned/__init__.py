@@ -39,8 +39,11 @@ def read_estimator(path: str | Path) -> TrainedEstimator:
     """The trained estimator of a file, which makes an estimator for a model.
 
     Raises:
-        ValueError: if torch or safetensors is not installed, or the file is none of `thruster train-estimator`.
+        ValueError: if there is no file, torch or safetensors is not installed, or the file is none of `thruster
+            train-estimator`.
     """
+    if not Path(path).is_file():
+        raise ValueError(f"a trained estimator must be a file, but there is none at {path}")
     check_installed()
     from filters.learned.file import read  # torch takes seconds to import
 

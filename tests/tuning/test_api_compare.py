@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from pathlib import Path
 
 import matplotlib.figure
 import numpy as np
@@ -10,13 +11,21 @@ import pytest
 import tuning
 from filters.augmented import Unknown
 from tests import pendulum_problem
+from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from tuning.evaluation.evaluate import evaluate
+from thruster_env.plants.affine import affine_model
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.fitting import default_filters
+from tuning.evaluation.knowledge import KNOWS, known
+from tuning.evaluation.residuals import model_error
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
+from tuning.problems.model_problem import ModelProblem
 from tuning.reporting.leaderboard import as_json as boards_as_json
+from tuning.search.plan import Plan
 from tuning.search.space import given_choice
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
@@ -79,10 +88,13 @@ def test_scores_are_drawn_with_their_intervals(comparison):
 
 
 def test_filters_are_tuned_first_where_that_is_asked_for(tmp_path):
-    found = tuning.compare(["kf", "ekf"], SHORT, trials=2, seeds=4, progress=False)
-    assert found.filters == ("kf tuned", "ekf tuned")
+    found = tuning.compare(["kf", "ekf"], SHORT, trials=4, seeds=4, progress=False)
+    assert found.filters == ("kf", "ekf")
+    plain = tuning.compare("ekf", SHORT, seeds=4, knows="untuned", progress=False).boards[0].rows[0]
+    kf, ekf = found.boards[0].rows
+    assert {kf.knows, ekf.knows} <= {"study", "scaled", "untuned", "noise"} and ekf.verdict == "better"
+    assert ekf.evaluation.score.value < plain.evaluation.score.value and "Model and plant" not in str(found)
     study = tuning.tune(SHORT, "ekf", trials=2, progress=False)
-    assert found.boards[0].rows[1].evaluation.score == tuning.evaluate(study, seeds=4).score
     file = study.save(tmp_path / "mine.json")
     again = tuning.compare([study, file, study, "ekf"], seeds=4, progress=False)
     assert again.filters == ("ekf tuned", "mine", "ekf tuned 2", "ekf") and again.problems == (SHORT,)
@@ -91,8 +103,6 @@ def test_filters_are_tuned_first_where_that_is_asked_for(tmp_path):
 
 
 def test_where_nobody_knows_the_noise_filters_have_the_scaled_default():
-    from tests.linear_problem import LinearProblem
-
     found = tuning.compare("ekf", LinearProblem(n=2, m=1, truth=False), seeds=4, progress=False)
     assert not found.boards[0].rows[0].evaluation.has_truth and "nan" not in found._repr_html_()
     assert np.isfinite(found.to_frame()["log-likelihood"]).all() and found.plot_scores().axes
@@ -104,8 +114,53 @@ def test_filters_with_what_a_model_came_with_are_those_of_the_baseline():
     choice = given_choice("kf", problem)
     data = problem.data(problem.held_out_seeds(0, 4))
     assert rows[0].evaluation.score == evaluate(choice.filter(problem), data, problem.scale).score
-    with pytest.raises(ValueError, match="given Q and R must be those of a user's model, .* but short has none"):
+    with pytest.raises(ValueError, match="given Q and R must be those of a user's model or .* but short has none"):
         tuning.compare("ekf", SHORT, seeds=2, knows="given")
+
+
+def sluggish(**options):
+    """A plant that is slower than its model; both have the same Q and R."""
+    noise = {"process_noise_cov": [0.04], "measurement_noise_cov": [1.0]}
+    start = {"prior_mean": [0.0], "prior_cov": [1.0], "b": np.ones((1, 1)), "c": [[1.0]], "states": ["x"], **noise}
+    truth, assumed = (affine_model(a=[[a]], **start) for a in (0.98, 0.7))
+    return ModelProblem(truth, assumed, Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), **options)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_with_a_wrong_model_each_filter_has_the_best_q_and_r_of_a_study_and_noise_estimation():
+    problem = sluggish(name="sluggish")
+    assert model_error(problem).startswith("the residuals of x have ")
+    found = tuning.compare("kf", problem, seeds=20, progress=False)
+    oracle = tuning.compare("kf", problem, seeds=20, knows="true", progress=False)
+    (row,), (other,) = found.boards[0].rows, oracle.boards[0].rows
+    assert row.knows in ("study", "noise") and other.knows == "true"
+    assert score_ratio(row.evaluation, other.evaluation).high < 0.9
+    text = " ".join(str(found).split())
+    assert "Model and plant differ: the residuals of x have" in text and "Model and plant" not in str(oracle)
+    right = ModelProblem(problem.truth, inputs=problem.inputs, steps=20, first_scored_step=4, scale=(1.0,))
+    assert model_error(right) == "" and known(None, "kf", right).source == "true"
+
+
+@pytest.mark.usefixtures("as_python")
+def test_particles_are_left_out_by_default_where_there_are_many_states():
+    found = tuning.compare(problem=LinearProblem(n=7, m=1, steps=20), seeds=2, knows="untuned", progress=False)
+    assert found.filters == ("ekf", "enkf 30") and "pf is left out: by default particles" in str(found)
+    assert default_filters([SHORT]) == (["ekf", "enkf", "pf"], {})
+
+
+def test_a_comparison_s_study_does_not_tune_the_ensemble_size():
+    assert Plan("enkf", (SHORT,)).space()["N"].single() is False
+    plan = Plan("enkf", (SHORT,), ensemble_size=7)
+    assert plan.space()["N"].single() and plan.choice_of({"N": 7}).numbers["ensemble_size"] == 7
+    assert plan.identity != Plan("enkf", (SHORT,)).identity
+
+
+def test_what_filters_know_has_one_explanation(thruster):  # noqa: F811
+    page = (Path(__file__).parents[2] / "docs" / "tuning.md").read_text()
+    help_text = thruster("compare", "--help").stdout.replace("│", " ")
+    columns = "".join(line[30:] for line in help_text.splitlines(keepends=True))  # without names and types
+    for text in (tuning.compare.__doc__.replace('"', ""), page, columns):
+        assert KNOWS.partition(": ")[2] in " ".join(text.split())
 
 
 WRONG = [
@@ -124,8 +179,8 @@ WRONG = [
         lambda: tuning.compare("enkf", ensemble_size=1),
         "must be a whole number of at least 2, but got 1",
     ),
-    (lambda: tuning.compare("ekf", knows="all"), "one of true, scaled, untuned, given, but got 'all'"),
-    (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out if filters are tuned"),
+    (lambda: tuning.compare("ekf", knows="all"), "one of true, scaled, .*, noise, study, but got 'all'"),
+    (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out, or 'study', with trials"),
     (lambda: tuning.compare("ekf", seeds=1), "held-out seeds must be a whole number of at least 2, but got 1"),
 ]
 

@@ -124,7 +124,7 @@ def test_a_size_is_for_filters_that_have_an_ensemble():
         (lambda: compare([], [NOMINAL], SEEDS), "a comparison must be of different filters, but got none"),
         (lambda: compare([contender("ekf")] * 2, [NOMINAL], SEEDS), "different filters, but got ekf, ekf"),
         (lambda: contender("none"), "filter must be one of"),
-        (lambda: contender("ekf", "much"), "knows must be one of true, scaled, untuned, given, but got 'much'"),
+        (lambda: contender("ekf", "much"), "knows must be one of true, .*, given, noise, study, but got 'much'"),
         (lambda: contender("enkf", ensemble_size=1).filter(NOMINAL), "ensemble_size must be"),
         (
             lambda: contender("ekf", unknown={"colour": None}).filter(NOMINAL),
@@ -175,7 +175,7 @@ def thruster(tmp_path, monkeypatch, capsys):
 
 
 def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
-    options = ("--filter", "ekf", "--filter", "ekf-robust", "--seeds", 8)
+    options = ("--filter", "ekf", "--filter", "ekf-robust", "--seeds", 8, "--knows", "true")
     code, out, _ = thruster(*options, "--scenario", "outliers", "--scenario", "nominal", "--json", "board.json")
     assert code == 0
     for word in ("one measured thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
@@ -209,19 +209,19 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     comparison = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
     write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [comparison], "s")
-    code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20)
+    code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20, "--knows", "true")
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
     assert "Q and R: of mine the tuned ones; of ekf the plant's own (oracle; --knows true)." in out
     code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")
     assert code == 0 and "On nominal no other filter can be compared with mine." in out
 
 
-def small_unknown():
+def small_unknown(r=1.0):
     """A walk that drifts, and a model that knows nothing of the drift: its Q is not the plant's."""
     noise = {"measurement_noise_cov": [1.0], "c": [[1.0, 0.0]]}
     start = {"prior_mean": [0.0, 0.1], "prior_cov": [1.0, 0.01], "process_noise_cov": [0.1, 1e-4]}
     truth = affine_model(a=[[0.9, 1.0], [0.0, 0.9]], b=np.zeros((2, 0)), states=["x", "y"], **noise, **start)
-    one = {"prior_mean": [0.0], "prior_cov": [1.0], "process_noise_cov": [0.1], "measurement_noise_cov": [1.0]}
+    one = {"prior_mean": [0.0], "prior_cov": [1.0], "process_noise_cov": [0.1], "measurement_noise_cov": [r]}
     assumed = affine_model(a=[[0.9]], b=np.zeros((1, 0)), c=[[1.0]], states=["x"], **one)
     return ModelProblem(truth, assumed, steps=60, scale=(1.0,))
 
@@ -234,13 +234,25 @@ def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thr
     assert "Q and R: the scaled default (--knows scaled)." in out
 
 
+def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_with(thruster, monkeypatch):
+    monkeypatch.setitem(sys.modules, "of_their_own", SimpleNamespace(problem=small_unknown(r=1e12)))
+    options = "--filter", "ekf", "--problem", "of_their_own:problem", "--seeds", 2
+    with interpreted():
+        code, out, errors = thruster(*options)
+        refused, _, rule = thruster(*options, "--knows", "scaled")
+    assert code == 0, errors
+    line = "Q and R: those that the model came with (--knows given). There is no scaled default: no factor on Q"
+    assert line in " ".join(out.split())
+    assert refused == 2 and "ekf must have a scaled default on of_their_own:problem, but no factor on Q" in rule
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
         (("--filter", "none"), "filter must be one of kf, "),
         (("--scenario", "none"), "problem must be one of nominal, "),
         (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
-        (("--knows", "all"), "knows must be one of true, scaled, untuned, given, but got 'all'"),
+        (("--knows", "all"), "knows must be one of true, scaled, untuned, given, noise, study, but got 'all'"),
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
         (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
         (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),
@@ -248,6 +260,11 @@ def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thr
         (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
         (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
         (("missing.json",), "a tuned file must be readable"),
+        (
+            ("missing.safetensors", "--filter", "ekf"),
+            "a trained estimator must be a file, but there is none",
+        ),
+        (("--trials", "5", "--knows", "true"), "knows must be left out, or 'study', with trials, but got 'true'"),
     ],
 )
 def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,21 +16,19 @@ from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
+from tuning.api.run import MOST_TRIALS
 from tuning.api.study import Study
-from tuning.api.tune import tune
 from tuning.api.user_choice import DEFAULT_FILTER, is_own, user_choice
 from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
-from tuning.evaluation.fitting import fitting
-from tuning.evaluation.knowledge import OF_FILE
+from tuning.evaluation.fitting import DEFAULT_FILTERS, default_filters, fitting
+from tuning.evaluation.knowledge import OF_FILE, STUDY, STUDY_TRIALS
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.augmented import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
-
-DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 
 
 def compare(
@@ -61,15 +58,20 @@ def compare(
     Args:
         filters: names of filters, tuned files, `Study`s, other packages' estimators, or your own: a filter such as
             `make_filter("ekf", model)` or a model with its Q and R, in a list, or in a mapping from the labels of
-            their rows; the others are compared with the first.
+            their rows; the others are compared with the first. The default's particle filter is left out for
+            models of more than 6 states.
         problem: a problem as for `tuning.tune`, or a list of several; by default that of the first tuned file or
             study, or "nominal".
         seeds: number of held-out seeds.
         seed: of the study to which they belong.
-        trials: tune each named filter first with this number of trials, all on the same training seeds.
-        knows: the Q and R of named filters: "true" (oracle), "scaled" (scaled default), "untuned" (rule
-            of thumb) or "given" (those of the model that filters assume); by default the oracle's, or the scaled
-            default's if the plant's Q and R are unknown.
+        trials: number of trials of the study if knows is "study"; if given, it is.
+        knows: the Q and R of named filters: "true" (the plant's own, the oracle), "scaled" (the scaled default),
+            "untuned" (the rule of thumb), "given" (the model's own), "noise" (noise estimation) or "study" (the
+            best on the training seeds of a study of 20 trials and all of these but the oracle; ensemble sizes are
+            not tuned). By default "true", but "study" if the model's residuals on true states are not white with
+            the plant's Q and R, for nobody would use these with a wrong model; rows that estimate further
+            constants keep "true". If the plant's Q and R are unknown, "scaled", or for a filter without a scaled
+            default the first that it has of "given", "noise" and "untuned".
         augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
             row; by name with an `Unknown`, or (std, walk).
         ensemble_size: of all filters, or by name.
@@ -88,29 +90,69 @@ def compare(
     problems = problems_of(_default(some) if problem is None else problem, preset)
     each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
     sizes = {name: size for name, size in each.items() if size is not None}
-    asked = some
-    some, left_out = without_unfit(asked, problems)
-    labels = [label for label, one in zip(labels, asked, strict=False) if not _is_named(one) or one in some]
+    named = None if filters is DEFAULT_FILTERS else some
+    options: dict[str, Any] = {"knows": knows, "trials": trials, "unknown": unknowns_of(augment or {})}
+    return run_comparison(
+        named, problems, seed, seeds, console_for(progress), sizes=sizes, labels=labels, **options
+    )
+
+
+def run_comparison(
+    filters: Sequence[Any] | None,
+    problems: Sequence[Problem],
+    seed: int,
+    seeds: int,
+    console: Any,
+    *,
+    knows: str | None,
+    trials: int | None,
+    unknown: Unknowns,
+    sizes: Mapping[Any, int],
+    labels: Sequence[Any] = (),
+) -> FilterComparison:
+    """Compare filters on problems with a progress bar, for `tuning.compare` and `thruster compare`.
+
+    Args:
+        filters: as for `contenders_of`; None for the default ones.
+        problems: the problems.
+        seed: of the study to which the held-out seeds belong.
+        seeds: number of held-out seeds.
+        console: where progress is shown.
+        knows: the Q and R of named filters, as `tuning.evaluation.knowledge.KNOWS` explains; None for the default.
+        trials: of the study if filters know that; if given, they do.
+        unknown: constants that filters also estimate in a second row.
+        sizes: ensemble size by name; under None that of all others.
+        labels: of the filters' rows, by the user; if empty, those of `contenders_of`.
+    """
     if trials is not None:
-        if knows is not None:
-            raise ValueError(
-                f"knows must be left out if filters are tuned, but got {short_repr(knows)} and trials"
-            )
-        some = [
-            tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
-            for one in some
-        ]
-    knows = knowledge_on(problems) if knows is None else knows
-    given = knows, unknowns_of(augment or {}), sizes, seed
-    contenders = contenders_of(some, *given)
+        trials = at_least("trials", trials, 1, MOST_TRIALS)
+        if knows not in (None, STUDY):
+            raise ValueError(f"knows must be left out, or {STUDY!r}, with trials, but got {short_repr(knows)}")
+        knows = STUDY
+    left_out: dict[str, str] = {}
+    if filters is None:
+        filters, left_out = default_filters(problems)
+    asked = filters
+    filters, unfit = without_unfit(asked, problems)
+    labels = [label for label, one in zip(labels, asked, strict=False) if not _is_named(one) or one in filters]
+    given = knows, unknown, sizes, seed, trials or STUDY_TRIALS
+    contenders = contenders_of(filters, *given)
     if labels:
-        of_each = [(label, contenders_of([one], *given)) for label, one in zip(labels, some, strict=True)]
+        of_each = [(label, contenders_of([one], *given)) for label, one in zip(labels, filters, strict=True)]
         contenders = [
             one._replace(label=one.label.replace(made[0].label, str(label), 1))
             for label, made in of_each
             for one in made
         ]
-    return replace(compared(contenders, problems, seed, seeds, console_for(progress)), left_out=left_out)
+
+    def held_out(problem: Problem) -> range:
+        return problem.held_out_seeds(seed, seeds)
+
+    for problem in problems:
+        held_out(problem)  # a clear error before any filter runs
+    with row_bar(len(contenders) * len(problems), console) as on_row:
+        boards, interrupted = compare_all(contenders, problems, held_out, on_row)
+    return FilterComparison(tuple(boards), seed, interrupted, left_out | unfit)
 
 
 def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
@@ -122,32 +164,23 @@ def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[
     return [one for one in filters if not _is_named(one) or one in kept], left_out
 
 
-def compared(
-    contenders: Sequence[Contender], problems: Sequence[Problem], seed: int, seeds: int, console: Any
-) -> FilterComparison:
-    """Run contenders over problems with a progress bar, for `tuning.compare` and `thruster compare`."""
-
-    def held_out(problem: Problem) -> range:
-        return problem.held_out_seeds(seed, seeds)
-
-    for problem in problems:
-        held_out(problem)  # a clear error before any filter runs
-    with row_bar(len(contenders) * len(problems), console) as on_row:
-        boards, interrupted = compare_all(contenders, problems, held_out, on_row)
-    return FilterComparison(tuple(boards), seed, interrupted)
-
-
 def contenders_of(
-    filters: Sequence[Any], knows: str, unknown: Unknowns, sizes: Mapping[Any, int], seed: int
+    filters: Sequence[Any],
+    knows: str | None,
+    unknown: Unknowns,
+    sizes: Mapping[Any, int],
+    seed: int,
+    trials: int = STUDY_TRIALS,
 ) -> list[Contender]:
     """The filters to compare: first tuned files and studies, then named filters.
 
     Args:
         filters: names, paths of tuned files, `Study`s or estimators.
-        knows: the Q and R of named filters.
+        knows: the Q and R of named filters; None for the default.
         unknown: constants that each of these also estimates in a second row.
         sizes: ensemble size by name; under None that of all others.
         seed: of the study whose training runs scale the scaled default.
+        trials: of the study by which filters are known.
     """
     for name, number in sizes.items():
         if name is not None and not filter_type(name).has_ensemble:
@@ -173,9 +206,9 @@ def contenders_of(
         else:
             kind = filter_type(one)
             size = size_of(one) if kind.has_ensemble and not kind.is_foreign else None
-            out.append(contender(one, knows, seed=seed, ensemble_size=size))
+            out.append(contender(one, knows, None, seed, trials, ensemble_size=size))
             if unknown and kind.has_covariance:
-                out.append(contender(one, knows, unknown, seed, ensemble_size=size))
+                out.append(contender(one, knows, unknown, seed, trials, ensemble_size=size))
     return out
 
 
@@ -191,11 +224,6 @@ def _default(filters: Sequence[Any]) -> Any:
         if not is_own(one) and not is_filter(one):
             return read_tuned(one, given_for(one))[1]
     return NOMINAL
-
-
-def knowledge_on(problems: Sequence[Problem]) -> str:
-    """The default Q and R of filters: the plant's, or the scaled default if these are unknown."""
-    return "scaled" if any(one.true is None for one in problems) else "true"
 
 
 def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:

@@ -22,6 +22,7 @@ from filters.estimators.find import label_of
 from thruster_env.numerics.checks import short_repr
 from thruster_env.numerics.progress import listening
 from tuning.api.notebook import NotebookLine
+from tuning.evaluation.knowledge import TUNING
 from tuning.search.interruption import STOPPING
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], N
             begun.append(label)
 
         def show(far: str) -> None:
-            if far == STOPPING:
+            if far == STOPPING or far.startswith(TUNING):
                 progress.update(task, description=far, refresh=True)
 
         with listening(show):

@@ -18,7 +18,6 @@ from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_type, make_filter
 from thruster_env.numerics.checks import one_of
-from tuning.evaluation.baselines import given, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import (
     Evaluation,
     compute_metrics,
@@ -28,7 +27,7 @@ from tuning.evaluation.evaluate import (
     with_restarts,
     with_time_constants,
 )
-from tuning.evaluation.knowledge import KNOWLEDGE
+from tuning.evaluation.knowledge import KNOWLEDGE, STUDY_TRIALS, Known, known
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
 from tuning.problems.augmented import beliefs_of
 from tuning.problems.check import data_of
@@ -52,6 +51,7 @@ class Contender(NamedTuple):
     unknown: Mapping[str, Unknown | None] = {}  # constants that it estimates, too; None for a default
     knows: str = ""  # of the plant's Q and R: one of `KNOWLEDGE`, or "tuned"
     suit: Callable[[Problem], Problem] = lambda problem: problem  # as the filter assumes it
+    known: Callable[[Problem], Known] | None = None  # choice and source of Q and R where the problem decides it
 
     def filter(self, scenario: Problem) -> Filter:
         """The filter, with the model that the scenario lets it assume."""
@@ -61,6 +61,13 @@ class Contender(NamedTuple):
             return filter_
         beliefs = beliefs_of(filter_.model.constants, self.unknown)
         return make_filter(choice.name, augmented_model(filter_.model, beliefs), **choice.numbers)
+
+    def origin(self, scenario: Problem) -> dict[str, str]:
+        """The source of Q and R on a scenario, and a note on it: fields of a `Row`."""
+        if self.known is None:
+            return {"knows": self.knows}
+        found = self.known(scenario)
+        return {"knows": found.source, "note": found.note}
 
     def beliefs(self, scenario: Problem) -> dict[str | int, Unknown]:
         """The prior of the constants that it also estimates."""
@@ -86,6 +93,7 @@ class Row(NamedTuple):
     likelihood_gain: Interval  # log-likelihood of a run less the first filter's, paired
     knows: str = ""  # of the plant's Q and R, as its `Contender` does
     beliefs: Mapping[str | int, Unknown] = {}  # of the constants that it estimates, too, at first
+    note: str = ""  # why its Q and R are these, in a sentence
 
     @property
     def verdict(self) -> str:
@@ -135,17 +143,22 @@ def _doubt(row: Row, first: Row) -> str:
 
 
 def contender(
-    name: str, knows: str = "true", unknown: Mapping[str, Unknown | None] | None = None, seed: int = 0, **numbers
+    name: str,
+    knows: str | None = "true",
+    unknown: Mapping[str, Unknown | None] | None = None,
+    seed: int = 0,
+    trials: int = STUDY_TRIALS,
+    **numbers,
 ) -> Contender:
     """A filter by name.
 
     Args:
         name: name of a filter; or an estimator, a function that makes one from a model, or "module:object".
-        knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q follows
-            from the mean NIS on the training runs, "untuned" for the rule of thumb, "given" for the values of the
-            model that filters assume.
+        knows: one of `KNOWLEDGE`, as `tuning.evaluation.knowledge.KNOWS` explains; None for what is best known on
+            each problem.
         unknown: constants of the model to estimate with the states; a belief of None means `default_belief`.
         seed: seed of the study whose training runs scale the scaled default.
+        trials: of the study by which Q and R are known.
         **numbers: parameters of the filter, such as `ensemble_size`; by default those of the rule of thumb.
 
     Raises:
@@ -153,18 +166,24 @@ def contender(
             made.)
     """
     kind = filter_type(name)
-    one_of("knows", knows, KNOWLEDGE)
+    if knows is not None:
+        one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
+    def knowing(scenario: Problem) -> Known:
+        keeps = knows is None and unknown and scenario.true is not None
+        return known("true" if keeps else knows, name, scenario, seed, trials, numbers.get("ensemble_size"))
+
     def chosen(scenario: Problem) -> Choice:
-        choice = _known(knows, name, scenario, seed)
+        choice = knowing(scenario).choice
         return choice._replace(numbers={**choice.numbers, **numbers})
 
     unknown = unknown or {}
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(kind).untuned))] if kind.has_ensemble else []
     others = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
-    return Contender(" ".join([kind.label, *size, *others, *added]), chosen, unknown, knows)
+    label = " ".join([kind.label, *size, *others, *added])
+    return Contender(label, chosen, unknown, known=knowing)
 
 
 def _said(value) -> str:
@@ -172,29 +191,6 @@ def _said(value) -> str:
     if isinstance(value, str):
         return value
     return ", ".join(f"{one:g}" for one in np.ravel(value))
-
-
-def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
-    """The choice of a filter with this knowledge; ValueError where there is none."""
-    if knows == "untuned":
-        return rule_of_thumb(name, scenario)
-    if knows == "given":
-        own = given(name, scenario)
-        if own is None:
-            raise ValueError(
-                "given Q and R must be those of a user's model, or defaults of its parameters, but "
-                f"{scenario.name} has none: compare with those that filters know as true, scaled or untuned"
-            )
-        return own
-    if knows == "true":
-        known = oracle(name, scenario)
-        if known is None:
-            raise ValueError(f"an oracle must know the plant's Q and R, but those of {scenario.name} are unknown")
-        return known
-    found = scaled_default(name, scenario, seed)
-    if found.choice is None:
-        raise ValueError(f"{name} must have a scaled default on {scenario.name}, but {found.reason}")
-    return found.choice
 
 
 def sized(choice: Choice, ensemble_size: int | None) -> Choice:
@@ -245,7 +241,7 @@ def compare(
                 for one, filter_ in zip(contenders, filters, strict=True):
                     on_row(scenario, one.label)
                     row = _row(one.label, filter_, data, board)
-                    board.rows.append(row._replace(knows=one.knows, beliefs=one.beliefs(scenario)))
+                    board.rows.append(row._replace(**one.origin(scenario), beliefs=one.beliefs(scenario)))
                     if stopped():
                         raise KeyboardInterrupt
     except KeyboardInterrupt:

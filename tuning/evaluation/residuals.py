@@ -21,6 +21,7 @@ from tuning.search.plan import TRAINING_SEEDS
 
 FEWEST = 10  # residuals for each entry of a mean, below which there is no covariance worth the name
 LEAST_EIGENVALUE = 1e-9  # of R's correlations: channels that are copies of each other have none
+TOLERANCE = 0.1  # of variances and correlations of residuals, relative, within which a model is right
 ROUNDING = 1e-12  # of a state's largest value, below which residuals are rounding
 
 
@@ -104,6 +105,51 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
         return Estimated(reason="the measurements have no noise")
     means = (rows.mean(axis=0) for rows in found[:2])
     return Estimated(q, r, *means, *(_correlation(rows) for rows in found[2:]))
+
+
+@lru_cache(maxsize=16)
+def model_error(problem: Problem, seed: int = 0) -> str:
+    """How a problem's model differs from its plant, in a few words; empty if it does not, or if nothing tells.
+
+    On true states, the residuals r of a right model are white with the plant's own variances s^2:
+
+        E[r_k^2]/s^2 = 1,  E[r_k r_{k+1}]/s^2 = 0,  each within 0.1 + 5 sqrt(2/N) of N residuals
+
+    Args:
+        problem: with the plant's own Q and R (`true`), and true states of all the model's states.
+        seed: of the study whose training runs are taken.
+    """
+    if problem.true is None or problem.scale is None:
+        return ""
+    model, data = problem.model(**problem.true), data_of(problem, problem.training_seeds(seed, TRAINING_SEEDS))
+    if data.states is None or data.known_states.shape[-1] != model.n:
+        return ""
+    found = residuals(model, data)
+    rounding = ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))
+    errors = _errors(model.states, np.diag(model.process_noise_cov), found.process, found.process_pairs, rounding)
+    variances = np.diag(model.measurement_noise_cov)
+    errors |= _errors(model.measurements, variances, found.measurement, found.measurement_pairs, 0.0)
+    return errors[max(errors)] if errors else ""
+
+
+def _errors(quantities, variances, rows, pairs, rounding) -> dict[float, str]:
+    """The components of residuals (N, d) that are not white with some variances (d,), by error over tolerance."""
+    if len(rows) < FEWEST:
+        return {}
+    tolerance, errors = TOLERANCE + 5.0 * np.sqrt(2.0 / len(rows)), {}
+    scale = np.maximum(np.sqrt(variances), rounding)
+    squares = (rows**2).mean(axis=0) / scale**2
+    lags = (pairs[0] * pairs[1]).mean(axis=0) / scale**2 if len(pairs[0]) >= FEWEST else np.zeros(len(scale))
+    for quantity, variance, square, lag in zip(quantities, variances, squares, lags, strict=True):
+        error = square - 1.0 if variance == 0.0 else max(abs(square - 1.0), abs(lag))
+        if error > tolerance:
+            words = f"the residuals of {quantity.short_label} have {square:.3g} times the plant's own variance"
+            if variance == 0.0:
+                words = f"{quantity.short_label} has residuals where the plant has no noise"
+            elif abs(lag) > tolerance:
+                words += f" and a correlation of {lag / square:.2f} from step to step"
+            errors[error / tolerance] = words
+    return errors
 
 
 def _correlation(pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import optuna
-from optuna.distributions import BaseDistribution
+from optuna.distributions import BaseDistribution, IntDistribution
 
 from filters.registry import filter_type
 from thruster_env.numerics.checks import positive, short_repr
@@ -56,6 +56,7 @@ class Plan(NamedTuple):
     worst: bool = False  # of several problems the worst one counts, and not their mean
     where: tuple[str, ...] = ()  # relations among the numbers of the model, such as "Q22 = 4 Q11"
     forget: float | None = None  # the longest time constant of the gain that is allowed [s]
+    ensemble_size: int | None = None  # N of the filter, where it is not tuned
 
     @property
     def identity(self) -> dict:
@@ -67,6 +68,7 @@ class Plan(NamedTuple):
             **({"full_r": True} if self.full_r else {}),
             **({"where": list(self.where)} if self.where else {}),
             **({} if self.forget is None else {"forget": self.forget}),
+            **({} if self.ensemble_size is None else {"ensemble_size": self.ensemble_size}),
             "filter": self.filter,
             "kinds": list(self.filter_types),
             "budget": self.budget,
@@ -201,7 +203,10 @@ class Plan(NamedTuple):
 
         The scale of P_0 is one of them where a scenario scores the start-up.
         """
-        return joint_distributions(self.filter_types, self.scenarios[0], **self.options)
+        found = joint_distributions(self.filter_types, self.scenarios[0], **self.options)
+        if self.ensemble_size is not None and "N" in found:
+            found["N"] = IntDistribution(self.ensemble_size, self.ensemble_size)
+        return found
 
     def parameters(self) -> dict[str, Parameter]:
         """A trial's parameters by name, without the filter type."""
