@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -91,7 +91,7 @@ def command(
     some = [*sorted(files or [], key=is_trained), *(filters or [])]
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(unknown_in, augment or []))
     announce_compilation()
-    options = {"knows": knows, "trials": trials, "unknown": unknown, "sizes": sizes}
+    options: dict[str, Any] = {"knows": knows, "trials": trials, "unknown": unknown, "sizes": sizes}
     found = run_comparison(some or None, chosen, seed, seeds, progress_console, **options)
     boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]

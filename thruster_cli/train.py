@@ -202,7 +202,10 @@ def report(setup: TrainingConfiguration, trained: Trained) -> list[RenderableTyp
     )
     shown: list[RenderableType] = []
     if rows:
-        shown += [title, table("", ["steps", "mean return"], rows, caption="0 is perfect.")]
+        caption = f"0 is perfect; actions of zero have {trained.idle:.3f} on the same episodes."
+        shown += [title, table("", ["steps", "mean return"], rows, caption=caption)]
+        if curve[-1][1] <= trained.idle:
+            shown.append("At the end the policy is no better than actions of zero: it needs more --steps.")
     shown.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
     shown.append(f"Policy: {trained.folder}")
     if trained.interrupted:
@@ -218,6 +221,7 @@ def as_json(setup: TrainingConfiguration, trained: Trained) -> dict:
         "learnt_now": trained.learnt,
         "seconds": trained.seconds,
         "evaluations": [{"steps": steps, "mean_return": value} for steps, value in trained.curve],
+        "mean_return_of_zero_actions": trained.idle,
         "interrupted": trained.interrupted,
         "setup": vars(setup),
     }

@@ -35,6 +35,12 @@ def check_installed() -> None:
         )
 
 
+def check_file(path: str | Path) -> None:
+    """Raise ValueError if there is no file, before torch is imported."""
+    if not Path(path).is_file():
+        raise ValueError(f"a trained estimator must be a file, but there is none at {path}")
+
+
 def read_estimator(path: str | Path) -> TrainedEstimator:
     """The trained estimator of a file, which makes an estimator for a model.
 
@@ -42,8 +48,7 @@ def read_estimator(path: str | Path) -> TrainedEstimator:
         ValueError: if there is no file, torch or safetensors is not installed, or the file is none of `thruster
             train-estimator`.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"a trained estimator must be a file, but there is none at {path}")
+    check_file(path)
     check_installed()
     from filters.learned.file import read  # torch takes seconds to import
 

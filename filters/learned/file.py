@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from filters.learned import check_file
 from filters.learned.ensemble import DifferentiableEnsembleFilter
 from filters.learned.estimator import LearnedEstimator
 from filters.learned.gains import KalmanNet, RecursiveKalmanNet
@@ -82,18 +83,31 @@ class TrainedEstimator:
             return
         if not needs_model and found == self._quantities and not _are_unnamed(model):
             return
-        own, given = self._digest, model.digest
+        rule = f"{self.path} must be used with the model that it was trained with"
         if self._quantities is not None and found != self._quantities:
             both = zip(self._quantities, found, strict=True)
             own, given = next((_listed(one), _listed(other)) for one, other in both if one != other)
-        raise ValueError(
-            f"{self.path} must be used with the model that it was trained with, {own}, but got {given}"
-        )
+            raise ValueError(f"{rule}, {own}, but got {given}")
+        then, now = self.about.get("constants") or {}, constants_of(model)
+        differing = [
+            f"{name} {then[name]:.4g} (here {value:.4g})"
+            for name, value in now.items()
+            if name in then and then[name] != value
+        ]
+        problem = self.about["training"].get("problem")
+        of_problem = "" if problem is None else f", that of {problem}"
+        raise ValueError(f"{rule}{of_problem}, but it had {', '.join(differing) or 'other equations'}")
 
 
 def quantities_of(model: StateSpaceModel) -> list[list[tuple[str, str]]]:
     """Symbols and units of states, inputs and measurements."""
     return [[(one.symbol, one.unit) for one in some] for some in model.quantities]
+
+
+def constants_of(model: StateSpaceModel) -> dict[str, float]:
+    """The named constants of a model that are numbers, which tell one preset from another."""
+    named = getattr(model.constants, "_asdict", dict)()
+    return {name: float(one) for name, one in named.items() if isinstance(one, int | float)}
 
 
 def _are_unnamed(model: StateSpaceModel) -> bool:
@@ -130,6 +144,7 @@ def write_estimator(path: str | Path, estimator: LearnedEstimator, training: dic
         "model": estimator.model.digest,
         "sizes": sizes_of(estimator.model),
         "quantities": quantities_of(estimator.model),
+        "constants": constants_of(estimator.model),
         "training": training,
     }
     numbers = {name: one.contiguous() for name, one in estimator.state_dict().items()}
@@ -143,4 +158,5 @@ def _read(path: str, changed: int) -> TrainedEstimator:
 
 def read(path: str | Path) -> TrainedEstimator:
     """The trained estimator of a file; read again only after a change."""
+    check_file(path)
     return _read(str(path), Path(path).stat().st_mtime_ns)

@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -9,9 +11,17 @@ import optuna
 import pytest
 from scipy.integrate import solve_ivp
 
-from filters import EstimateState
+from filters import EstimateState, make_filter, run
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from thruster_env.studies import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_bearing
+from thruster_env.studies import (
+    BENCHMARKS,
+    benchmark,
+    lorenz63,
+    lorenz63_sparse,
+    lorenz96,
+    pendulum,
+    range_bearing,
+)
 from thruster_env.studies.benchmark import (
     Published,
     against_published,
@@ -24,7 +34,9 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
+from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
 
 
@@ -118,6 +130,61 @@ def test_inflation_that_adapts_keeps_a_small_ensemble_on_the_ring_which_is_lost_
     rows = [Published("etkf", numbers | {"adaptive_inflation": number}, 0.18) for number in (0.0, 0.1)]
     lost, kept = against_published(lorenz96.problem, lorenz96.model, rows)(range(4), lambda row: None)
     assert kept.ours.value < 0.2 < 1.0 < lost.ours.value
+
+
+def row_of_page(table, first_cells):
+    """The numbers of a row of a table of docs/benchmarks.md: those of each cell behind the first ones."""
+    page = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text()
+    part = page.partition(f"<!-- table {table} -->")[2].partition("<!-- end -->")[0]
+    (line,) = [line for line in part.splitlines() if line.startswith(f"| {first_cells} |")]
+    return [[float(one) for one in re.findall(r"\d+\.\d+", cell)] for cell in line.split("|")[1:-1]]
+
+
+# A cheap row of each table. States are chaotic, so that rounding of another machine moves single runs.
+OF_PAGE = {
+    "lorenz63": (lorenz63, "etkf, N = 3, inflation 1.3"),
+    "lorenz63, particles": (lorenz63, "pf, N = 100, regularisation 2.48, threshold 0.3"),
+    "lorenz63_sparse": (lorenz63_sparse, "ensrf, N = 20, inflation 1.01, rotations"),
+    "lorenz96": (lorenz96, "letkf, N = 7, radius 4, inflation 1.04, rotations"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "study", "label"),
+    [
+        pytest.param(name, *one, id=name, marks=[] if name == "lorenz63" else pytest.mark.slow)
+        for name, one in OF_PAGE.items()
+    ],
+)
+def test_a_row_of_the_page_is_recomputed(name, study, label):
+    (published,) = [one for one in study.PUBLISHED if one.label == label]
+    (row,) = against_published(study.problem, study.model, [published])(range(benchmark.RUNS), lambda row: None)
+    _, theirs, ours, _, median, *_ = row_of_page(name.partition(",")[0], label)
+    half = (ours[2] - ours[1]) / 2
+    assert theirs == [published.value] and abs(row.ours.value - ours[0]) < half
+    assert abs(row.run_median - median[0]) < half
+
+
+@pytest.mark.slow
+def test_a_row_on_the_pendulum_and_on_range_and_bearing_is_recomputed():
+    rule = evaluate_held_out(untuned_choice("ekf", pendulum.problem), pendulum.problem, 0).untuned
+    _, _, _, theta, omega, nees, nis = row_of_page("pendulum", "ekf | rule of thumb")
+    found = [*(part.value for part in rule.rmse), rule.nees.value, rule.nis.value]
+    np.testing.assert_allclose(found, [theta[0], omega[0], nees[0], nis[0]], atol=0.006)
+    data = range_bearing.problem.data(range(benchmark.RUNS))
+    ekf = make_filter("ekf", range_bearing.model(range_bearing.SIGMA.start))
+    means = run(ekf, data.filter_keys, data.inputs, data.measurements).means
+    ours = np.sqrt(range_bearing._squares(means, data).mean())
+    assert ours == pytest.approx(row_of_page("range_bearing", "ekf, untuned, sigma_a 2")[2][0], abs=6e-4)
+
+
+@pytest.mark.slow
+def test_the_inflation_that_a_study_found_has_its_score():
+    cells = row_of_page("inflation", "etkf | 9")
+    numbers = {"ensemble_size": 9, "inflation": cells[2][0], "relaxation": cells[3][0]}
+    seeds, rows = held_out_seeds(0, benchmark.RUNS), [Published("etkf", numbers, 0.6)]
+    (row,) = against_published(lorenz63.problem, lorenz63.model, rows)(seeds, lambda row: None)
+    assert abs(row.ours.value - cells[4][0]) < (cells[4][2] - cells[4][1]) / 2
 
 
 def small(why=""):

@@ -55,6 +55,9 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
         assert word in " ".join(done.stdout.split())
     data = json.loads((tmp_path / "train.json").read_text())
     assert data["steps"] == 128 and len(data["evaluations"]) == 2 and data["setup"]["observe"] == "ekf"
+    idle, text = data["mean_return_of_zero_actions"], " ".join(done.stdout.split())
+    assert idle < 0.0 and f"actions of zero have {idle:.3f} on the same episodes" in text
+    assert ("no better than actions of zero" in text) == (data["evaluations"][-1]["mean_return"] <= idle)
     assert (folder / "tensorboard").is_dir()
     assert "training was already complete" in thruster(*options).stdout
     other = thruster("train", "--observe", "raw", "--steps", 128, "--envs", COPIES, "--no-tensorboard")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -32,6 +33,7 @@ from thruster_env.training.saved import (
     save,
     whole,
 )
+from thruster_env.training.score import score
 from thruster_env.training.setup import TrainingConfiguration
 from thruster_env.training.torch_settings import learning
 from tuning.problems.seeds import SEEDS_APART, training_seeds
@@ -51,6 +53,7 @@ class Trained(NamedTuple):
     seconds: float  # of this call
     curve: list[tuple[int, float]]  # steps and mean return of each evaluation
     interrupted: bool
+    idle: float = math.nan  # mean return of actions of zero on the episodes of the evaluations; NaN without any
 
 
 def train(
@@ -110,9 +113,23 @@ def train(
         save(folder / FINAL, setup, model)
     curve = list(zip(evaluation.evaluations_timesteps, evaluation.returns, strict=True))
     seconds = time.perf_counter() - began
+    idle = _Idle(envs.action_space)
     envs.close()
     validation.close()
-    return Trained(folder, model.num_timesteps, model.num_timesteps - before, seconds, curve, stopped)
+    zero = score(idle, setup, seeds[:VALIDATION_EPISODES]).returns.mean() if curve else math.nan
+    return Trained(folder, model.num_timesteps, model.num_timesteps - before, seconds, curve, stopped, float(zero))
+
+
+class _Idle:
+    """Actions of zero: planes and thrust held in the middle or, with a controller, that controller alone."""
+
+    def __init__(self, space):
+        """Take the space of an env's actions."""
+        self._shape = space.shape
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, p) of zero."""
+        return np.zeros((len(observation), *self._shape), dtype=np.float32), state
 
 
 def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:

@@ -148,6 +148,7 @@ def _trained(
 
     validation = data_of(problem, problem.validation_seeds(seed, VALIDATION_SEEDS))
     told = {"problem": problem.name, "digest": problem.digest, "seed": seed, "runs": len(data.seeds)}
+    told["plant"] = problem.plant_data
     target.parent.mkdir(parents=True, exist_ok=True)
     with _bar(f"{estimator.kind} on {problem.name}", settings.steps, console) as (on_step, show):
 

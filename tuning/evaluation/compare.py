@@ -62,12 +62,9 @@ class Contender(NamedTuple):
         beliefs = beliefs_of(filter_.model.constants, self.unknown)
         return make_filter(choice.name, augmented_model(filter_.model, beliefs), **choice.numbers)
 
-    def origin(self, scenario: Problem) -> dict[str, str]:
-        """The source of Q and R on a scenario, and a note on it: fields of a `Row`."""
-        if self.known is None:
-            return {"knows": self.knows}
-        found = self.known(scenario)
-        return {"knows": found.source, "note": found.note}
+    def origin(self, scenario: Problem) -> tuple[str, str]:
+        """The source of Q and R on a scenario, and a note on it."""
+        return (self.knows, "") if self.known is None else self.known(scenario)[1:]
 
     def beliefs(self, scenario: Problem) -> dict[str | int, Unknown]:
         """The prior of the constants that it also estimates."""
@@ -241,7 +238,8 @@ def compare(
                 for one, filter_ in zip(contenders, filters, strict=True):
                     on_row(scenario, one.label)
                     row = _row(one.label, filter_, data, board)
-                    board.rows.append(row._replace(**one.origin(scenario), beliefs=one.beliefs(scenario)))
+                    source, note = one.origin(scenario)
+                    board.rows.append(row._replace(knows=source, note=note, beliefs=one.beliefs(scenario)))
                     if stopped():
                         raise KeyboardInterrupt
     except KeyboardInterrupt:

@@ -93,8 +93,8 @@ def known(
         error = model_error(problem, seed)
         if not error:
             return _named("true", name, problem, seed, trials, ensemble_size)
-        found = _studied(name, problem, seed, trials, ensemble_size)
-        return found._replace(note=f"Model and plant differ: {error}.") if found.source else found
+        studied = _studied(name, problem, seed, trials, ensemble_size)
+        return studied._replace(note=f"Model and plant differ: {error}.") if studied.source else studied
     found = scaled_default(name, problem, seed)
     if found.choice is not None:
         return Known(found.choice, "scaled")

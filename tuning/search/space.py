@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
+from filters.estimators.find import estimator_named, is_trained
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type, make_filter
 from tuning.problems.parameter import Parameter
@@ -36,7 +38,12 @@ class Choice(NamedTuple):
 
     def filter(self, problem: Problem) -> Filter:
         """The filter of this choice, with the problem's assumed model."""
-        return make_filter(self.name, problem.model(**self.model), **self.numbers)
+        try:
+            return make_filter(self.name, problem.model(**self.model), **self.numbers)
+        except ValueError:
+            if is_trained(self.name) and Path(self.name).is_file():  # what differs, by the presets' names
+                problem.check_tuned_for(estimator_named(self.name).about["training"].get("plant"), self.name)
+            raise
 
     def with_size(self, ensemble_size: int) -> Choice:
         """The same choice with another ensemble size."""
