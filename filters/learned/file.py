@@ -23,6 +23,7 @@ LEARNED = {
     one.kind: one for one in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)
 }
 FORMAT = 1
+SHOWN = 5  # constants that differ, of those that an error names
 DESCRIPTION = "estimator"  # the entry of a file's metadata that describes it
 
 
@@ -94,6 +95,8 @@ class TrainedEstimator:
             for name, value in now.items()
             if name in then and then[name] != value
         ]
+        more = len(differing) - SHOWN
+        differing = differing[:SHOWN] + ([f"{more} more"] if more > 0 else [])
         problem = self.about["training"].get("problem")
         of_problem = "" if problem is None else f", that of {problem}"
         raise ValueError(f"{rule}{of_problem}, but it had {', '.join(differing) or 'other equations'}")
@@ -106,7 +109,7 @@ def quantities_of(model: StateSpaceModel) -> list[list[tuple[str, str]]]:
 
 def constants_of(model: StateSpaceModel) -> dict[str, float]:
     """The named constants of a model that are numbers, which tell one preset from another."""
-    named = getattr(model.constants, "_asdict", dict)()
+    named: dict = getattr(model.constants, "_asdict", dict)()
     return {name: float(one) for name, one in named.items() if isinstance(one, int | float)}
 
 

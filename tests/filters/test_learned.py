@@ -20,9 +20,8 @@ from filters.learned.networks import GainNetwork
 from filters.wrappers.vector import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.plants.affine import affine_model
-from tuning.search.space import untuned_choice
+from tuning.search.space import Choice
 from tuning.thruster.find import find_scenario
-from tuning.thruster.logs import of_preset
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6
@@ -290,12 +289,12 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
     with pytest.raises(ValueError, match="must be used with the model that it was trained with"):
         read(path)(plane_model(state_offset=[0.0, 0.0]))
     assert isinstance(read(path)(plane_model(process_noise_cov=[1.0, 1.0])), KalmanNet)
-    own, other = (of_preset(find_scenario("nominal"), preset) for preset in ("tunnel", "t200"))
+    own, other = (find_scenario("nominal").replace(preset=preset) for preset in ("tunnel", "t200"))
     write_estimator(path, made("kalmannet", own.model()), {"problem": "nominal", "plant": own.plant_data})
     with pytest.raises(ValueError, match=r"that of nominal, but it had motor_damping .* \(here .*\)"):
         read(path)(other.model())
     with pytest.raises(ValueError, match=r"gain.safetensors was tuned for preset tunnel \(here t200\)"):
-        untuned_choice(str(path), other).filter(other)
+        Choice(str(path), {}, {}).filter(other)
     with pytest.raises(ValueError, match="must be a file, but there is none"):
         read(tmp_path / "none.safetensors")
     (tmp_path / "text.safetensors").write_text("nothing")
