@@ -31,8 +31,7 @@ from thruster_cli.options import (
 )
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
 from thruster_env.plants.logs.write import check_suffix, write_columns
-from tuning.logs.problem import as_tuned
-from tuning.logs.read import read_named
+from tuning.logs.read import as_tuned, read_named
 
 MOST_EPISODES = 8  # that are shown
 

@@ -26,7 +26,8 @@ from thruster_env.training.setup import make_configuration
 from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
-from tuning.logs.problem import as_tuned, log_problem, problems_in
+from tuning.logs.problem import log_problem, problems_in
+from tuning.logs.read import as_tuned
 from tuning.problems.files import scenario_of
 from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan

@@ -14,8 +14,8 @@ from filters.logs.findings import findings
 from thruster_env.numerics.checks import short_repr
 from tuning.api.estimates import LogEstimates
 from tuning.logs.model_of_logs import model_of_logs
-from tuning.logs.problem import as_tuned, name_of
-from tuning.logs.read import read_named
+from tuning.logs.problem import name_of
+from tuning.logs.read import as_tuned, read_named
 
 if TYPE_CHECKING:
     from tuning.api.study import Study

@@ -12,7 +12,7 @@ from filters.tuned_file import made_with, read_tuned_file, tune_options
 from thruster_env.numerics.checks import short_repr
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import read_for
-from tuning.logs.read import read_named, texts
+from tuning.logs.read import check_model, read_named, texts
 from tuning.problems.augmented import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem
@@ -171,7 +171,7 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
             raise ValueError(
                 f"logs in a tuned file must have paths and options, but {file} has {short_repr(content)}"
             ) from None
-        _check_model(options.get("model"), model, file)
+        check_model(options.get("model"), model, file)
         options |= {} if preset is None else {"preset": str(preset)}
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
@@ -192,32 +192,3 @@ def model_named_in(problem: Problem) -> str | None:
     if content is None or "logs" not in content:
         return None
     return content["options"].get("model")
-
-
-def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, Any]:
-    """Options for reading a log, with the preset and sensors of a tuned file's own logs where none are given.
-
-    Raises:
-        ValueError: if no model is given, and the file only names one that is code.
-    """
-    if tuned is None or named.get("model") is not None:
-        return dict(named)
-    options = tune_options(read_tuned_file(tuned))
-    if named.get("preset") is None:
-        _check_model(options.get("model"), None, tuned)
-    stored: dict[str, Any] = {name: value for name, value in options.items() if name in ("preset", "sensors")}
-    return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
-
-
-def _check_model(named, given: str | None, file: str | Path) -> None:
-    """Raise ValueError unless the caller gives exactly the code that a file names."""
-    if named is None and given is not None:
-        raise ValueError(
-            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(given)}"
-        )
-    if named != given:
-        raise ValueError(
-            f"the model of logs must be given if it is code, "
-            f"but {file} only names {short_repr(named)}: use --model "
-            f"{named}, if you trust it"
-        )

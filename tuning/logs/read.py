@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from filters.tuned_file import read_tuned_file, tune_options
 from thruster_env.numerics.checks import finite, short_repr
 from thruster_env.numerics.modules import object_named
 from thruster_env.plants.continuous import in_discrete_time
@@ -115,3 +116,32 @@ def _seconds(name: str, value: Any) -> float:
         raise ValueError(
             f"clock_offset (--clock-offset) of {name} must be seconds, but got {short_repr(value)}"
         ) from None
+
+
+def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, Any]:
+    """Options for reading a log, with the preset and sensors of a tuned file's own logs where none are given.
+
+    Raises:
+        ValueError: if no model is given, and the file only names one that is code.
+    """
+    if tuned is None or named.get("model") is not None:
+        return dict(named)
+    options = tune_options(read_tuned_file(tuned))
+    if named.get("preset") is None:
+        check_model(options.get("model"), None, tuned)
+    stored: dict[str, Any] = {name: value for name, value in options.items() if name in ("preset", "sensors")}
+    return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
+
+
+def check_model(named, given: str | None, file: str | Path) -> None:
+    """Raise ValueError unless the caller gives exactly the code that a file names."""
+    if named is None and given is not None:
+        raise ValueError(
+            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(given)}"
+        )
+    if named != given:
+        raise ValueError(
+            f"the model of logs must be given if it is code, "
+            f"but {file} only names {short_repr(named)}: use --model "
+            f"{named}, if you trust it"
+        )
