@@ -53,6 +53,9 @@ class TrainedEstimator:
                 raise ValueError(f"its format is not {FORMAT}")
             kind, self._options = str(self.about["kind"]), dict(self.about["options"])
             self._digest, self._quantities = self.about["model"], self.about.get("quantities")
+            self.training = dict(self.about.get("training") or {})
+            constants = dict(self.about.get("constants") or {})  # older files have none
+            self._constants = {str(key): float(value) for key, value in constants.items()}
             if self._quantities is not None:
                 self._quantities = [[tuple(map(str, one)) for one in some] for some in self._quantities]
         except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
@@ -89,7 +92,7 @@ class TrainedEstimator:
             both = zip(self._quantities, found, strict=True)
             own, given = next((_listed(one), _listed(other)) for one, other in both if one != other)
             raise ValueError(f"{rule}, {own}, but got {given}")
-        then, now = self.about.get("constants") or {}, constants_of(model)
+        then, now = self._constants, constants_of(model)
         differing = [
             f"{name} {then[name]:.4g} (here {value:.4g})"
             for name, value in now.items()
@@ -97,7 +100,7 @@ class TrainedEstimator:
         ]
         more = len(differing) - SHOWN
         differing = differing[:SHOWN] + ([f"{more} more"] if more > 0 else [])
-        problem = self.about["training"].get("problem")
+        problem = self.training.get("problem")
         of_problem = "" if problem is None else f", that of {problem}"
         raise ValueError(f"{rule}{of_problem}, but it had {', '.join(differing) or 'other equations'}")
 

@@ -289,12 +289,6 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
     with pytest.raises(ValueError, match="must be used with the model that it was trained with"):
         read(path)(plane_model(state_offset=[0.0, 0.0]))
     assert isinstance(read(path)(plane_model(process_noise_cov=[1.0, 1.0])), KalmanNet)
-    own, other = (find_scenario("nominal").replace(preset=preset) for preset in ("tunnel", "t200"))
-    write_estimator(path, made("kalmannet", own.model()), {"problem": "nominal", "plant": own.plant_data})
-    with pytest.raises(ValueError, match=r"that of nominal, but it had motor_damping .* \(here .*\)"):
-        read(path)(other.model())
-    with pytest.raises(ValueError, match=r"gain.safetensors was tuned for preset tunnel \(here t200\)"):
-        Choice(str(path), {}, {}).filter(other)
     with pytest.raises(ValueError, match="must be a file, but there is none"):
         read(tmp_path / "none.safetensors")
     (tmp_path / "text.safetensors").write_text("nothing")
@@ -312,6 +306,16 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
     )
     with pytest.raises(ValueError, match="must have the numbers of a kalmannet"):
         read(tmp_path / "odd.safetensors")(plane_model())
+
+
+def test_a_file_of_another_preset_names_both_and_the_constants_that_differ(tmp_path, as_python):
+    path = tmp_path / "gain.safetensors"
+    own, other = (find_scenario("nominal").replace(preset=preset) for preset in ("tunnel", "t200"))
+    write_estimator(path, made("kalmannet", own.model()), {"problem": "nominal", "plant": own.plant_data})
+    with pytest.raises(ValueError, match=r"that of nominal, but it had motor_damping .* \(here .*\)"):
+        read(path)(other.model())
+    with pytest.raises(ValueError, match=r"gain.safetensors was tuned for preset tunnel \(here t200\)"):
+        Choice(str(path), {}, {}).filter(other)
 
 
 def test_a_gru_is_refused_for_other_quantities_and_for_other_equations_of_unnamed_ones(tmp_path, as_python):

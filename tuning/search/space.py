@@ -42,7 +42,7 @@ class Choice(NamedTuple):
             return make_filter(self.name, problem.model(**self.model), **self.numbers)
         except ValueError:
             if is_trained(self.name) and Path(self.name).is_file():  # what differs, by the presets' names
-                problem.check_tuned_for(estimator_named(self.name).about["training"].get("plant"), self.name)
+                problem.check_tuned_for(estimator_named(self.name).training.get("plant"), self.name)
             raise
 
     def with_size(self, ensemble_size: int) -> Choice:
