@@ -102,7 +102,7 @@ class TrainedEstimator:
         differing = differing[:SHOWN] + ([f"{more} more"] if more > 0 else [])
         problem = self.training.get("problem")
         of_problem = "" if problem is None else f", that of {problem}"
-        raise ValueError(f"{rule}{of_problem}, but it had {', '.join(differing) or 'other equations'}")
+        raise ValueError(f"{rule}{of_problem}, but that had {', '.join(differing) or 'other equations'}")
 
 
 def quantities_of(model: StateSpaceModel) -> list[list[tuple[str, str]]]:

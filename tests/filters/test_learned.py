@@ -312,7 +312,7 @@ def test_a_file_of_another_preset_names_both_and_the_constants_that_differ(tmp_p
     path = tmp_path / "gain.safetensors"
     own, other = (find_scenario("nominal").replace(preset=preset) for preset in ("tunnel", "t200"))
     write_estimator(path, made("kalmannet", own.model()), {"problem": "nominal", "plant": own.plant_data})
-    with pytest.raises(ValueError, match=r"that of nominal, but it had motor_damping .* \(here .*\)"):
+    with pytest.raises(ValueError, match=r"that of nominal, but that had motor_damping .* \(here .*\)"):
         read(path)(other.model())
     with pytest.raises(ValueError, match=r"gain.safetensors was tuned for preset tunnel \(here t200\)"):
         Choice(str(path), {}, {}).filter(other)
@@ -344,9 +344,7 @@ def test_a_gru_is_refused_for_other_quantities_and_for_other_equations_of_unname
             read(path)(plant(**change))
     write_estimator(tmp_path / "plain.safetensors", made("gru", plant(named=False), width=3), {})
     assert read(tmp_path / "plain.safetensors")(plant(named=False)).name == "gru"
-    with pytest.raises(
-        ValueError, match="the model that it was trained with, [0-9a-f]{12}, but got [0-9a-f]{12}$"
-    ):
+    with pytest.raises(ValueError, match="the model that it was trained with, but that had other equations$"):
         read(tmp_path / "plain.safetensors")(plant(a=0.8, named=False))
     about = {key: value for key, value in read(path).about.items() if key != "quantities"}  # as older files
     save_file(load_file(path), tmp_path / "old.safetensors", {"estimator": json.dumps(about)})
