@@ -8,7 +8,7 @@ import typer
 
 from thruster_cli.options import JsonOption, spelt
 from thruster_cli.output import emit, table
-from tuning.ways.registry import WAYS
+from tuning.ways.registry import WAYS, find_way
 from tuning.ways.way import GRADIENT, TRUTH
 
 NEEDS = "needs"
@@ -26,15 +26,15 @@ def command(
 
     Example: thruster ways em
     """
+    shown = None if name is None else find_way(name)  # a clear error for an unknown one
     data: dict[str, Any] = {
         one: {"about": way.about, "when": way.when, "source": way.source, NEEDS: list(way.needs)}
         for one, way in WAYS.items()
         if name in (None, one)
     }
-    if name is not None:
-        way = WAYS[name]
-        text = (way.follow.__doc__ or "").strip()
-        emit([f"{name}: {way.about}.", f"Use it {way.when}.", f"Source: {way.source}", text], data, json)
+    if shown is not None:
+        text = (shown.follow.__doc__ or "").strip()
+        emit([f"{name}: {shown.about}.", f"Use it {shown.when}.", f"Source: {shown.source}", text], data, json)
         return
     rows = [[one, way.about, way.when, _needs(way.needs)] for one, way in WAYS.items()]
     emit([table("ways of tuning: thruster tune --way NAME", HEADS, rows, words=True)], data, json)

@@ -71,6 +71,11 @@ def test_what_a_way_lacks_is_said_in_one_line(problem, options, words):
     assert "\n" not in str(said.value)
 
 
+def test_an_unknown_way_is_refused_in_one_line(thruster):  # noqa: F811
+    unknown = thruster("ways", "magic")
+    assert unknown.returncode == 2 and "way must be one of" in unknown.stderr and "'magic'" in unknown.stderr
+
+
 @pytest.mark.slow
 def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--way", "desroziers", "--trials", 4)
