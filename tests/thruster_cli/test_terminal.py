@@ -199,7 +199,7 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
         way=None,
         comparisons=[comparison],
         gradient=None,
-        plan=SimpleNamespace(prune=True, filter="enkf"),
+        plan=SimpleNamespace(prune=True, filter="enkf", forget=None),
         result=SimpleNamespace(finished=6),
     )
     (said,) = way_out(tuning)
