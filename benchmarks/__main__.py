@@ -13,7 +13,9 @@ import typer
 from benchmarks.rates import measure_again, rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
-from thruster_cli.output import (
+from thruster_env.core.checks import one_of
+from thruster_env.core.threads import cores
+from tuning.cli.output import (
     JsonOption,
     SeedOption,
     announce_compilation,
@@ -22,9 +24,7 @@ from thruster_cli.output import (
     progress_console,
     table,
 )
-from thruster_env.numerics.checks import one_of
-from thruster_env.numerics.threads import cores
-from thruster_env.training.extras import check_installed
+from tuning.policies.extras import check_installed
 
 CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "

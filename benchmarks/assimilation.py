@@ -21,8 +21,8 @@ from benchmarks.timing import Timing
 from benchmarks.workloads import step_by_size, times
 from filters.engine.batch import run
 from filters.filter import Filter
-from thruster_env.numerics.threads import cores
-from thruster_env.studies.lorenz96 import STEPS, problem
+from thruster_env.core.threads import cores
+from tuning.experiments.lorenz96 import STEPS, problem
 from tuning.problems import in_parts
 from tuning.search import filter_parameters
 from tuning.search import plan as plans

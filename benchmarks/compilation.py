@@ -19,7 +19,7 @@ import numpy as np
 from filters import affine_model, make_filter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 
 SIZES = ((2, 1), (12, 4), (40, 40))
 ON_AFFINE = ("kf", "kf-steady", "fuzzy")  # they would approximate another model

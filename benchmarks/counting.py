@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 ADD, MULTIPLY, DIVIDE, ROOT, RECIPROCAL_ROOT = "add", "multiply", "divide", "root", "reciprocal root"
 PRODUCT, INTEGER = "integer product", "integer"  # of 32 bits by 32, and shifts, sums and exclusive ors

@@ -10,11 +10,11 @@ from __future__ import annotations
 import json
 import sys
 
-from auv_env.model import MODELS, auv_model
 from benchmarks.compilation import measured, timed_use
 from filters import make_filter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type
+from thruster_env.auv.model import MODELS, auv_model
 
 FEW_RULES = {"fuzzy": {"premises": [0, 5]}}  # u and r; twelve states would make 4096
 WITH_POSITION = ("navigation", "current")  # of which there is no steady state unless a position is measured

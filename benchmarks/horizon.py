@@ -14,8 +14,8 @@ from benchmarks.rows import Row
 from benchmarks.steps import PEER_STEPS, episode, recorded_episode
 from benchmarks.timing import alone, seconds_a_call, side_by_side
 from filters.wrappers.single import EstimateState
-from thruster_env.model import thruster_model
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.model import thruster_model
 
 HORIZON = 10
 GOAL = 1 / 10

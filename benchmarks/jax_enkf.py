@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from thruster_env.dynamics import substep, thrust_and_torque
-from thruster_env.numerics.checks import covariance_root
-from thruster_env.numerics.threads import cores
-from thruster_env.plant import Plant
+from thruster_env.core.checks import covariance_root
+from thruster_env.core.threads import cores
+from thruster_env.thruster.dynamics import substep, thrust_and_torque
+from thruster_env.thruster.plant import Plant
 
 NORMALS = 3  # a member and step: one for each state, one for the measurement
 

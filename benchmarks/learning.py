@@ -11,14 +11,14 @@ from benchmarks.timing import Measure
 from tuning.problems.seeds import training_seeds
 
 if TYPE_CHECKING:
-    from thruster_env.training.setup import TrainingConfiguration
+    from tuning.policies.setup import TrainingConfiguration
 
 
 def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
     """Seconds a step of a short training, as `thruster train` learns."""
-    from thruster_env.training.environments import make_environments
-    from thruster_env.training.model import new_model
-    from thruster_env.training.torch_settings import learning
+    from tuning.policies.environments import make_environments
+    from tuning.policies.model import new_model
+    from tuning.policies.torch_settings import learning
 
     model = new_model(setup, make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=native))
     return _steps_of(model, lambda: learning(model), rollouts)
@@ -32,8 +32,8 @@ def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from thruster_env.numerics.torch_threads import one_thread
-    from thruster_env.training.environments import make_environments
+    from thruster_env.core.torch_threads import one_thread
+    from tuning.policies.environments import make_environments
 
     numbers = dict(setup.hyperparameters)
     envs = VecNormalize(

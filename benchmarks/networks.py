@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from benchmarks.timing import alone, seconds_a_call
-from thruster_env.training.setup import TrainingConfiguration
+from tuning.policies.setup import TrainingConfiguration
 
 NETWORKS = 2  # one of the action, one of the value, which is a single number, too
 PASSES = 3  # through them in a step of gradient descent: the output, then slopes over weights and over inputs
@@ -13,7 +13,7 @@ PASSES = 3  # through them in a step of gradient descent: the output, then slope
 
 def network_limit(setup: TrainingConfiguration) -> float:
     """Seconds a step of PPO's products with its networks' weights, at torch's rate in one thread."""
-    from thruster_env.training.environments import make_environments
+    from tuning.policies.environments import make_environments
 
     envs, given = make_environments(setup, [0]), dict(setup.hyperparameters)
     layers = [envs.observation_space.shape[0], *given["policy_kwargs"]["net_arch"], envs.action_space.shape[0]]

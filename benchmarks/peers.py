@@ -13,11 +13,11 @@ from filterpy.kalman import (
     UnscentedKalmanFilter,
 )
 
-from thruster_env.dynamics import Constants, substep, thrust_and_torque
-from thruster_env.numerics.compiled import compiled, function_fingerprint
-from thruster_env.numerics.tuples import vector_reader
-from thruster_env.plant import Plant
-from thruster_env.plants.affine import AffineModel
+from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.tuples import vector_reader
+from thruster_env.model.affine import AffineModel
+from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
+from thruster_env.thruster.plant import Plant
 
 _read_constants = vector_reader(len(Constants._fields))
 

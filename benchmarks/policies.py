@@ -48,7 +48,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
 def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:
     """Seconds a copy and step of the envs alone."""
-    from thruster_env.training.environments import make_environments
+    from tuning.policies.environments import make_environments
 
     envs = make_environments(_setup(observe, seed), training_seeds(seed, COPIES), native=native)
     actions = np.random.default_rng(seed).uniform(-1, 1, (steps, COPIES, 1)).astype(np.float32)
@@ -64,6 +64,6 @@ def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:
 
 
 def _setup(observe: str, seed: int):
-    from thruster_env.training.setup import make_configuration
+    from tuning.policies.setup import make_configuration
 
     return make_configuration("manoeuvre", find_scenario("medium_noise"), observe, seed=seed, num_envs=COPIES)

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.counting import ADD, DIVIDE, INTEGER, MULTIPLY, PRODUCT, RECIPROCAL_ROOT, ROOT
-from thruster_env.numerics.compiled import compiled
-from thruster_env.numerics.threads import cores as all_cores
-from thruster_env.numerics.threads import spread
+from thruster_env.core.compiled import compiled
+from thruster_env.core.threads import cores as all_cores
+from thruster_env.core.threads import spread
 
 FUSED, ROUND = "fused multiply-add", "product, shift and two exclusive ors"
 IN_A_ROUND = 3  # operations on whole numbers that go with a product in a round of Philox

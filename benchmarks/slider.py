@@ -28,7 +28,7 @@ MEASURED = "performance.getEntriesByName('move to picture').map(one => one.durat
 @contextmanager
 def served(*options: str) -> Iterator[str]:
     """The address of a page."""
-    command = [sys.executable, "-m", "thruster_cli", "explore", "--no-browser", *options]
+    command = [sys.executable, "-m", "tuning.cli", "explore", "--no-browser", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         yield next(line.strip() for line in process.stdout if line.startswith("http"))

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.rows import Row, machine_lines, machine_name
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.files import write_whole
-from thruster_env.numerics.markdown import table, with_tables
+from thruster_env.core.checks import short_repr
+from thruster_env.core.files import write_whole
+from thruster_env.core.markdown import table, with_tables
 
 HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
 NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit

@@ -14,8 +14,8 @@ from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
 from benchmarks.workloads import step_of_env, step_of_filtered
 from filters.wrappers.single import EstimateState
-from thruster_env.numerics.streams import ACTION_SPACE, derived_seed
-from thruster_env.plant import Plant
+from thruster_env.core.streams import ACTION_SPACE, derived_seed
+from thruster_env.thruster.plant import Plant
 
 ENSEMBLE_SIZE = 50
 PEER_STEPS = 100  # of FilterPy's slow filters in a round; their time a step does not depend on their number

@@ -17,7 +17,7 @@ from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
 from benchmarks.workloads import step_by_size, times
-from thruster_env.numerics.threads import cores
+from thruster_env.core.threads import cores
 from tuning.evaluation import sizes
 from tuning.likelihood import family
 from tuning.search import trials

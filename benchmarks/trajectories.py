@@ -17,7 +17,7 @@ from benchmarks.timing import alone, side_by_side
 from benchmarks.workloads import step_of_filter, times
 from filters import run
 from filters.filter import Filter
-from thruster_env.numerics.threads import cores
+from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice

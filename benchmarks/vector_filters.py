@@ -11,7 +11,7 @@ from benchmarks.rows import Row
 from benchmarks.timing import alone
 from benchmarks.vectors import vector_steps
 from benchmarks.workloads import step_of_filtered
-from thruster_env.numerics.threads import cores
+from thruster_env.core.threads import cores
 
 COPIES, STEPS = 1024, 100
 ENSEMBLE_SIZE = 50

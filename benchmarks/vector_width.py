@@ -21,7 +21,7 @@ from benchmarks.timing import Measure
 from benchmarks.trajectories import estimates
 from benchmarks.vectors import vector_steps
 from benchmarks.vehicles import member_steps
-from thruster_env.numerics import optimising
+from thruster_env.core import optimising
 from tuning.auv.find import find_scenario as find_vehicles
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice

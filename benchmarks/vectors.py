@@ -15,16 +15,16 @@ from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.workloads import step_of_env
-from thruster_env.dynamics import substep
-from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import COMMAND, SUBSTEPS, VOLTAGE
-from thruster_env.engine.motion import move_thruster
-from thruster_env.numerics.compiled import compiled, function_fingerprint
-from thruster_env.numerics.streams import ACTION_SPACE, derived_seed
-from thruster_env.numerics.threads import cores, spread
-from thruster_env.plant import make_plant
-from thruster_env.plants.memory import set_row
-from thruster_env.task import Task
+from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.memory import set_row
+from thruster_env.core.streams import ACTION_SPACE, derived_seed
+from thruster_env.core.threads import cores, spread
+from thruster_env.thruster.dynamics import substep
+from thruster_env.thruster.engine.copies import Copies
+from thruster_env.thruster.engine.memory import COMMAND, SUBSTEPS, VOLTAGE
+from thruster_env.thruster.engine.motion import move_thruster
+from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.task import Task
 
 COPIES, STEPS = 8192, 200
 PROPAGATED = 65536

@@ -10,9 +10,6 @@ from time import perf_counter
 import gymnasium as gym
 import numpy as np
 
-from auv_env.dynamics import motion_substep
-from auv_env.engine.motion import read_constants
-from auv_env.plant import make_plant
 from benchmarks.batches import shared
 from benchmarks.counting import operations_of
 from benchmarks.rates import arithmetic_limit
@@ -22,9 +19,12 @@ from benchmarks.vectors import vector_steps
 from benchmarks.workloads import step_of_filter, step_of_filtered, times
 from filters import make_filter, run
 from filters.filter import Filter
-from thruster_env.numerics.compiled import compiled, function_fingerprint
-from thruster_env.numerics.threads import cores
-from thruster_env.numerics.tuples import tuple_of, written_out
+from thruster_env.auv.dynamics import motion_substep
+from thruster_env.auv.engine.motion import read_constants
+from thruster_env.auv.plant import make_plant
+from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.threads import cores
+from thruster_env.core.tuples import tuple_of, written_out
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
 from tuning.problems.seeds import training_seeds

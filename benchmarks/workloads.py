@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.counting import counting
 from filters.engine.compile import new_memory
 from filters.filter import Filter
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import FILTER_PROCESS, normal_block
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import FILTER_PROCESS, normal_block
 
 NORMALS = 4  # that one block of the generator makes
 FEW = 8, 16  # members that are enough to count, whole vector registers of them

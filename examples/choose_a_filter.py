@@ -16,7 +16,7 @@ seeds count.
 
 import tuning
 from filters import FILTERS, make_filter
-from thruster_env.model import thruster_model
+from thruster_env.thruster.model import thruster_model
 
 SEEDS = 50
 

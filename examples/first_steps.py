@@ -98,7 +98,7 @@ print(f"mean NIS: {nis.mean():.2f}")
 # they need.
 
 from filters import make_filter
-from thruster_env.model import thruster_model
+from thruster_env.thruster.model import thruster_model
 
 ekf = make_filter("ekf", thruster_model(preset="tunnel"))
 belief = ekf.predict(ekf.init(), u=[12.0])

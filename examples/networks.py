@@ -22,9 +22,9 @@ import torch
 
 import filters
 from filters import make_filter, run, thruster_model
-from thruster_env.model import transition
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants.simulate import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model.simulate import simulate
+from thruster_env.thruster.model import transition
 
 RUNS = 60
 STEPS = 30

@@ -29,12 +29,9 @@ from typing import ClassVar
 
 import tuning
 from filters import ExtendedKalmanFilter
-from filters.gaussian.extended import advance, settle
-from filters.pages.page_filter import Page, PageFilter
-from thruster_env.model import thruster_model
-from thruster_env.numerics.algebra.blocks import forward_quotient
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import (
+from filters.algebra.blocks import forward_quotient
+from filters.algebra.densities import log_density
+from filters.algebra.operations import (
     divide,
     joseph,
     only,
@@ -43,8 +40,11 @@ from thruster_env.numerics.algebra.operations import (
     uncorrelated,
     wrap,
 )
-from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.scalars import at_most, diagonal, exponential
+from filters.algebra.points import root
+from filters.algebra.scalars import at_most, diagonal, exponential
+from filters.gaussian.extended import advance, settle
+from filters.pages.page_filter import Page, PageFilter
+from thruster_env.thruster.model import thruster_model
 
 SEEDS = 100
 

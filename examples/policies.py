@@ -21,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 import thruster_env
-from thruster_env.training.vec_env import NativeVecEnv
+from tuning.policies.vec_env import NativeVecEnv
 
 COPIES = 64
 TRAINING_STEPS = 60_000

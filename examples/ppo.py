@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
-from thruster_env.training import NativeVecEnv
+from tuning.policies import NativeVecEnv
 
 ENV, FILTER = "BowThrusterTracking-v0", "ekf"
 COPIES = 64  # stepped side by side, in one compiled call

@@ -16,9 +16,9 @@ import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 
-import auv_env
-from auv_env.control.depth_and_course import DepthAndCourse
+import thruster_env.auv
 from filters import EstimateState
+from thruster_env.auv.control.depth_and_course import DepthAndCourse
 
 STEPS = 600
 

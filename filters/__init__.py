@@ -40,9 +40,9 @@ from filters.transformed import transformed_model
 from filters.wrappers.ids import register_filtered_envs
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
-from thruster_env.numerics.compiled import may_be_inlined
-from thruster_env.plants.affine import affine_model, linearize
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import may_be_inlined
+from thruster_env.model.affine import affine_model, linearize
+from thruster_env.model.state_space import StateSpaceModel
 
 __all__ = [
     "FILTERS",
@@ -100,7 +100,7 @@ __all__ = [
     "transformed_model",
 ]
 
-may_be_inlined(__name__, "thruster_env.plants")
+may_be_inlined(__name__, "thruster_env.env", "thruster_env.graphs")
 register_filtered_envs()
 
 
@@ -109,5 +109,5 @@ def __getattr__(name: str):
     if name == "thruster_model":
         from importlib import import_module
 
-        return import_module("thruster_env.model").thruster_model
+        return import_module("thruster_env.thruster.model").thruster_model
     raise AttributeError(f"module 'filters' has no attribute {name!r}")

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.angles import NAMES, short_way
-from thruster_env.numerics.checks import finite, positive
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.derivatives import step_of, stretch
-from thruster_env.numerics.pickling import makes_functions
-from thruster_env.numerics.sources import Source, entrywise, tuple_of, written_out
-from thruster_env.numerics.tuples import assembled, joiner, vector_part
-from thruster_env.plants.quantities import Output, Quantity
-from thruster_env.plants.shape import constants_are_array
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import NAMES, short_way
+from thruster_env.core.checks import finite, positive
+from thruster_env.core.compiled import inlined
+from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import Source, entrywise, tuple_of, written_out
+from thruster_env.core.tuples import assembled, joiner, vector_part
+from thruster_env.model.quantities import Output, Quantity
+from thruster_env.model.shape import constants_are_array
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class Unknown(NamedTuple):

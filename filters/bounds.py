@@ -6,10 +6,10 @@ import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from thruster_env.numerics.checks import as_floats, correlations
-from thruster_env.plants.affine import AffineModel
-from thruster_env.plants.simulate import simulate
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, correlations
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.simulate import simulate
+from thruster_env.model.state_space import StateSpaceModel
 
 STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.pickling import makes_functions
-from thruster_env.numerics.sources import is_array, matrix_of, tuple_of, written_out
-from thruster_env.plants.affine import AffineModel, affine_model
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import is_array, matrix_of, tuple_of, written_out
+from thruster_env.model.affine import AffineModel, affine_model
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def embedded_model(

@@ -15,8 +15,8 @@ import numpy as np
 from filters.engine.belief import Belief, Innovation, Kernels
 from filters.engine.gated import GatedSession
 from filters.engine.session import Running, Session
-from thruster_env.numerics.compiled import is_interpreting
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import is_interpreting
+from thruster_env.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from filters.live import Live
@@ -38,7 +38,7 @@ class Filter:
     has_covariance: ClassVar[bool] = True  # if not, covariances and log-likelihoods are zero and say nothing
     one_model: ClassVar[bool] = True  # if not, it has others beside `model`, with their own sample times and Q
     mixable: ClassVar[bool] = True  # whether a step may begin with another mean and P than those the last one left
-    any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.plants.steps`
+    any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.logs.steps`
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 

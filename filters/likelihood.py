@@ -9,8 +9,8 @@ import numpy as np
 from filters.differentiated.recursion import Wanted
 from filters.differentiated.runs import ModelSlopes, derivatives
 from filters.filter import Filter
-from thruster_env.numerics.checks import as_floats
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class Likelihood(NamedTuple):

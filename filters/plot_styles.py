@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from thruster_env.numerics.plots import BLUE, GREEN, MUSTARD, PALE, PLUM, RUST, SKY, TRUE, WINE
+from thruster_env.core.plots import BLUE, GREEN, MUSTARD, PALE, PLUM, RUST, SKY, TRUE, WINE
 
 SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
 TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates

@@ -7,19 +7,19 @@ from functools import lru_cache, partial
 import numpy as np
 
 from filters.wrapped import wrapped_variances
-from thruster_env.numerics.checks import as_floats, at_least, correlations, covariance_root
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.derivatives import step_of, stretch
-from thruster_env.numerics.matrices import multiplier, quadratic_form
-from thruster_env.numerics.progress import told
-from thruster_env.numerics.sources import Source
-from thruster_env.numerics.streams import GROUP
-from thruster_env.numerics.threads import cores, spread
-from thruster_env.numerics.tuples import matrix_reader, vector_reader, vector_writer
-from thruster_env.plants.layout import constants_reader, number_places, padded
-from thruster_env.plants.shape import Functions, Shape, observation_slopes, transition_slopes
-from thruster_env.plants.simulate import noise_step, truth_steps
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.matrices import multiplier, quadratic_form
+from thruster_env.core.progress import told
+from thruster_env.core.sources import Source
+from thruster_env.core.streams import GROUP
+from thruster_env.core.threads import cores, spread
+from thruster_env.core.tuples import matrix_reader, vector_reader, vector_writer
+from thruster_env.model.layout import constants_reader, number_places, padded
+from thruster_env.model.shape import Functions, Shape, observation_slopes, transition_slopes
+from thruster_env.model.simulate import noise_step, truth_steps
+from thruster_env.model.state_space import StateSpaceModel
 
 ALL_UP_TO = 12  # states, for which the matrices of every sequence cost nothing that counts
 MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together

@@ -36,9 +36,9 @@ from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
-from thruster_env.numerics.checks import one_of
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import AnyStepModel
+from thruster_env.core.checks import one_of
+from thruster_env.logs.steps import AnyStepModel
+from thruster_env.model.state_space import StateSpaceModel
 
 LISTED = "thruster filters"  # the command that lists all
 FILTERS: dict[str, type[Filter]] = {

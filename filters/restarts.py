@@ -13,11 +13,11 @@ from filters.engine.batch import Estimates, trajectories
 from filters.engine.session import Session
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
-from thruster_env.numerics.checks import as_floats
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import observation_slopes, transition_slopes
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats
+from thruster_env.core.sources import as_value
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import observation_slopes, transition_slopes
+from thruster_env.model.state_space import StateSpaceModel
 
 Found = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
 Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)

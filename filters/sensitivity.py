@@ -13,8 +13,8 @@ from filters.differentiated.runs import Density, ModelSlopes, derivatives
 from filters.filter import Filter
 from filters.likelihood import check_shapes
 from filters.starts import Starts
-from thruster_env.numerics.checks import as_floats
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats
+from thruster_env.model.state_space import StateSpaceModel
 
 __all__ = ["ModelSlopes", "Sensitivity", "sensitivity"]
 

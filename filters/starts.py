@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import observation_slopes
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import difference
+from thruster_env.core.sources import as_value
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import observation_slopes
+from thruster_env.model.state_space import StateSpaceModel
 
 PRIOR, MEASUREMENT = "prior", "measurement"
 STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin

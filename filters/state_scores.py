@@ -10,8 +10,8 @@ from filters.differentiated.recursion import LOG_SCORE, SQUARES, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives
 from filters.filter import Filter
 from filters.likelihood import Likelihood, check_shapes
-from thruster_env.numerics.checks import as_floats, one_of
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, one_of
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def state_score(

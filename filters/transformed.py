@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.pickling import as_function, as_made, makes_functions
-from thruster_env.numerics.sources import as_value, is_array, tuple_of, written_out
-from thruster_env.plants.quantities import Output, Quantity
-from thruster_env.plants.state_bounds import Bound, checked_bounds
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.pickling import as_function, as_made, makes_functions
+from thruster_env.core.sources import as_value, is_array, tuple_of, written_out
+from thruster_env.model.quantities import Output, Quantity
+from thruster_env.model.state_bounds import Bound, checked_bounds
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def transformed_model(model: StateSpaceModel, bounds: Mapping[str | int, tuple] | None = None) -> StateSpaceModel:

@@ -17,7 +17,7 @@ from typing import Any
 
 from filters.registry import FILTERS, LISTED, filter_type
 from filters.tuned_model import check_model_data
-from thruster_env.numerics.checks import finite, one_of, positive, short_repr
+from thruster_env.core.checks import finite, one_of, positive, short_repr
 
 FILE_FORMAT = "tuned filter"
 OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3

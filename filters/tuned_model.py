@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import of_one_step
+from thruster_env.core.checks import short_repr
+from thruster_env.logs.steps import of_one_step
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)

@@ -14,13 +14,13 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-import auv_env  # noqa: F401 - registers the envs
-from auv_env.control.depth_and_course import DepthAndCourse
-from auv_env.manoeuvres import MANOEUVRES
+import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState
 from pages.page import digits, make_page, table
-from thruster_env.numerics.files import write_whole
-from thruster_env.plants.observe import ObserveStateVector
+from thruster_env.auv.control.depth_and_course import DepthAndCourse
+from thruster_env.auv.manoeuvres import MANOEUVRES
+from thruster_env.core.files import write_whole
+from thruster_env.env.observe import ObserveStateVector
 
 
 def frame(path: Path) -> Path:

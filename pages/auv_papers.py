@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from pages.page import make_page, table
-from thruster_env.studies import ngatini2017, ngatini2019
-from thruster_env.studies.vehicle.estimators import MEASUREMENTS
-from thruster_env.studies.vehicle.experiment import PathResult, run_tasks
-from thruster_env.studies.vehicle.figure import path_runs, paths_figure
-from thruster_env.studies.vehicle.findings import ENKF, FKF, findings
-from thruster_env.studies.vehicle.printed import POSE, PrintedRow
-from thruster_env.studies.vehicle.scores import Scores, position_ratio
-from thruster_env.studies.vehicle.statements import statements
-from thruster_env.studies.vehicle.tasks import tasks_of
-from thruster_env.studies.vehicle.wording import digits, with_interval
+from tuning.experiments import ngatini2017, ngatini2019
+from tuning.experiments.vehicle.estimators import MEASUREMENTS
+from tuning.experiments.vehicle.experiment import PathResult, run_tasks
+from tuning.experiments.vehicle.figure import path_runs, paths_figure
+from tuning.experiments.vehicle.findings import ENKF, FKF, findings
+from tuning.experiments.vehicle.printed import POSE, PrintedRow
+from tuning.experiments.vehicle.scores import Scores, position_ratio
+from tuning.experiments.vehicle.statements import statements
+from tuning.experiments.vehicle.tasks import tasks_of
+from tuning.experiments.vehicle.wording import digits, with_interval
 
 RUNS = {"ngatini2019": 50, "ngatini2017": 10}
 

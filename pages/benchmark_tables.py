@@ -14,14 +14,14 @@ from functools import partial
 from pathlib import Path
 
 from pages.page import DOCS, table
-from thruster_env.numerics.files import write_whole
-from thruster_env.numerics.markdown import with_tables
-from thruster_env.studies import BENCHMARKS
-from thruster_env.studies.benchmark import find_benchmark
-from thruster_env.studies.lorenz63 import problem as lorenz63
-from thruster_env.studies.pendulum import problem as pendulum
-from thruster_env.studies.tuned_inflation import tune_inflation
+from thruster_env.core.files import write_whole
+from thruster_env.core.markdown import with_tables
 from tuning.evaluation.held_out import evaluate_held_out
+from tuning.experiments import BENCHMARKS
+from tuning.experiments.benchmark import find_benchmark
+from tuning.experiments.lorenz63 import problem as lorenz63
+from tuning.experiments.pendulum import problem as pendulum
+from tuning.experiments.tuned_inflation import tune_inflation
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
 

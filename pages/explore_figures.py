@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pages.page import digits, make_page, table
-from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from tuning.exploring.bench import Bench
 from tuning.exploring.scenes import SCENES, Scene
 from tuning.exploring.view import View

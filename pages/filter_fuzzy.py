@@ -13,9 +13,9 @@ from filters.gaussian.fuzzy import BLENDINGS
 from pages.filter_gaussian import FLOW, FLOW_RMSE
 from pages.filter_runs import STYLES, Runs, errors_of, held_runs, nees, times
 from pages.page import digits, legend_below, log_ticks, table
-from thruster_env.linear.steady_state import steady_state
-from thruster_env.numerics.plots import DARK, SKY, new_figure, save_figure, tidy
-from thruster_env.parameters import PRESETS
+from thruster_env.core.plots import DARK, SKY, new_figure, save_figure, tidy
+from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.parameters import PRESETS
 from tuning.problems.data import FIRST_SCORED_STEP
 
 CENTRE = 12.0  # [V]

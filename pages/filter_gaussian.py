@@ -18,8 +18,8 @@ from filters import (
 from filters.posterior import posterior_bound
 from pages.filter_runs import PUBLISHED_NOISE, RUNS, STYLES, deviations, errors_of, held_runs, rmse, runs_of, times
 from pages.page import legend_below, log_ticks
-from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from thruster_env.plant import make_plant
+from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.thruster.plant import make_plant
 from tuning.problems.data import FIRST_SCORED_STEP
 
 FLOW = "flow velocity $U_a$ [m/s]"

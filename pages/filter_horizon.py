@@ -10,7 +10,7 @@ from filters import make_filter, run
 from pages.filter_runs import STYLES
 from pages.page import legend_below, log_ticks
 from pages.ranking_horizon import POSITIVE, SETTLED, assumed, batches
-from thruster_env.numerics.plots import new_figure, save_figure, tidy
+from thruster_env.core.plots import new_figure, save_figure, tidy
 
 RUNS, LENGTHS = 50, (1, 2, 5, 10, 20, 30)
 

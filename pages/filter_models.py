@@ -10,8 +10,8 @@ import numpy as np
 from filters import InteractingMultipleModelFilter, affine_model, make_filter, run, thruster_model
 from filters.filter import Filter
 from pages.filter_runs import STYLES, times
-from thruster_env.numerics.plots import PALE, new_figure, save_figure, tidy
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.plots import PALE, new_figure, save_figure, tidy
+from thruster_env.model.state_space import StateSpaceModel
 
 LOST_FROM, LOST_TO, STEPS, LEVEL = 150, 350, 500, 12.0  # steps; [V]
 

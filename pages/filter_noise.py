@@ -18,7 +18,7 @@ from filters import (
 )
 from pages.filter_runs import RUNS, SEED, STYLES, Runs, deviations, errors_of, held_runs, times
 from pages.page import legend_below, log_ticks
-from thruster_env.numerics.plots import BLUE, DARK, MUSTARD, RUST, new_figure, save_figure, tidy
+from thruster_env.core.plots import BLUE, DARK, MUSTARD, RUST, new_figure, save_figure, tidy
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"

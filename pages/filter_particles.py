@@ -9,8 +9,8 @@ import numpy as np
 from filters import make_filter, run
 from pages.filter_runs import STYLES
 from pages.page import log_ticks
-from thruster_env.numerics.plots import BLUE, DARK, new_figure, save_figure, tidy
-from thruster_env.studies import mixed_linear
+from thruster_env.core.plots import BLUE, DARK, new_figure, save_figure, tidy
+from tuning.experiments import mixed_linear
 
 SIZES = (20, 50, 100, 200, 500, 1000, 2000, 5000)
 RUNS = 200

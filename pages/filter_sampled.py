@@ -10,8 +10,8 @@ from filters import ParticleFilter, make_filter, run, thruster_model
 from filters.ensembles.recording import record_members
 from pages.filter_runs import PUBLISHED_NOISE, STYLES, Runs, errors_of, held_runs, runs_of, times
 from pages.page import log_ticks
-from thruster_env.numerics.plots import DARK, RUST, new_figure, save_figure, tidy
-from thruster_env.plant import make_plant
+from thruster_env.core.plots import DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.thruster.plant import make_plant
 
 SIGNLESS = {"sensors": ["speed-magnitude"], "process_noise_cov": (4.0, 4e-4), "measurement_noise_cov": [0.25]}
 

@@ -16,7 +16,7 @@ from pages.filter_noise import LOUD, outliers
 from pages.filter_runs import PUBLISHED_NOISE, Runs, errors_of, held_runs
 from pages.filter_sampled import SIGNLESS, signless_runs
 from pages.page import digits, table
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 
 class Words(NamedTuple):

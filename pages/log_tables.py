@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from pages.page import make_page, table
-from thruster_env.studies.hidden_truth import CASES, MANY_RUNS, RUNS, TRIALS, Hidden, hide_truth
+from tuning.experiments.hidden_truth import CASES, MANY_RUNS, RUNS, TRIALS, Hidden, hide_truth
 from tuning.problems.find import find_problem
 
 

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Sequence
 
 from filters import StateSpaceModel
+from filters.algebra.matrices import Matrix, in_order
 from filters.differentiated.memory import Memory
 from filters.differentiated.recursion import MOST, Wanted, stages_of
 from filters.ensembles import deterministic, steps, stochastic
@@ -23,9 +24,8 @@ from filters.pages.memory import RowMemory
 from filters.pages.stages import Stage, as_programs
 from filters.particles import particle, weighted
 from pages.page import make_page
-from thruster_env.numerics.algebra.loops import cut
-from thruster_env.numerics.algebra.matrices import Matrix, in_order
-from thruster_env.numerics.algebra.programs import Place, Program
+from thruster_env.graphs.loops import cut
+from thruster_env.graphs.programs import Place, Program
 
 WANTED = Wanted(information=False, constants=True, tails=False)
 

@@ -17,19 +17,19 @@ import numpy as np
 
 from pages.page import label_grid, legend_below, make_page
 from pages.plant_tables import FULL_VOLTAGE, TABLES, thrust_coefficient
-from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.effects.flow import FLOW_SIGNALS
-from thruster_env.effects.reference import REFERENCE_SIGNALS
-from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import AMBIENT, FIXED_ROWS, READINGS, REFERENCE, THRUST, VALID, VOLTAGE
-from thruster_env.linear.steady_state import steady_state
-from thruster_env.numerics.files import write_whole
-from thruster_env.numerics.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.parameters import PRESETS
-from thruster_env.plant import Plant, make_plant
-from thruster_env.simulation import simulate
-from thruster_env.task import Task
+from thruster_env.core.files import write_whole
+from thruster_env.core.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
+from thruster_env.core.streams import episode_keys
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
+from thruster_env.thruster.engine.copies import Copies
+from thruster_env.thruster.engine.memory import AMBIENT, FIXED_ROWS, READINGS, REFERENCE, THRUST, VALID, VOLTAGE
+from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.plant import Plant, make_plant
+from thruster_env.thruster.simulation import simulate
+from thruster_env.thruster.task import Task
 
 # Presets are told apart by colour and by dashes; open_bladed hardly turns and is left out of the pictures.
 STYLES = {
@@ -203,7 +203,7 @@ def frame(path: Path) -> Path:
 
 
 def run(plant: Plant, voltages: np.ndarray, task: Task | None = None, seed: int = SEED) -> np.ndarray:
-    """Record (K + 1, rows) of one copy under voltages (K,); `thruster_env.engine.memory` names the rows."""
+    """Record (K + 1, rows) of one copy under voltages (K,); `engine.memory` names the rows."""
     copies = Copies(plant, task or Task(), 1)
     copies.begin(episode_keys([seed]))
     record = [copies.memory[0, :FIXED_ROWS, 0].copy()]

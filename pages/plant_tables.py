@@ -9,12 +9,18 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from pages.page import digits, table
-from thruster_env.control.controllers import LQRController, PIController
-from thruster_env.dynamics import rates
-from thruster_env.linear.steady_state import jacobians, required_substeps, run_substeps, state_range, steady_state
-from thruster_env.parameters import PRESETS, ThrusterParameters, derive_constants
-from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_MEASUREMENT_NOISE
-from thruster_env.plants.observe import ObserveStateVector
+from thruster_env.env.observe import ObserveStateVector
+from thruster_env.thruster.control.controllers import LQRController, PIController
+from thruster_env.thruster.dynamics import rates
+from thruster_env.thruster.linear.steady_state import (
+    jacobians,
+    required_substeps,
+    run_substeps,
+    state_range,
+    steady_state,
+)
+from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, derive_constants
+from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_MEASUREMENT_NOISE
 
 FULL_VOLTAGE = dict.fromkeys(PRESETS, DEFAULT_MAX_VOLTAGE) | {"t200": 13.0}  # [V]
 SHARES = (0.25, 0.5, 1.0)  # of the full voltage
@@ -43,7 +49,7 @@ SOURCES = {
     "open_bladed": "the same",
     "tunnel_physical": "`tunnel`, corrected",
     "open_bladed_corrected": "`open_bladed`, corrected",
-    "t200": "Blue Robotics' bollard table of 2019; `thruster_env/studies/t200_identification.py`",
+    "t200": "Blue Robotics' bollard table of 2019; `tuning/experiments/t200_identification.py`",
 }
 INFERRED = {
     "tunnel": "nothing: K_h = 17.79, as printed",

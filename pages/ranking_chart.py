@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from filters.plot_styles import colour_of
 from pages.page import DOCS
-from thruster_env.numerics.plots import DARK, GREY, new_figure, save_figure
+from thruster_env.core.plots import DARK, GREY, new_figure, save_figure
 
 FILE = "ranking_chart.png"
 WIDTH, ROW = 9.6, 0.56  # [in]

@@ -98,7 +98,7 @@ def network_further() -> str:
 
 def network_papers() -> str:
     """The settings of the paper on KalmanNet: mean square errors in dB."""
-    from thruster_env.studies import kalmannet
+    from tuning.experiments import kalmannet
 
     own, rows = {"differentiable-enkf": {"steps": 100, "window": 20}}, []
     for problem in (kalmannet.linear, kalmannet.lorenz):

@@ -14,8 +14,8 @@ from filters.filter import Filter
 from filters.horizon.window import LOSSES, STUDENT
 from pages.page import digits, table
 from pages.ranking_tables import EKF, IEKF, ROBUST, SEEDS, leaderboard, main, ratio_cell
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants.simulate import simulate
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model.simulate import simulate
 from tuning.evaluation.compare import contender
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario

@@ -17,8 +17,8 @@ from filters.consistency.intervals import rmse_intervals
 from filters.consistency.nees import whitened
 from pages.page import DOCS, table
 from pages.ranking_tables import leaderboard, main, table_of
-from thruster_env.studies import mixed_linear
 from tuning.evaluation.compare import contender
+from tuning.experiments import mixed_linear
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario

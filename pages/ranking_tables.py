@@ -18,7 +18,7 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from filters.registry import FILTERS, filter_type
 from pages.page import DOCS, digits, table, with_tables
-from thruster_env.numerics.files import write_whole
+from thruster_env.core.files import write_whole
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem

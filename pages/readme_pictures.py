@@ -22,11 +22,11 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.engine.batch import run
 from pages.page import DOCS
-from thruster_cli.demo import FILTER, SCENARIO, before_and_after
-from thruster_cli.tune import tune
-from thruster_cli.tuning_report import Tuning
-from thruster_env.numerics.files import write_whole
-from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.files import write_whole
+from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from tuning.cli.demo import FILTER, SCENARIO, before_and_after
+from tuning.cli.tune import tune
+from tuning.cli.tuning_report import Tuning
 from tuning.reporting.panels import axis_label
 from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario

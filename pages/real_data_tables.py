@@ -13,17 +13,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pages.page import DOCS
-from thruster_env.numerics.files import write_whole
-from thruster_env.numerics.markdown import table, with_tables
-from thruster_env.numerics.toml import as_toml
-from thruster_env.studies.recordings.comparison import estimates_of
-from thruster_env.studies.recordings.identification import CHOSEN
-from thruster_env.studies.recordings.model import IDENTIFIED, model
-from thruster_env.studies.recordings.regime import regimes
-from thruster_env.studies.recordings.results import Task, identify_all
-from thruster_env.studies.recordings.runs import read_recordings
-from thruster_env.studies.recordings.tables import sentences
-from thruster_env.studies.recordings.tables import tables_of as rows_of
+from thruster_env.core.files import write_whole
+from thruster_env.core.markdown import table, with_tables
+from thruster_env.core.toml import as_toml
+from tuning.experiments.recordings.comparison import estimates_of
+from tuning.experiments.recordings.identification import CHOSEN
+from tuning.experiments.recordings.model import IDENTIFIED, model
+from tuning.experiments.recordings.regime import regimes
+from tuning.experiments.recordings.results import Task, identify_all
+from tuning.experiments.recordings.runs import read_recordings
+from tuning.experiments.recordings.tables import sentences
+from tuning.experiments.recordings.tables import tables_of as rows_of
 
 
 def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pages.page import make_page, table
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.logs.log import Log
+from thruster_env.logs.log import Log
+from thruster_env.model.affine import affine_model
 from tuning.problems.log_parts import Block, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.measures import Measured, Runs, over, signed_rank

@@ -18,7 +18,7 @@ from pages.page import log_ticks, make_page, table
 from pages.tuning_masses import TABLES as MASSES_TABLES
 from pages.tuning_recovery import TABLES as RECOVERY_TABLES
 from pages.tuning_recovery import bad_start
-from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from pages.page import table
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
 from tuning.evaluation.baselines import GIVEN, NOISE
 from tuning.evaluation.evaluate import score_ratio
 from tuning.evaluation.held_out import evaluate_held_out

@@ -16,10 +16,10 @@ from filters.augmented import Unknown, augmented_model
 from filters.filter import Filter
 from filters.registry import make_filter
 from pages.page import make_page, table
-from thruster_env.dynamics import Constants
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.tuples import written_out
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import inlined
+from thruster_env.core.tuples import written_out
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.dynamics import Constants
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.search.objectives import nis_violation, penalised

@@ -13,8 +13,8 @@ from functools import cache
 from pathlib import Path
 
 from pages.page import make_page
-from thruster_env.studies.users.runs import Case, Panel, run_panel
-from thruster_env.studies.users.tables import markdown, sentences
+from tuning.experiments.users.runs import Case, Panel, run_panel
+from tuning.experiments.users.tables import markdown, sentences
 
 RESULTS = Path("out") / "users"
 

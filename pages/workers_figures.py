@@ -15,8 +15,8 @@ import numpy as np
 
 from pages.page import log_ticks, make_page, table
 from pages.workers_rates import FILTERS, NOTHING, STORAGES, WAITING, WORKS, rates
-from thruster_env.numerics.plots import BLUE, RUST, new_figure, save_figure, tidy
-from thruster_env.numerics.threads import cores
+from thruster_env.core.plots import BLUE, RUST, new_figure, save_figure, tidy
+from thruster_env.core.threads import cores
 
 COLOURS = dict(zip(STORAGES, (BLUE, RUST), strict=True))
 MOST = 128  # workers in the picture

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 # Before anything imports matplotlib or pygame.
 os.environ.setdefault("MPLBACKEND", "Agg")

@@ -5,10 +5,10 @@ import shutil
 import gymnasium as gym
 import pytest
 
-from thruster_env.training.environments import make_environments
-from thruster_env.training.learn import train
-from thruster_env.training.saved import load, read_configuration
-from thruster_env.training.setup import make_configuration
+from tuning.policies.environments import make_environments
+from tuning.policies.learn import train
+from tuning.policies.saved import load, read_configuration
+from tuning.policies.setup import make_configuration
 from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT = 4, 30

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants import simulate
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model import simulate
+from thruster_env.model.affine import affine_model
+from thruster_env.model.quantities import Quantity
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 

@@ -8,9 +8,9 @@ import numpy as np
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model
 from filters.registry import filter_type
 from filters.tuned_file import sealed
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 KEY = (123456789, 4294967295)  # of a filter's random numbers
 # One of each kind of page and kernel: what one of the others has in common with it is compiled alike.

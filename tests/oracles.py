@@ -6,7 +6,7 @@ import numpy as np
 
 from filters import run
 from tests.models import KEY
-from thruster_env.numerics.streams import normal_block
+from thruster_env.core.streams import normal_block
 
 
 def normals(stream, step, rows, size):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.algebra.operations import divide, eye, only, sym, uncorrelated
-from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, exceeds, is_number, trace
-from thruster_env.numerics.checks import finite
+from filters.algebra.operations import divide, eye, only, sym, uncorrelated
+from filters.algebra.points import outer
+from filters.algebra.scalars import choose, exceeds, is_number, trace
+from thruster_env.core.checks import finite
 
 
 def noise_moment(seen, HPH, R, v):

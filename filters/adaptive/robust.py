@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.adaptive.noise import noise_moment
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.scalars import constant, count, trace
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.scalars import constant, count, trace
-from thruster_env.numerics.checks import at_least, positive
+from thruster_env.core.checks import at_least, positive
 
 MOST_ITERATIONS = 50  # that are written out
 

@@ -8,13 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from filters.adaptive.noise import bounded_step, part_that_is_kept
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import outer
+from filters.algebra.scalars import choose, constant, exceeds, shifted
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, constant, exceeds, shifted
 
 
 def start(model):

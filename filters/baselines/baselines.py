@@ -15,12 +15,12 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
-from thruster_env.numerics.angles import wrapped
-from thruster_env.numerics.checks import at_least, positive, short_repr
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.tuples import vector_reader, vector_writer, zeros_of
-from thruster_env.plants.layout import constants_reader, number_places
-from thruster_env.plants.shape import Functions, Shape, innovation_of
+from thruster_env.core.angles import wrapped
+from thruster_env.core.checks import at_least, positive, short_repr
+from thruster_env.core.compiled import inlined
+from thruster_env.core.tuples import vector_reader, vector_writer, zeros_of
+from thruster_env.model.layout import constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape, innovation_of
 
 
 @inlined

@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 
-from thruster_env.numerics.angles import wrapped
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.sources import Source
+from thruster_env.core.angles import wrapped
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source
 
 INTERVALS = 100  # on either side, in which a sign change is looked for
 HALVINGS = 60  # of such an interval; and steps of the golden section, each of which leaves 0.618 of it

@@ -10,11 +10,11 @@ import numpy as np
 from filters.c.monitor import TestsWriter
 from filters.c.programs import FilterPrograms
 from filters.c.writer import Writer
-from thruster_env.numerics.algebra.c_source import literal, statements_of_members
-from thruster_env.numerics.algebra.loops import cut
-from thruster_env.numerics.algebra.programs import Program
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS
-from thruster_env.plants.layout import LANES, padded
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS
+from thruster_env.graphs.c_source import literal, statements_of_members
+from thruster_env.graphs.loops import cut
+from thruster_env.graphs.programs import Program
+from thruster_env.model.layout import LANES, padded
 
 DRAW = """\
 /* Philox4x32-10 of a counter and a key (Salmon, Moraes, Dror, Shaw 2011). */

@@ -9,11 +9,11 @@ from filters.c.log_reader import LINES, ROWS
 from filters.c.programs import FilterPrograms
 from filters.logs.columns import header_of
 from filters.logs.estimate import SKIPPED
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs import write
-from thruster_env.plants.logs.columns import DATE_NAMES, TIME_NAMES, plain
-from thruster_env.plants.logs.units import LENGTHS, WORDS, conversion
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs import write
+from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, plain
+from thruster_env.logs.units import LENGTHS, WORDS, conversion
+from thruster_env.model.quantities import Quantity
 
 MAIN = """\
 /* Filter a log: a CSV with a row a step on standard input, estimates on standard output.
@@ -124,7 +124,7 @@ def log_program(
 ) -> str:
     """The source of the program for a filter in C of this name.
 
-    It reads numbers, missing ones, units and times as `thruster_env.plants.logs.read.read_log` does, or ends with
+    It reads numbers, missing ones, units and times as `thruster_env.logs.read.read_log` does, or ends with
     exit code 2 and the number of the line. Logs must be of the sample time dt [s], and rows that they lack are
     predicted; without a dt they may be of any, and may lack none. An ensemble's random numbers are those of seed 0
     in `thruster estimate`, whose columns are those of its output: the estimate and its standard deviation, then

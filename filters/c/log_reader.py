@@ -1,4 +1,4 @@
-"""The part of a program in C that reads lines and rows of a log: the rules of `thruster_env.plants.logs`."""
+"""The part of a program in C that reads lines and rows of a log: the rules of `thruster_env.logs`."""
 
 LINES = r"""
 #define WAY "; thruster log LOG --out NEW.csv writes what thruster estimate reads of it"

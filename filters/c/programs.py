@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.algebra.densities import dot
+from filters.algebra.matrices import Matrix, evaluate
+from filters.algebra.operations import factor, quotient
 from filters.c.identifiers import is_macro, is_name
 from filters.engine.layout import memory_places
 from filters.ensembles.ensemble import EnsembleFilter
@@ -21,13 +24,10 @@ from filters.pages.memory import RowMemory
 from filters.pages.page_filter import FilterWithPage, with_page
 from filters.pages.stages import numbers_of
 from filters.pages.traced import MOST, Traced
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.graphs import Graph, TooLarge
-from thruster_env.numerics.algebra.matrices import Matrix, evaluate
-from thruster_env.numerics.algebra.operations import factor, quotient
-from thruster_env.numerics.algebra.programs import BY_MEMBERS, Place, Program, program_of
-from thruster_env.plants.shape import Shape
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.graphs.graphs import Graph, TooLarge
+from thruster_env.graphs.programs import BY_MEMBERS, Place, Program, program_of
+from thruster_env.model.shape import Shape
+from thruster_env.model.state_space import StateSpaceModel
 
 NIS = -1  # its place in a row, where machine code has none
 TOLD = frozenset(  # of each filter in C, and by its tests

@@ -14,7 +14,7 @@ from filters.c.sizes import COMPILERS, Sizes, sizes_of
 from filters.c.source import c_filter
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of
-from thruster_env.numerics.files import check_target, write_whole
+from thruster_env.core.files import check_target, write_whole
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.10)

@@ -9,10 +9,8 @@ import numpy as np
 from filters.c.programs import FilterPrograms
 from filters.engine.batch import run
 from filters.filter import Filter
-from thruster_env.numerics.algebra.precision import as_single
-from thruster_env.numerics.algebra.programs import Program, work_names
-from thruster_env.numerics.angles import difference, wrapped_where
-from thruster_env.numerics.streams import (
+from thruster_env.core.angles import difference, wrapped_where
+from thruster_env.core.streams import (
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
@@ -20,7 +18,9 @@ from thruster_env.numerics.streams import (
     fill_normals,
     filter_keys,
 )
-from thruster_env.plants.layout import LANES, padded
+from thruster_env.graphs.precision import as_single
+from thruster_env.graphs.programs import Program, work_names
+from thruster_env.model.layout import LANES, padded
 
 
 class _Single:

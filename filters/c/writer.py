@@ -13,10 +13,10 @@ import numpy as np
 from filters.c.monitor import TestsWriter
 from filters.c.programs import FilterPrograms
 from filters.engine.restart import LARGEST
-from thruster_env.numerics.algebra.c_source import functions_called_by, literal, statements_of
-from thruster_env.numerics.algebra.programs import Program
-from thruster_env.numerics.angles import wrapped_where
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.angles import wrapped_where
+from thruster_env.graphs.c_source import functions_called_by, literal, statements_of
+from thruster_env.graphs.programs import Program
+from thruster_env.model.quantities import Quantity
 
 LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
 TEST_ANEW = "    {name}_test_anew(filter);\n"

@@ -12,7 +12,7 @@ from scipy.special import chdtr, chdtri
 
 from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.uniformity import Uniformity, uniformity
-from thruster_env.numerics.threads import spread
+from thruster_env.core.threads import spread
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns

@@ -25,7 +25,7 @@ from filters.consistency.uniformity import Uniformity, uniformity
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
 from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members
-from thruster_env.numerics.angles import difference, is_angle, wrapped
+from thruster_env.core.angles import difference, is_angle, wrapped
 
 
 class EnsembleCheck(NamedTuple):

@@ -10,10 +10,10 @@ import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.affine import AffineModel, slopes_of_step
-from thruster_env.plants.shape import observation_slopes
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.sources import as_value
+from thruster_env.model.affine import AffineModel, slopes_of_step
+from thruster_env.model.shape import observation_slopes
+from thruster_env.model.state_space import StateSpaceModel
 
 STEPS = 24  # up to each of the places in a run, at which slopes are taken
 PLACES = (0.75, 1.0)  # in a run: filters have settled there

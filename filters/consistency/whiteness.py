@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from filters.consistency.nees import whitened
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 LAGS = 20
 

@@ -18,7 +18,7 @@ from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 
 KINDS: tuple[type[PageFilter], ...] = (
     KalmanFilter,

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from math import prod
 
+from filters.algebra.matrices import Matrix, given
+from filters.algebra.points import root
 from filters.pages.equations import PagedModel
 from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
 from filters.pages.programs import together
-from thruster_env.numerics.algebra.matrices import Matrix, given
-from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.plants.layout import number_places, starts_of
-from thruster_env.plants.shape import Shape
+from thruster_env.graphs.programs import Place
+from thruster_env.model.layout import number_places, starts_of
+from thruster_env.model.shape import Shape
 
 
 class Memory(NumbersMemory):
-    """The arrays of `thruster_env.numerics.algebra.programs`, for a model's sizes.
+    """The arrays of `thruster_env.graphs.programs`, for a model's sizes.
 
         rows      x, P, what is kept; the same as a stage leaves it; u, z; the score; the true x; what slopes need
         change    of a parameter: dx, dP, d of what is kept; d score; of the information what `notes` says, twice

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters.algebra.matrices import Matrix
+from filters.algebra.operations import only, present, uncorrelated, wrap
 from filters.differentiated.memory import Memory
 from filters.differentiated.scores import LIKELIHOOD, LOG_SCORE, SQUARES, Wanted, density_of, score_of_truth
 from filters.gaussian.extended import ExtendedKalmanFilter
@@ -21,13 +23,11 @@ from filters.pages.page import Page
 from filters.pages.programs import with_kept
 from filters.pages.stages import Stage, as_calls, as_programs, stage_of
 from filters.pages.traced import MOST
-from thruster_env.numerics.algebra.graphs import uncollected
-from thruster_env.numerics.algebra.matrices import Matrix
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.programs import callable_of
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.plants.layout import constants_reader, number_places, starts_of
-from thruster_env.plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.graphs.graphs import uncollected
+from thruster_env.graphs.programs import callable_of
+from thruster_env.model.layout import constants_reader, number_places, starts_of
+from thruster_env.model.shape import Functions, Shape, observation_slopes, transition_slopes
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
 

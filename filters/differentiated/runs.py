@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.algebra.densities import tail_of
 from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
 from filters.pages.page_filter import PageFilter
 from filters.starts import Starts, as_the_prior_says
-from thruster_env.numerics.algebra.densities import tail_of
-from thruster_env.numerics.angles import wrapped_where
-from thruster_env.numerics.threads import spread
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import wrapped_where
+from thruster_env.core.threads import spread
+from thruster_env.model.state_space import StateSpaceModel
 
 STEP = 1e-6  # of parameters, of which 1 is a sensible change
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from filters.algebra.densities import density, density_slope, dot, heavier, outlier_weight
+from filters.algebra.derivatives import slopes_of
+from filters.algebra.matrices import Matrix
+from filters.algebra.operations import factor, inverse, present, quotient, uncorrelated
 from filters.differentiated.memory import Memory
-from thruster_env.numerics.algebra.densities import density, density_slope, dot, heavier, outlier_weight
-from thruster_env.numerics.algebra.derivatives import slopes_of
-from thruster_env.numerics.algebra.matrices import Matrix
-from thruster_env.numerics.algebra.operations import factor, inverse, present, quotient, uncorrelated
 
 LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
 

@@ -10,10 +10,10 @@ import numpy as np
 from filters.engine.compile import batch, new_memory, vectors
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.numerics.checks import as_floats, covariance, short_repr
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.numerics.threads import spread
-from thruster_env.plants.layout import LANES, with_root
+from thruster_env.core.checks import as_floats, covariance, short_repr
+from thruster_env.core.streams import filter_keys
+from thruster_env.core.threads import spread
+from thruster_env.model.layout import LANES, with_root
 
 
 class Estimates(NamedTuple):

@@ -11,8 +11,8 @@ from filters.engine.checks import vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, build_operation, new_memory
 from filters.engine.layout import memory_places
 from filters.filter import Filter
-from thruster_env.numerics.compiled import CompiledOrPython, inlined, is_interpreting
-from thruster_env.numerics.threads import in_parts, worker_threads
+from thruster_env.core.compiled import CompiledOrPython, inlined, is_interpreting
+from thruster_env.core.threads import in_parts, worker_threads
 
 THREADED_COPIES = 256  # fewer are done before a second thread has woken up
 IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # what a copy's belief does in a call

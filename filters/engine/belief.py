@@ -54,7 +54,7 @@ class Innovation(NamedTuple):
 class Kernels(NamedTuple):
     """A kind of filter for one shape of model, as plain functions on its memory.
 
-    `row` is laid out by `filters.engine.layout`, `numbers` by `thruster_env.plants.layout`; `table` is
+    `row` is laid out by `filters.engine.layout`, `numbers` by `thruster_env.model.layout`; `table` is
     (table_rows, padded size), its first n rows the members, without columns for filters without an ensemble;
     `draws` has room for `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first
     `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch`

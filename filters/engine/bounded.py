@@ -24,9 +24,9 @@ import numpy as np
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.truncated import truncated_normal
-from thruster_env.plants.state_bounds import Bound
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.truncated import truncated_normal
+from thruster_env.model.state_bounds import Bound
 
 TRUNCATION, PROJECTION = "truncation", "projection"
 ROUNDS = 10_000  # at most, over all bounds

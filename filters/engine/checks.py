@@ -7,7 +7,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from filters.engine.belief import Belief, LostBelief
-from thruster_env.numerics.checks import ROUNDING, as_floats, at_least, covariance, short_repr
+from thruster_env.core.checks import ROUNDING, as_floats, at_least, covariance, short_repr
 
 FEW = 4  # states, up to which a belief is looked at in Python
 

@@ -12,9 +12,9 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.engine.side_by_side import build_side_by_side
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from thruster_env.numerics.streams import GROUP
-from thruster_env.plants.layout import LANES, number_places, padded
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.core.streams import GROUP
+from thruster_env.model.layout import LANES, number_places, padded
 
 START, PREDICT, UPDATE = 1, 2, 4  # what an operation does, to be added
 REFUSED = -1  # what it returns of an input that is not finite, or an infinite measurement: it has done nothing

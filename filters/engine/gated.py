@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.engine.compile import PREDICT, UPDATE
 from filters.engine.session import Session
-from thruster_env.numerics.checks import positive
+from thruster_env.core.checks import positive
 
 if TYPE_CHECKING:
     from filters.filter import Filter

@@ -2,7 +2,7 @@
 
 A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column per ensemble
 member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
-model's numbers, behind which a filter has its own, is laid out by `thruster_env.plants.layout`.
+model's numbers, behind which a filter has its own, is laid out by `thruster_env.model.layout`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
-from thruster_env.numerics.angles import angle_writer
-from thruster_env.numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
-from thruster_env.plants.layout import number_places, starts_of
-from thruster_env.plants.shape import Shape
+from thruster_env.core.angles import angle_writer
+from thruster_env.core.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
+from thruster_env.model.layout import number_places, starts_of
+from thruster_env.model.shape import Shape
 
 
 class MemoryPlaces(NamedTuple):

@@ -7,9 +7,9 @@ from functools import cache, lru_cache
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.sources import Source
-from thruster_env.plants.layout import number_places
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source
+from thruster_env.model.layout import number_places
 
 LARGEST = 1e300  # what the numbers of a belief may add up to
 

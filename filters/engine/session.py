@@ -14,11 +14,11 @@ from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places, own_place
-from thruster_env.numerics.checks import covariance, finite, positive
-from thruster_env.numerics.direct import direct
-from thruster_env.plants.diffusion import same_dt
-from thruster_env.plants.layout import number_places, with_root
-from thruster_env.plants.steps import sample_time_place
+from thruster_env.core.checks import covariance, finite, positive
+from thruster_env.core.direct import direct
+from thruster_env.logs.steps import sample_time_place
+from thruster_env.model.diffusion import same_dt
+from thruster_env.model.layout import number_places, with_root
 
 if TYPE_CHECKING:
     from filters.filter import Filter

@@ -13,8 +13,8 @@ import numpy as np
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from filters.engine.restart import LARGEST, restart_if_lost
-from thruster_env.numerics.compiled import function_fingerprint, narrow
-from thruster_env.plants.layout import LANES, number_places
+from thruster_env.core.compiled import function_fingerprint, narrow
+from thruster_env.model.layout import LANES, number_places
 
 GROUPS = 4  # worked on one after the other in each stage: their instructions overlap
 

@@ -37,13 +37,13 @@ from functools import cache
 
 import numpy as np
 
+from filters.algebra.densities import dot
+from filters.algebra.members import correlations, mean
+from filters.algebra.operations import divide, factor, inverse, present, uncorrelated
+from filters.algebra.points import outer
+from filters.algebra.scalars import at_least, choose, constant, diagonal, exceeds
 from filters.ensembles.steps import expect
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.members import correlations, mean
-from thruster_env.numerics.algebra.operations import divide, factor, inverse, present, uncorrelated
-from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import at_least, choose, constant, diagonal, exceeds
 
 
 def slopes(model, x, z, v, S):

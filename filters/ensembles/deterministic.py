@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.operations import divide
 from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.localised import LocalisedFilter
 from filters.ensembles.rotation import with_rotation
 from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.operations import divide
-from thruster_env.numerics.checks import switch
+from thruster_env.core.checks import switch
 
 
 def update(model, x, z, e):

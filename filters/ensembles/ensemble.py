@@ -14,7 +14,7 @@ from filters.ensembles.inflation import inflated, relaxed
 from filters.ensembles.spread import checked, limits
 from filters.pages.members import members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 LARGEST_ENSEMBLE = 1_000_000
 OF_THE_ENGINE = frozenset(  # parameters that no page reads
@@ -29,7 +29,7 @@ class EnsembleFilter(FilterWithPage):
         x = settle(model, advance(model, x, u), w),  w ~ N(0, I), advance once for each of the model's substeps
         x, v, S, log N(v; 0, S) = update(model, x, z, e),  e ~ N(0, I)
 
-    What is said of all members together (`thruster_env.numerics.algebra.members`) is the same for each: `mean(x)`,
+    What is said of all members together (`filters.algebra.members`) is the same for each: `mean(x)`,
     `covariance(x, y)`. Normals that a page does not use are not drawn. The belief's mean and covariance are those
     of the members.
 

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from filters.algebra.densities import dot
+from filters.algebra.geometric import geometric_mean
+from filters.algebra.members import mean
+from filters.algebra.operations import divide, eye, present, sym
+from filters.algebra.points import root
+from filters.algebra.scalars import at_least, choose, constant, count, exceeds, exponential, trace
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.geometric import geometric_mean
-from thruster_env.numerics.algebra.members import mean
-from thruster_env.numerics.algebra.operations import divide, eye, present, sym
-from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.scalars import at_least, choose, constant, count, exceeds, exponential, trace
-from thruster_env.numerics.checks import positive
+from thruster_env.core.checks import positive
 
 ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
 FLATTEST = 0.25  # smallest slope that it divides by

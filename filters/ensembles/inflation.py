@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from thruster_env.numerics.algebra.members import mean, stretches, variances
+from filters.algebra.members import mean, stretches, variances
 
 
 @cache

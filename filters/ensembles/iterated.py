@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.geometric import geometric_mean
+from filters.algebra.members import covariance
+from filters.algebra.operations import divide
 from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.steps import advance, compare, expect, settle
 from filters.ensembles.window import seen_anew, window_kernels
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.geometric import geometric_mean
-from thruster_env.numerics.algebra.members import covariance
-from thruster_env.numerics.algebra.operations import divide
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 MOST_ITERATIONS = 20  # that are written out
 LONGEST_WINDOW = 1000  # steps

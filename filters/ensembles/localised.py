@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from filters.ensembles.ensemble import EnsembleFilter
-from thruster_env.numerics.checks import positive
+from thruster_env.core.checks import positive
 
 SUPPORT = (10.0 / 3.0) ** 0.5  # of a taper over its radius: half of what it reaches over
 

@@ -10,6 +10,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from filters.algebra.blocks import forward_quotient
+from filters.algebra.matrices import given
+from filters.algebra.members import mean
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.points import root
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.ensembles.rows import relax_row, row_moments
@@ -18,14 +23,9 @@ from filters.pages.members import MembersMemory, kept_size, members_kernels, wor
 from filters.pages.page import Page
 from filters.pages.programs import stored
 from filters.pages.stages import Stage
-from thruster_env.numerics.algebra.blocks import forward_quotient
-from thruster_env.numerics.algebra.matrices import given
-from thruster_env.numerics.algebra.members import mean
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import root
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.graphs.programs import Place
+from thruster_env.model.shape import Functions, Shape
 
 
 @inlined

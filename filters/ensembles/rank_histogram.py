@@ -12,8 +12,8 @@ import numpy as np
 from filters.ensembles.by_parts import LocalisedByParts, look
 from filters.ensembles.steps import advance, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.normal import below, quantile
+from thruster_env.core.compiled import inlined
+from thruster_env.core.normal import below, quantile
 
 
 @inlined

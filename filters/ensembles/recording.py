@@ -9,7 +9,7 @@ import numpy as np
 from filters.engine.session import Session
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 
 class Members(NamedTuple):

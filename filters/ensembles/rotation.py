@@ -7,8 +7,8 @@ from functools import cache, lru_cache
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_ROTATION, fill_normals
+from thruster_env.core.compiled import inlined
+from thruster_env.core.streams import FILTER_ROTATION, fill_normals
 
 
 @inlined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.compiled import inlined
+from thruster_env.core.compiled import inlined
 
 
 @inlined

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.blocks import triangle_quotient
+from filters.algebra.operations import divide
+from filters.algebra.points import root
 from filters.ensembles.by_parts import LocalisedByParts
 from filters.ensembles.parts import gaussian_moves
 from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.blocks import triangle_quotient
-from thruster_env.numerics.algebra.operations import divide
-from thruster_env.numerics.algebra.points import root
 
 
 def update(model, x, z, e):

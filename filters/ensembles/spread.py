@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from thruster_env.numerics.checks import positive, short_repr, switch
+from thruster_env.core.checks import positive, short_repr, switch
 
 
 def checked(filter_: Any) -> dict[str, float]:

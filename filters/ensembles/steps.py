@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.members import covariance, mean, on_branch
-from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
+from filters.algebra.densities import log_density
+from filters.algebra.members import covariance, mean, on_branch
+from filters.algebra.operations import only, present, sym, uncorrelated, wrap
 
 
 def advance(model, x, u):

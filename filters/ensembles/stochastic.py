@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.members import centred
+from filters.algebra.operations import divide
 from filters.ensembles.localised import LocalisedFilter
 from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.members import centred
-from thruster_env.numerics.algebra.operations import divide
-from thruster_env.numerics.checks import switch
+from thruster_env.core.checks import switch
 
 
 def update(model, x, z, e):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.geometric import geometric_mean
+from filters.algebra.operations import divide
 from filters.ensembles.by_parts import LocalisedByParts
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.steps import advance, compare, settle
 from filters.pages.page_filter import Page
-from thruster_env.numerics.algebra.geometric import geometric_mean
-from thruster_env.numerics.algebra.operations import divide
 
 
 def update(model, x, z, e):

@@ -14,6 +14,10 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
+from filters.algebra.geometric import geometric_mean
+from filters.algebra.matrices import given
+from filters.algebra.members import covariance, mean, on_branch
+from filters.algebra.operations import divide, only, present, wrap
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.ensembles.rows import relax_row, row_moments, stretch_row
@@ -22,15 +26,11 @@ from filters.pages.members import MembersMemory, stages_of, works_of
 from filters.pages.page import Page
 from filters.pages.programs import stored
 from filters.pages.stages import Stage
-from thruster_env.numerics.algebra.geometric import geometric_mean
-from thruster_env.numerics.algebra.matrices import given
-from thruster_env.numerics.algebra.members import covariance, mean, on_branch
-from thruster_env.numerics.algebra.operations import divide, only, present, wrap
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.graphs.programs import Place
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Functions, Shape
 
 
 def seen_anew(model, y, z, Y, v, S, R):

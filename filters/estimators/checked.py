@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from filters.estimators.estimator import Output
-from thruster_env.numerics.checks import as_floats, correlation_flaws, short_repr
+from thruster_env.core.checks import as_floats, correlation_flaws, short_repr
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
 CALLED = {

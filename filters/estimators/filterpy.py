@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
-from thruster_env.numerics.angles import difference, wrapped_where
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import difference, wrapped_where
+from thruster_env.core.sources import as_value
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class FilterPyEstimator(Estimator):

@@ -8,9 +8,9 @@ from typing import Any
 from filters.estimators.estimator import is_estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.modules import is_code, object_named, said
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.core.modules import is_code, object_named, said
+from thruster_env.model.state_space import StateSpaceModel
 
 TRAINED = ".safetensors"  # the end of the name of a trained estimator's file
 

@@ -12,10 +12,10 @@ from filters.estimators.checked import Checks, absent, log_likelihoods, without_
 from filters.estimators.estimator import Output, is_estimator
 from filters.estimators.session import EstimatorSession, seed_of
 from filters.filter import Filter
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.global_generators import GlobalGenerators, seeded_copy
-from thruster_env.numerics.modules import said
-from thruster_env.numerics.streams import GLOBAL_GENERATORS, derived_seed
+from thruster_env.core.checks import short_repr
+from thruster_env.core.global_generators import GlobalGenerators, seeded_copy
+from thruster_env.core.modules import said
+from thruster_env.core.streams import GLOBAL_GENERATORS, derived_seed
 
 DIFFERENCE = 1e-6  # of two runs of a key, as part of the largest number: threads leave less
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 
 START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from filters.gaussian.mixture import Parts, nothing
-from thruster_env.numerics.compiled import inlined
+from thruster_env.core.compiled import inlined
 
 
 class Absent(NamedTuple):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import on_circle, ones, others, outer, root, square, units
 from filters.gaussian.unscented_points import advance
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import on_circle, ones, others, outer, root, square, units
 
 
 def begin(model, x, P):

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from filters.gaussian.square_root import SQUARE_ROOT
 from filters.gaussian.ud import UD
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.checks import one_of
+from thruster_env.core.checks import one_of
 
 
 def advance(model, x, P, u):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.operations import sym
 from filters.gaussian.extended import advance, update
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.operations import sym
-from thruster_env.numerics.checks import between
+from thruster_env.core.checks import between
 
 
 def settle(model, x, P):

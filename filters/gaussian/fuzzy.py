@@ -11,8 +11,8 @@ import numpy as np
 from filters.gaussian import extended
 from filters.gaussian.mixture_filter import MixtureFilter, MixturePage
 from filters.gaussian.rules import checked_corners, memberships, rules_at_corners
-from thruster_env.numerics.checks import one_of, short_repr
-from thruster_env.plants.affine import AffineModel
+from thruster_env.core.checks import one_of, short_repr
+from thruster_env.model.affine import AffineModel
 
 BLENDINGS = ("weights", "moments", "output")
 

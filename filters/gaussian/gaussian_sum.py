@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.algebra.densities import dot
+from filters.algebra.points import outer
+from filters.algebra.scalars import choose, exceeds
 from filters.baselines.baselines import place_of
 from filters.gaussian import extended
 from filters.gaussian.mixture_filter import MixtureFilter, MixturePage
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.points import outer
-from thruster_env.numerics.algebra.scalars import choose, exceeds
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.algebra.operations import divide, eye, sym
 from filters.gaussian.extended import advance, update
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.operations import divide, eye, sym
-from thruster_env.numerics.checks import positive, vector
+from thruster_env.core.checks import positive, vector
 
 
 def settle(model, x, P):

@@ -11,11 +11,11 @@ Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
 
 from __future__ import annotations
 
+from filters.algebra.blocks import inverse_of
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, only, present, sym, uncorrelated, wrap
 from filters.gaussian.extended import advance, settle
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import inverse_of
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, only, present, sym, uncorrelated, wrap
 
 
 def update(model, x, P, z):

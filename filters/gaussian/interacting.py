@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.algebra.densities import dot
 from filters.gaussian.multiple_models import MultipleModelFilter, probabilities_of
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.checks import between, positive
+from thruster_env.core.checks import between, positive
 
 
 def mixing(p, mu):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 MOST_ITERATIONS = 20
 

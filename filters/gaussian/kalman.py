@@ -13,8 +13,8 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.information import INFORMATION
 from filters.gaussian.schedule import SCHEDULED
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.checks import at_least, covariance, one_of
-from thruster_env.plants.affine import AffineModel, linearize
+from thruster_env.core.checks import at_least, covariance, one_of
+from thruster_env.model.affine import AffineModel, linearize
 
 MOST_POINTS = 200  # of a schedule; programs are written out for them
 

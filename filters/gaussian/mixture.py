@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.angles import places_of, whole_turns, wrapped
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.sources import Source, lower_pairs
+from thruster_env.core.angles import places_of, whole_turns, wrapped
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source, lower_pairs
 
 
 class Parts(NamedTuple):
@@ -33,7 +33,7 @@ def blender(
     """Return `blend(row, weights, target)`: mean and covariance of a mixture, which lie from a place on.
 
     In each part x and P begin at such places; the weights begin at one in the row. Angles of parts are put on one
-    branch (`thruster_env.numerics.angles`); if it `wraps`, those of the mean lie in (-pi, pi]. Without what lies
+    branch (`thruster_env.core.angles`); if it `wraps`, those of the mean lie in (-pi, pi]. Without what lies
     `between` the parts the covariance is the sum of w_k P_k.
     """
     source = Source("blend", "row, weights, target", result=(size, size))

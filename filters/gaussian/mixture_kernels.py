@@ -7,6 +7,8 @@ from functools import lru_cache
 from math import prod
 from typing import Any, NamedTuple
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import present
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.gaussian.extended import ExtendedKalmanFilter
@@ -16,10 +18,8 @@ from filters.pages.kernels import anything_measured, nothing_to_summarise, page_
 from filters.pages.memory import RowMemory
 from filters.pages.programs import programs_of, stored, together, works_of
 from filters.pages.stages import Stage
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import present
-from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.model.shape import Functions, Shape
 
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
 

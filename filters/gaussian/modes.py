@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+from filters.algebra.matrices import given
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.engine.restart import restart_if_lost
@@ -14,11 +15,10 @@ from filters.gaussian.absent import Absent, completer
 from filters.gaussian.mixture import Parts, blender, log_weigher, logarithm, nothing
 from filters.pages.kernels import anything_measured, nothing_to_summarise
 from filters.pages.programs import stored, works_of
-from thruster_env.numerics.algebra.matrices import given
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.layout import number_places, starts_of
-from thruster_env.plants.shape import Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.graphs.programs import Place
+from thruster_env.model.layout import number_places, starts_of
+from thruster_env.model.shape import Shape
 
 LOST = 700.0  # what the log-likelihood of a mode whose filter begins anew is below the least of the others
 

@@ -16,8 +16,8 @@ from filters.filter import Filter
 from filters.gaussian.absent import Absent, absent_states
 from filters.gaussian.mixture import parts_of
 from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.numerics.checks import as_floats, one_of, positive, short_repr, vector
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, one_of, positive, short_repr, vector
+from thruster_env.model.state_space import StateSpaceModel
 
 MOST_MODES = 32
 SUM_TOLERANCE = 1e-9

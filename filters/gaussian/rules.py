@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from filters.algebra.matrices import operation
 from filters.baselines.baselines import place_of
-from thruster_env.numerics.algebra.graphs import where
-from thruster_env.numerics.algebra.matrices import operation
-from thruster_env.numerics.checks import short_repr, vector
-from thruster_env.plants.affine import AffineModel, linearize
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr, vector
+from thruster_env.graphs.graphs import where
+from thruster_env.model.affine import AffineModel, linearize
+from thruster_env.model.state_space import StateSpaceModel
 
 MOST_STATES = 8  # that rules ask for: 256 rules
 

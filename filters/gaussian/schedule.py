@@ -6,10 +6,10 @@ beyond them; they are those of the last input until the next, and at first those
 
 from __future__ import annotations
 
+from filters.algebra.blocks import zeros
+from filters.algebra.points import hats
 from filters.gaussian import extended
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import zeros
-from thruster_env.numerics.algebra.points import hats
 
 
 def constants_at(model, u):

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from filters.baselines.baselines import places_of
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 
 
 def update(model, x, P, z):

@@ -15,11 +15,11 @@ Trans. Automatic Control 16(6).
 
 from __future__ import annotations
 
+from filters.algebra.blocks import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
+from filters.algebra.densities import density
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.points import root, square
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
-from thruster_env.numerics.algebra.densities import density
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import root, square
 
 
 def start(model):

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import joseph, only, present, sym, uncorrelated, wrap
 from filters.gaussian.extended import advance, settle
 from filters.gaussian.kalman import AffineFilter
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import joseph, only, present, sym, uncorrelated, wrap
 
 STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
 

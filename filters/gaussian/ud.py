@@ -11,12 +11,12 @@ Source: Bierman (1977), Factorization Methods for Discrete Sequential Estimation
 
 from __future__ import annotations
 
+from filters.algebra import upper
+from filters.algebra.blocks import factor_of, forward_quotient, hstack, triangle
+from filters.algebra.densities import density
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.points import root, square
 from filters.pages.page import Page
-from thruster_env.numerics.algebra import upper
-from thruster_env.numerics.algebra.blocks import factor_of, forward_quotient, hstack, triangle
-from thruster_env.numerics.algebra.densities import density
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import root, square
 
 
 def start(model):

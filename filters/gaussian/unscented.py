@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import others, root, units
 from filters.gaussian.unscented_points import advance, moments, points, scatter
 from filters.gaussian.unscented_root import ROOT
 from filters.pages.page_filter import Page, PageFilter
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import others, root, units
-from thruster_env.numerics.checks import finite, one_of, positive
+from thruster_env.core.checks import finite, one_of, positive
 
 
 def begin(model, x, P):

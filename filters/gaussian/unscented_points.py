@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.algebra.operations import wrap
-from thruster_env.numerics.algebra.points import first, ones, others, outer, square, units
+from filters.algebra.operations import wrap
+from filters.algebra.points import first, ones, others, outer, square, units
 
 
 def points(model, x, L):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from filters.algebra.blocks import hstack, part, triangle, vstack, zeros
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.points import ones, others, outer, root, square, units
 from filters.gaussian.square_root import start, updated
 from filters.gaussian.unscented_points import advance, moments, points
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.blocks import hstack, part, triangle, vstack, zeros
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.points import ones, others, outer, root, square, units
 
 
 def begin(model, x, P):

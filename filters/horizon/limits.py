@@ -20,9 +20,9 @@ from functools import cache
 from typing import NamedTuple
 
 from filters.horizon.window import kept_places, scratch_places
-from thruster_env.numerics.compiled import inlined
-from thruster_env.plants.shape import Shape
-from thruster_env.plants.state_bounds import Bound
+from thruster_env.core.compiled import inlined
+from thruster_env.model.shape import Shape
+from thruster_env.model.state_bounds import Bound
 
 ENOUGH = 1e-9  # beyond a bound, and of a force, in standard deviations: rounding
 SLACK = 1e-9  # of a variance that a bound leaves, so that bounds which contradict each other show as forces

@@ -12,7 +12,7 @@ from filters.engine.belief import Belief, Kernels
 from filters.filter import Filter
 from filters.horizon.passes import horizon_kernels
 from filters.horizon.window import HUBER, LOSSES, kept_places
-from thruster_env.numerics.checks import at_least, one_of, positive
+from thruster_env.core.checks import at_least, one_of, positive
 
 MOST_STEPS, MOST_ITERATIONS = 200, 50
 KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # that kernels are made for, so that studies compile few

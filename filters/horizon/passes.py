@@ -15,10 +15,10 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.limits import limits
 from filters.horizon.window import kept_places, scratch_places, window_works
 from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
-from thruster_env.numerics.compiled import inlined, not_inlined
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
-from thruster_env.plants.state_bounds import Bound
+from thruster_env.core.compiled import inlined, not_inlined
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.state_bounds import Bound
 
 MOST_PASSES = 100  # beyond those that are asked for, until bounds settle
 HALVINGS = 6  # of a step that costs more, where bounds do not change

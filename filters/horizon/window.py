@@ -16,17 +16,9 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
-from filters.engine.layout import memory_places
-from filters.gaussian import extended
-from filters.pages.equations import Equations
-from filters.pages.memory import RowMemory
-from filters.pages.page import Page
-from filters.pages.programs import programs_of, stored
-from filters.pages.stages import Stage
-from filters.smoothers.rts import advance, begin
-from thruster_env.numerics.algebra.blocks import careful
-from thruster_env.numerics.algebra.densities import dot
-from thruster_env.numerics.algebra.operations import (
+from filters.algebra.blocks import careful
+from filters.algebra.densities import dot
+from filters.algebra.operations import (
     divide,
     eye,
     joseph,
@@ -37,7 +29,7 @@ from thruster_env.numerics.algebra.operations import (
     uncorrelated,
     wrap,
 )
-from thruster_env.numerics.algebra.scalars import (
+from filters.algebra.scalars import (
     choose,
     constant,
     count,
@@ -45,8 +37,16 @@ from thruster_env.numerics.algebra.scalars import (
     logarithm,
     shifted,
 )
-from thruster_env.plants.layout import starts_of
-from thruster_env.plants.shape import Functions, Shape
+from filters.engine.layout import memory_places
+from filters.gaussian import extended
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.page import Page
+from filters.pages.programs import programs_of, stored
+from filters.pages.stages import Stage
+from filters.smoothers.rts import advance, begin
+from thruster_env.model.layout import starts_of
+from thruster_env.model.shape import Functions, Shape
 
 HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
 OWN = tuple(

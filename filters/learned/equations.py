@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from filters.tensors.algebra import wrapped_where
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from thruster_env.numerics.derivatives import jacobian
-from thruster_env.numerics.tuples import matrix_writer, vector_reader, vector_writer
-from thruster_env.plants.layout import constants_reader, number_places
-from thruster_env.plants.shape import Functions, Shape
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import AnyStepModel
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.core.derivatives import jacobian
+from thruster_env.core.tuples import matrix_writer, vector_reader, vector_writer
+from thruster_env.logs.steps import AnyStepModel
+from thruster_env.model.layout import constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class Equations:

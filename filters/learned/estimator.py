@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
-from thruster_env.numerics.checks import as_floats, at_least, one_of
-from thruster_env.numerics.torch_threads import one_thread
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, at_least, one_of
+from thruster_env.core.torch_threads import one_thread
+from thruster_env.model.state_space import StateSpaceModel
 
 MOST = 10_000  # members, or hidden states
 

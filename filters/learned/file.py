@@ -15,9 +15,9 @@ from filters.learned.ensemble import DifferentiableEnsembleFilter
 from filters.learned.estimator import LearnedEstimator
 from filters.learned.gains import KalmanNet, RecursiveKalmanNet
 from filters.learned.recurrent import GatedRecurrentUnit
-from thruster_env.numerics.checks import one_of
-from thruster_env.numerics.files import write_whole
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import one_of
+from thruster_env.core.files import write_whole
+from thruster_env.model.state_space import StateSpaceModel
 
 LEARNED = {
     one.kind: one for one in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)

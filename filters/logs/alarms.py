@@ -10,8 +10,8 @@ import numpy as np
 
 from filters.logs.estimate import LogEstimate, estimate_with
 from filters.monitoring.monitor import Alarm, Monitor
-from thruster_env.plants.logs.stamps import date_text, time_text
-from thruster_env.plants.quantities import Quantity
+from thruster_env.logs.stamps import date_text, time_text
+from thruster_env.model.quantities import Quantity
 
 
 class LogAlarms(NamedTuple):

@@ -11,9 +11,9 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
 from filters.restarts import Restarts
-from thruster_env.plants.continuous import ContinuousModel
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.logs.log import Log
+from thruster_env.model.continuous import ContinuousModel
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def by_the_clock(

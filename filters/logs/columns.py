@@ -7,9 +7,9 @@ import numpy as np
 from filters.logs.alarms import LogAlarms
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import compared
-from thruster_env.plants.logs.columns import plain
-from thruster_env.plants.logs.units import suffix
-from thruster_env.plants.quantities import Quantity
+from thruster_env.logs.columns import plain
+from thruster_env.logs.units import suffix
+from thruster_env.model.quantities import Quantity
 
 
 def columns_of(found: LogEstimate, told: LogAlarms | None = None) -> dict[str, np.ndarray]:

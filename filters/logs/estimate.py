@@ -17,11 +17,11 @@ from filters.logs.clock import by_the_clock, noise_by_rates
 from filters.restarts import FirstRestart, Restarts
 from filters.smoothers.smooth import smoothed
 from filters.wrappers.arguments import filter_for
-from thruster_env.numerics.checks import at_least
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.replay import ReplayEnv
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import at_least
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -90,12 +90,12 @@ def estimate(
     Args:
         log: recorded run, or the path of a file.
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
-        model: of the log, as `thruster_env.plants.replay.ReplayEnv` takes it: a model, what makes or offers one,
+        model: of the log, as `thruster_env.env.replay.ReplayEnv` takes it: a model, what makes or offers one,
             or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.
         lag: how many later measurements, also without `smoother`; all if None.
-        columns: headers by quantity, as `thruster_env.plants.logs.read.read_log` takes them.
+        columns: headers by quantity, as `thruster_env.logs.read.read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
         grid: whether a file is put on a grid, as `read_log` takes it.

@@ -11,11 +11,11 @@ from filters.logs.alarms import LogAlarms, episodes
 from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
 from filters.plot_styles import TRUTH, colour_of
-from thruster_env.numerics.angles import with_breaks, wrapped
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import new_figure, save_figure, tidy
-from thruster_env.numerics.sources import is_array
-from thruster_env.plants.logs.columns import OUTPUT, STATE
+from thruster_env.core.angles import with_breaks, wrapped
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import new_figure, save_figure, tidy
+from thruster_env.core.sources import is_array
+from thruster_env.logs.columns import OUTPUT, STATE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,10 +14,10 @@ from filters.consistency.blow_up import root_mean_square
 from filters.consistency.nees import whitened
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
 from filters.logs.estimate import SKIPPED, LogEstimate
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.checks import at_least
-from thruster_env.plants.logs.columns import STATE
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.angles import difference
+from thruster_env.core.checks import at_least
+from thruster_env.logs.columns import STATE
+from thruster_env.model.quantities import Quantity
 
 
 class Residual(NamedTuple):

@@ -7,7 +7,7 @@ from math import isnan
 from filters.consistency.blow_up import blow_up_sentence
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import LogFindings
-from thruster_env.plants.logs.findings import GAP, SPOILING, sentences
+from thruster_env.logs.findings import GAP, SPOILING, sentences
 
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 

@@ -12,8 +12,8 @@ from scipy.special import chdtri
 
 from filters.monitoring import recursion
 from filters.monitoring.thresholds import chi_square, cusum_threshold, glr_threshold
-from thruster_env.numerics.checks import as_floats, at_least, one_of, positive, short_repr
-from thruster_env.numerics.compiled import CompiledOrPython, inlined
+from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
+from thruster_env.core.compiled import CompiledOrPython, inlined
 
 if TYPE_CHECKING:
     from filters.filter import Filter

@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.monitoring.monitor import Monitor, monitor_of
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import as_floats, short_repr
+from thruster_env.core.checks import as_floats, short_repr
 
 SAFELY = 2  # times the longest run of equal, or missing, readings of what is healthy
 THRESHOLDS = "thresholds"

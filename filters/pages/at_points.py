@@ -7,8 +7,8 @@ from functools import cache
 from typing import Any
 
 from filters.pages.differences import difference_of_values, slope_of
-from thruster_env.numerics.sources import Source, entrywise, tuple_of, written_out
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.sources import Source, entrywise, tuple_of, written_out
+from thruster_env.model.shape import Functions, Shape
 
 
 @cache

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.angles import NAMES, short_way
-from thruster_env.numerics.derivatives import RELATIVE_STEP, step_of, stretch
-from thruster_env.numerics.sources import Source, entrywise, is_array, tuple_of, written_out
-from thruster_env.numerics.tuples import scaled_sum, vector_reader
-from thruster_env.plants.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
+from thruster_env.core.angles import NAMES, short_way
+from thruster_env.core.derivatives import RELATIVE_STEP, step_of, stretch
+from thruster_env.core.sources import Source, entrywise, is_array, tuple_of, written_out
+from thruster_env.core.tuples import scaled_sum, vector_reader
+from thruster_env.model.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
 
 
 @cache

@@ -14,13 +14,13 @@ from collections.abc import Callable
 from copy import copy
 from typing import Self
 
+from filters.algebra.matrices import Matrix, Operation, never, plus, through
+from filters.algebra.points import root
 from filters.pages.at_points import called_at_points
 from filters.pages.differences import called_parts
 from filters.pages.memory import NumbersMemory
 from filters.pages.traced import not_known, traced_model
-from thruster_env.numerics.algebra.matrices import Matrix, Operation, never, plus, through
-from thruster_env.numerics.algebra.points import root
-from thruster_env.plants.shape import Functions
+from thruster_env.model.shape import Functions
 
 
 class PagedModel:

@@ -13,10 +13,10 @@ from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.programs import programs_of, stored, together
 from filters.pages.stages import Stage
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.tuples import matrix_reader, vector_reader
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.core.tuples import matrix_reader, vector_reader
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Functions, Shape
 
 
 def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:

@@ -7,6 +7,9 @@ from functools import lru_cache
 from math import prod
 from typing import NamedTuple
 
+from filters.algebra.matrices import Matrix, given, in_order
+from filters.algebra.members import covariance, mean, on_branch
+from filters.algebra.operations import quotient, wrap
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.pages.equations import Equations, PagedModel
@@ -14,16 +17,13 @@ from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
 from filters.pages.programs import stored, with_kept
 from filters.pages.stages import Stage, as_calls, as_programs
-from thruster_env.numerics.algebra.graphs import TooLarge
-from thruster_env.numerics.algebra.loops import cut
-from thruster_env.numerics.algebra.matrices import Matrix, given, in_order
-from thruster_env.numerics.algebra.members import covariance, mean, on_branch
-from thruster_env.numerics.algebra.operations import quotient, wrap
-from thruster_env.numerics.algebra.programs import OF_MEMBERS, Place, callable_of
-from thruster_env.numerics.compiled import inlined
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from thruster_env.plants.layout import LANES, constants_reader, number_places
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.compiled import inlined
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.graphs.graphs import TooLarge
+from thruster_env.graphs.loops import cut
+from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of
+from thruster_env.model.layout import LANES, constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape
 
 # Operations and sums of a stage: beyond, instructions take longer to compile than calls.
 MOST, MOST_SUMS = 14_000, 600

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from math import prod
 from typing import Any
 
+from filters.algebra.matrices import Matrix, given
 from filters.engine.layout import memory_places, own_place
 from filters.pages.page import Page
-from thruster_env.numerics.algebra.matrices import Matrix, given
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Shape
+from thruster_env.graphs.programs import Place
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Shape
 
 
 class NumbersMemory:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from filters.algebra.matrices import Matrix
 from filters.pages.equations import Equations
 from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage, as_calls, as_programs
 from filters.pages.traced import MOST
-from thruster_env.numerics.algebra.graphs import uncollected
-from thruster_env.numerics.algebra.matrices import Matrix
-from thruster_env.numerics.algebra.programs import BY_MEMBERS, OF_STEPS, Place, callable_of
-from thruster_env.plants.layout import LANES, constants_reader
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.graphs.graphs import uncollected
+from thruster_env.graphs.programs import BY_MEMBERS, OF_STEPS, Place, callable_of
+from thruster_env.model.layout import LANES, constants_reader
+from thruster_env.model.shape import Functions, Shape
 
 
 class Programs(NamedTuple):

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.algebra.calls import arguments_of, calls_of
-from thruster_env.numerics.algebra.derivatives import slopes_of
-from thruster_env.numerics.algebra.graphs import CONDITIONS, Graph, Number, needed_by
-from thruster_env.numerics.algebra.matrices import Matrix, Operation, evaluate, in_order
-from thruster_env.numerics.algebra.operations import present
-from thruster_env.numerics.algebra.programs import ARRAYS, Place, program_of
+from filters.algebra.calls import arguments_of, calls_of
+from filters.algebra.derivatives import slopes_of
+from filters.algebra.matrices import Matrix, Operation, evaluate, in_order
+from filters.algebra.operations import present
+from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, needed_by
+from thruster_env.graphs.programs import ARRAYS, Place, program_of
 
 OF_PARAMETER = ("change", "move")  # arrays whose numbers are those of a parameter
 FREE = ("given", "constant", *CONDITIONS)  # operations whose results are at hand, or cannot be kept as floats

@@ -8,14 +8,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from thruster_env.numerics.algebra.branches import on_every_side
-from thruster_env.numerics.algebra.graphs import Graph, Number
-from thruster_env.numerics.algebra.programs import Place, values_of
-from thruster_env.numerics.algebra.slopes import along
-from thruster_env.numerics.algebra.tracing import traced
-from thruster_env.numerics.derivatives import by_complex_step
-from thruster_env.numerics.sources import is_array
-from thruster_env.plants.shape import Functions, Shape, constants_are_array
+from thruster_env.core.derivatives import by_complex_step
+from thruster_env.core.sources import is_array
+from thruster_env.graphs.branches import on_every_side
+from thruster_env.graphs.graphs import Graph, Number
+from thruster_env.graphs.programs import Place, values_of
+from thruster_env.graphs.slopes import along
+from thruster_env.graphs.tracing import traced
+from thruster_env.model.shape import Functions, Shape, constants_are_array
 
 MOST = 30_000  # operations of a stage: beyond, instructions take longer to compile than calls
 POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and phases, where graphs are compared

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from filters.algebra.blocks import zeros
+from filters.algebra.densities import log_density
+from filters.algebra.members import on_branch
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.samples import weighted_square, weights
 from filters.ensembles.steps import advance
 from filters.pages.page_filter import Page
 from filters.particles import weighted
 from filters.particles.renewal import spread
 from filters.particles.weighted import WeightedFilter, expect, fit
-from thruster_env.numerics.algebra.blocks import zeros
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.members import on_branch
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.samples import weighted_square, weights
 
 
 def start(model, w):

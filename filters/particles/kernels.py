@@ -27,8 +27,8 @@ from filters.pages.members import MembersMemory, predictor, works_of
 from filters.pages.page import Page
 from filters.particles.resampling import SCRATCH_ROWS, systematic_resampler
 from filters.particles.stages import Layout, stages_of
-from thruster_env.numerics.compiled import inlined, not_inlined
-from thruster_env.numerics.streams import (
+from thruster_env.core.compiled import inlined, not_inlined
+from thruster_env.core.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
@@ -36,8 +36,8 @@ from thruster_env.numerics.streams import (
     fill_normals,
     uniform_block,
 )
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)

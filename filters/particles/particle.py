@@ -14,7 +14,7 @@ from filters.particles.kernels import particle_kernels
 from filters.particles.proposal import OPTIMAL
 from filters.particles.renewal import draw, smooth, spread
 from filters.particles.weighted import ResampledFilter, expect, fit, start
-from thruster_env.numerics.checks import one_of
+from thruster_env.core.checks import one_of
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 

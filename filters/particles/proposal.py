@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from filters.algebra.blocks import zeros
+from filters.algebra.densities import log_density
+from filters.algebra.operations import divide, only, present, sym, uncorrelated, wrap
 from filters.ensembles.steps import advance
 from filters.pages.page import Page
 from filters.particles import auxiliary
 from filters.particles.weighted import expect
-from thruster_env.numerics.algebra.blocks import zeros
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.operations import divide, only, present, sym, uncorrelated, wrap
 
 
 def start(model, w):

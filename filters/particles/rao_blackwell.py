@@ -8,18 +8,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.algebra.blocks import hstack, pick, zeros
+from filters.algebra.members import on_branch
+from filters.algebra.operations import sym, wrap
+from filters.algebra.points import outer, root, square
+from filters.algebra.samples import weighted_covariance, weighted_mean, weights
 from filters.baselines.baselines import places_of
 from filters.engine.belief import Belief
 from filters.gaussian import extended
 from filters.pages.page_filter import Page
 from filters.particles.weighted import ResampledFilter
-from thruster_env.numerics.algebra.blocks import hstack, pick, zeros
-from thruster_env.numerics.algebra.members import on_branch
-from thruster_env.numerics.algebra.operations import sym, wrap
-from thruster_env.numerics.algebra.points import outer, root, square
-from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
-from thruster_env.numerics.streams import FILTER_PROPOSAL, GROUP, fill_normals
-from thruster_env.plants.layout import padded
+from thruster_env.core.streams import FILTER_PROPOSAL, GROUP, fill_normals
+from thruster_env.model.layout import padded
 
 
 def sample(x, P, e, sampled):

@@ -7,8 +7,8 @@ filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d
 
 from __future__ import annotations
 
-from thruster_env.numerics.algebra.members import mean as mean_of
-from thruster_env.numerics.algebra.points import outer, root
+from filters.algebra.members import mean as mean_of
+from filters.algebra.points import outer, root
 
 
 def spread(model, x, mean, P, e):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from thruster_env.numerics.compiled import inlined
+from thruster_env.core.compiled import inlined
 
 SCRATCH_ROWS = 3
 

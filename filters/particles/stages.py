@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from math import prod
 
-from filters.engine.layout import memory_places
-from filters.pages.equations import PagedModel
-from filters.pages.members import MembersMemory
-from filters.pages.page import Page
-from filters.pages.programs import stored, with_kept
-from filters.pages.stages import Stage
-from thruster_env.numerics.algebra.matrices import Matrix, given
-from thruster_env.numerics.algebra.members import on_branch
-from thruster_env.numerics.algebra.operations import wrap
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.algebra.samples import (
+from filters.algebra.matrices import Matrix, given
+from filters.algebra.members import on_branch
+from filters.algebra.operations import wrap
+from filters.algebra.samples import (
     effective_size,
     normalised,
     weighted_covariance,
     weighted_mean,
     weights,
 )
-from thruster_env.numerics.algebra.scalars import at_least
+from filters.algebra.scalars import at_least
+from filters.engine.layout import memory_places
+from filters.pages.equations import PagedModel
+from filters.pages.members import MembersMemory
+from filters.pages.page import Page
+from filters.pages.programs import stored, with_kept
+from filters.pages.stages import Stage
+from thruster_env.graphs.programs import Place
 
 LOWEST = -1e300  # of logarithms of weights
 

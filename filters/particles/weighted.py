@@ -9,16 +9,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from filters.algebra.densities import log_density
+from filters.algebra.members import on_branch
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.samples import weighted_covariance, weighted_mean, weights
 from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.pages.page_filter import FilterWithPage, Page
 from filters.particles.kernels import particle_kernels
 from filters.particles.renewal import kernel_width
-from thruster_env.numerics.algebra.densities import log_density
-from thruster_env.numerics.algebra.members import on_branch
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
-from thruster_env.numerics.algebra.samples import weighted_covariance, weighted_mean, weights
-from thruster_env.numerics.checks import at_least, finite, positive
+from thruster_env.core.checks import at_least, finite, positive
 
 
 def start(model, w):

@@ -15,11 +15,11 @@ from filters.pages.page_filter import Page, PageFilter
 from filters.pages.programs import programs_of, stored, together
 from filters.pages.stages import Stage
 from filters.smoothers.rts import Relation, back
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.threads import spread
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.shape import Functions, Shape
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.threads import spread
+from thruster_env.model.layout import number_places
+from thruster_env.model.shape import Functions, Shape
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
 Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)

@@ -16,11 +16,11 @@ from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.page_is_all import named
 from filters.pages.members import analysis_of
-from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.numerics.threads import spread
-from thruster_env.numerics.tuples import joiner, vector_part, written_out
-from thruster_env.plants.layout import number_places
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.threads import spread
+from thruster_env.core.tuples import joiner, vector_part, written_out
+from thruster_env.model.layout import number_places
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def smooth_ensembles(

@@ -7,7 +7,7 @@ import numpy as np
 from filters.engine.session import Session
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
-from thruster_env.numerics.angles import difference, wrapped_where
+from thruster_env.core.angles import difference, wrapped_where
 
 ROUNDING = 1e-12  # of a covariance in standard deviations
 

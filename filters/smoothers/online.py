@@ -12,7 +12,7 @@ from filters.filter import Filter
 from filters.pages.page_filter import PageFilter
 from filters.smoothers.backwards import passes
 from filters.smoothers.relations import relation_of
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 
 class WithSmoother:

@@ -11,12 +11,12 @@ points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
 
 from __future__ import annotations
 
+from filters.algebra.blocks import careful
+from filters.algebra.operations import quotient, sym
+from filters.algebra.points import others, root, square, units
 from filters.gaussian import cubature, unscented
 from filters.gaussian.unscented_points import advance, moments, scatter
 from filters.smoothers.rts import Relation
-from thruster_env.numerics.algebra.blocks import careful
-from thruster_env.numerics.algebra.operations import quotient, sym
-from thruster_env.numerics.algebra.points import others, root, square, units
 
 
 def link_unscented(model, x, P, X):

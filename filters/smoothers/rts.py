@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from filters.algebra.blocks import careful
+from filters.algebra.operations import eye, quotient, sym, wrap
 from filters.gaussian.schedule import constants_at
-from thruster_env.numerics.algebra.blocks import careful
-from thruster_env.numerics.algebra.operations import eye, quotient, sym, wrap
 
 
 class Relation(NamedTuple):

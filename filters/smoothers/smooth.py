@@ -18,7 +18,7 @@ from filters.smoothers.backwards import smooth_backwards
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.modes import smoothed_modes
 from filters.smoothers.relations import relation_of
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 
 class Smoothed(NamedTuple):

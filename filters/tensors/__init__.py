@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from thruster_env.numerics.extras import to_install
+from thruster_env.core.extras import to_install
 
 if TYPE_CHECKING:
     from filters.filter import Filter

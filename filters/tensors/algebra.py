@@ -15,19 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from thruster_env.numerics.algebra import (
-    blocks,
-    densities,
-    geometric,
-    matrices,
-    members,
-    operations,
-    points,
-    scalars,
-)
-from thruster_env.numerics.algebra.matrices import Matrix, Operation
-from thruster_env.numerics.angles import TURN
-from thruster_env.numerics.triangles import RESOLUTION
+from filters.algebra import blocks, densities, geometric, matrices, members, operations, points, scalars
+from filters.algebra.matrices import Matrix, Operation
+from thruster_env.core.angles import TURN
+from thruster_env.core.triangles import RESOLUTION
 
 
 def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:

@@ -17,10 +17,10 @@ from torch.overrides import TorchFunctionMode
 from filters.pages.traced import MOST, Traced
 from filters.tensors.graphs import order_of, values_of, with_finite_slope
 from filters.tensors.stages import Equation
-from thruster_env.numerics.algebra.graphs import Graph, Number
-from thruster_env.numerics.sources import is_array
-from thruster_env.numerics.user_functions import needs_floats
-from thruster_env.plants.shape import Shape, constants_are_array
+from thruster_env.core.sources import is_array
+from thruster_env.core.user_functions import needs_floats
+from thruster_env.graphs.graphs import Graph, Number
+from thruster_env.model.shape import Shape, constants_are_array
 
 POINTS = 64  # at which functions of tensors are compared with those of floats
 

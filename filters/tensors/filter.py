@@ -19,9 +19,9 @@ from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovati
 from filters.tensors.equations import equation_of
 from filters.tensors.likelihood import as_numbers, compiled_likelihood
 from filters.tensors.stages import Draw, EnsembleStages, Stages, normals_of
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.checks import one_of, short_repr
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.checks import one_of, short_repr
+from thruster_env.core.streams import filter_keys
+from thruster_env.graphs.programs import Place
 
 DIMENSIONS = {
     "process_noise_cov": 2,

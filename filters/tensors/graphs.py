@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from thruster_env.numerics.algebra.graphs import COMPARISONS, Number, needed_by
-from thruster_env.numerics.algebra.magnitudes import POSITIVE
-from thruster_env.numerics.algebra.precision import as_single
+from thruster_env.graphs.graphs import COMPARISONS, Number, needed_by
+from thruster_env.graphs.magnitudes import POSITIVE
+from thruster_env.graphs.precision import as_single
 
 WORK: dict[str, Callable] = {
     "+": operator.add,

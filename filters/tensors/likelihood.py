@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from filters.filter import Filter
 from filters.likelihood import likelihood
-from thruster_env.numerics.checks import as_floats
-from thruster_env.numerics.sources import lower_pairs
+from thruster_env.core.checks import as_floats
+from thruster_env.core.sources import lower_pairs
 
 
 def compiled_likelihood(filter_: Filter, inputs: Any, measurements: Any, q: Tensor, r: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filters.algebra.matrices import Matrix, Operation, in_order, never
 from filters.pages.equations import PagedModel
 from filters.pages.kernels import stages_of
 from filters.pages.members import MembersMemory
@@ -17,11 +18,10 @@ from filters.pages.memory import NumbersMemory, RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage
 from filters.tensors.algebra import work_out
-from thruster_env.numerics.algebra.matrices import Matrix, Operation, in_order, never
-from thruster_env.numerics.algebra.programs import Place
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, normal_block
-from thruster_env.plants.layout import LANES, padded
-from thruster_env.plants.shape import Shape
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, normal_block
+from thruster_env.graphs.programs import Place
+from thruster_env.model.layout import LANES, padded
+from thruster_env.model.shape import Shape
 
 NORMALS = Place("draws", 0)
 Draw = Callable[[int, int], Tensor]

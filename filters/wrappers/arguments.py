@@ -13,8 +13,8 @@ from filters.filter import Filter
 from filters.registry import filter_type
 from filters.wrappers.models import made, maker_of
 from filters.wrappers.tuned import tuned_filter
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.model.state_space import StateSpaceModel
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement

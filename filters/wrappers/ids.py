@@ -15,8 +15,7 @@ from gymnasium.envs.registration import load_env_creator, register, registry
 
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.compiled import package_of
+from thruster_env.core.checks import short_repr
 
 PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
 ALIASES = {"kf": "KF", "ekf": "EKF", "ukf": "UKF", "enkf": "EnKF", "pf": "PF"}
@@ -73,7 +72,7 @@ def modelled_ids() -> list[str]:
     found = []
     for env_id, spec in registry.items():
         entry = spec.entry_point
-        if isinstance(entry, str) and package_of(entry.partition(":")[0]) in packages:
+        if isinstance(entry, str) and entry.partition(".")[0].partition(":")[0] in packages:
             if hasattr(load_env_creator(entry), "state_space_model"):
                 found.append(env_id)
     return found

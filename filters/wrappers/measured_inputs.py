@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.plants.split import Split
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.split import Split
+from thruster_env.model.state_space import StateSpaceModel
 
 HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 

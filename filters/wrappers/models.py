@@ -8,8 +8,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:

@@ -25,10 +25,10 @@ from filters.wrappers.arguments import (
     given_filter,
 )
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from thruster_env.numerics.checks import as_floats, one_of, short_repr
-from thruster_env.numerics.checks import seed as checked_seed
-from thruster_env.numerics.streams import draw_key, filter_generator
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, one_of, short_repr
+from thruster_env.core.checks import seed as checked_seed
+from thruster_env.core.streams import draw_key, filter_generator
+from thruster_env.model.state_space import StateSpaceModel
 
 FLOAT32 = np.dtype(np.float32)  # a cast to a dtype is quicker than one to its type
 

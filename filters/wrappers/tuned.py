@@ -12,7 +12,7 @@ from filters.registry import make_filter
 from filters.tuned_file import AUGMENTED, FACTORS, NOISE, PRIOR, compared, read_tuned_file
 from filters.tuned_model import check_same_model, check_same_quantities
 from filters.wrappers.models import made, maker_of
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 
 
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:

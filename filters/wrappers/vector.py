@@ -21,10 +21,10 @@ from filters.restarts import FirstRestarts
 from filters.smoothers.online import WithSmoother
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from thruster_env.numerics.checks import as_floats, one_of, short_repr
-from thruster_env.numerics.keys import EpisodeKeys, reset_mask
-from thruster_env.numerics.streams import filter_generator
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, one_of, short_repr
+from thruster_env.core.keys import EpisodeKeys, reset_mask
+from thruster_env.core.streams import filter_generator
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class EstimateStates(gym.vector.VectorWrapper):

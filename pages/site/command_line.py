@@ -31,7 +31,7 @@ def commands() -> str:
 
     Examples stand in blocks that can be copied, and what an option takes is in capitals everywhere.
     """
-    from thruster_cli.app import app
+    from tuning.cli.app import app
 
     command = typer.main.get_command(app)
     context = typer.Context(command, info_name="thruster")

@@ -4,7 +4,7 @@ from math import prod
 
 import numpy as np
 
-from thruster_env.numerics.checks import covariance_root
+from thruster_env.core.checks import covariance_root
 
 
 class OfArrays:

@@ -17,9 +17,9 @@ from filters.adaptive.sage_husa import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
 from tests.oracles import kalman_update
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 KEY = (1, 2)
 adaptive = pytest.mark.parametrize("kind", [SageHusaFilter, VariationalBayesFilter])

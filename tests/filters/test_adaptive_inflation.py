@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from filters import StateSpaceModel, make_filter, run
 from tests.filters.test_localised import ring
 from tests.models import KEY, plane_model, random_affine, simulated
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 DEVIATION = 0.3
 

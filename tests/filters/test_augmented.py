@@ -18,10 +18,10 @@ from filters import (
     thruster_model,
 )
 from tests.models import held_voltages, scalar_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.derivatives import jacobian
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.derivatives import jacobian
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model import simulate
 
 
 def test_the_new_states_stand_in_for_the_constants():

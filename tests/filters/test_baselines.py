@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model
 from filters.baselines.inverse import component_solver
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 KEYS = np.zeros((1, 2))
 KINDS = [OpenLoop, Inversion, LowPass]

@@ -11,8 +11,8 @@ from filters.augmented import Unknown
 from filters.consistency.intervals import mean_interval
 from filters.smoothers.online import WithSmoother
 from tests.models import KEY, scalar_model, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.truncated import truncated_normal
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.truncated import truncated_normal
 
 INF = np.inf
 PAGES = (
@@ -193,7 +193,7 @@ def test_of_a_constant_that_is_not_negative_the_belief_is_exact():
 @pytest.mark.usefixtures("as_python")
 def test_a_copy_of_a_vector_env_is_the_single_env():
     from filters import EstimateState, EstimateStates
-    from thruster_env.model import thruster_model
+    from thruster_env.thruster.model import thruster_model
 
     model = thruster_model().replace(bounds={"omega_m": (0.0, 30.0), "U_a": (0.0, None)})
     single = EstimateState(gym.make("BowThruster-v0"), "ekf", model=model)

@@ -10,7 +10,7 @@ from filters import StateSpaceModel, affine_model, make_filter, run
 from filters.bounds import path_bound
 from filters.posterior import posterior_bound
 from filters.wrapped import wrapped_variances
-from thruster_env.numerics.checks import covariance_root
+from thruster_env.core.checks import covariance_root
 from tuning.problems import model_problem
 from tuning.problems.model_problem import ModelProblem
 

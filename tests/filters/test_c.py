@@ -9,7 +9,6 @@ import subprocess
 import numpy as np
 import pytest
 
-from auv_env.model import auv_model
 from filters import StateSpaceModel, make_filter, run, thruster_model
 from filters.c.programs import programs_of
 from filters.c.project import write_project
@@ -21,14 +20,15 @@ from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
 from tests.slow import slow_but
-from thruster_cli.templates.filter import Template
-from thruster_env.numerics.algebra.c_source import literal, statements_of
-from thruster_env.numerics.algebra.graphs import Graph, arctan2, where
-from thruster_env.numerics.algebra.programs import Place, program_of
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.replay import ReplayEnv
+from thruster_env.auv.model import auv_model
+from thruster_env.core.angles import difference
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.graphs.c_source import literal, statements_of
+from thruster_env.graphs.graphs import Graph, arctan2, where
+from thruster_env.graphs.programs import Place, program_of
+from thruster_env.logs.read import read_log
+from tuning.cli.templates.filter import Template
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]

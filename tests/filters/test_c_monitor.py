@@ -17,8 +17,8 @@ from filters.monitoring.monitor import TESTS
 from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
 from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.replay import ReplayEnv
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
 
 MAIN = """\
 #include "one.h"

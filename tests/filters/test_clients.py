@@ -42,4 +42,7 @@ def test_a_vector_env_says_how_it_resets_where_gymnasiums_own_do(mode):
     sync = envs_of("sync", vector_kwargs={"autoreset_mode": mode})
     assert isinstance(sync, SyncVectorEnv) and native.autoreset_mode == sync.autoreset_mode == mode
     assert EstimateStates(native, filter="ekf").autoreset_mode == mode
-    assert EstimateStates(sync, filter="ekf", model="thruster_env.model:thruster_model").autoreset_mode == mode
+    assert (
+        EstimateStates(sync, filter="ekf", model="thruster_env.thruster.model:thruster_model").autoreset_mode
+        == mode
+    )

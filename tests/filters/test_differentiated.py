@@ -12,7 +12,7 @@ from filters.sensitivity import ModelSlopes, sensitivity
 from tests.filters.test_sensitivity import case, slopes_of
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import DT, pendulum, simulated, swing, wide_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
 

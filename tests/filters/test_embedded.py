@@ -7,7 +7,7 @@ import pytest
 
 from filters import StateSpaceModel
 from filters.embedded import embedded_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 
 def pushed(x, u, c):

@@ -8,15 +8,15 @@ import pytest
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, normals, relative_errors
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import (
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import (
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
     episode_keys,
     filter_keys,
 )
-from thruster_env.plants import simulate
+from thruster_env.model import simulate
 
 
 @pytest.mark.parametrize("centred", [0, 1])

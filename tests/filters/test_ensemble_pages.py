@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
+from filters.algebra.members import mean
+from filters.algebra.operations import divide
 from filters.differentiated.differentiable import differentiable
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.steps import advance, compare, settle
@@ -15,17 +17,15 @@ from filters.pages.programs import with_kept
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, turning_pendulum, wide_pendulum
 from tests.models import random_affine, simulated, wide_model
-from thruster_env.numerics.algebra.members import mean
-from thruster_env.numerics.algebra.operations import divide
-from thruster_env.numerics.checks import covariance_root
-from thruster_env.numerics.streams import (
+from thruster_env.core.checks import covariance_root
+from thruster_env.core.streams import (
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
     episode_keys,
     fill_normals,
 )
-from thruster_env.plants.layout import LANES, padded
+from thruster_env.model.layout import LANES, padded
 
 SIZE = 11
 CHOICES = {

@@ -8,7 +8,7 @@ import pytest
 
 from filters import EnsembleTransformFilter, StateSpaceModel, make_filter
 from tests.models import KEY, wide_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 
 def stay(x, u, c):

@@ -17,8 +17,8 @@ from filters import (
 from filters.smoothers.smooth import smooth
 from tests.models import KEY, plane_model, scalar_model, simulated, wide_model
 from tests.oracles import normals
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
 
 KEYS = np.array([KEY])
 with_gaps = partial(simulated, level=1.0, missing=0.25)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, make_filter, run
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 MOST_RESCALINGS = json.loads((Path(__file__).parents[1] / "data" / "dapper_twins.json").read_text())
 RUNS = 16

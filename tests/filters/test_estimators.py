@@ -14,7 +14,7 @@ from filters import EstimateState, make_filter, run
 from filters.estimators.estimator import Estimator
 from filters.wrappers.vector import EstimateStates
 from tests.models import random_affine, simulated
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate

@@ -15,9 +15,9 @@ from filters.logs.estimate import estimate
 from filters.logs.findings import findings
 from filters.logs.verdict import verdict
 from tests.models import scalar_model, simulated
-from tests.numerics.test_angles import STEPS, data_of, rotated, turning
-from thruster_env.numerics.angles import difference
-from thruster_env.plants.logs.log import Log
+from tests.thruster_env.core.test_angles import STEPS, data_of, rotated, turning
+from thruster_env.core.angles import difference
+from thruster_env.logs.log import Log
 
 UNSCENTED = "filters.estimators.filterpy:unscented"
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -9,9 +9,9 @@ from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster
 from tests import models
 from tests.models import DT, held_voltages, line_model, look, simulated, swing
 from tests.oracles import kalman_update
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 
 def swing_jacobian(x, u, c):

@@ -14,9 +14,9 @@ from filters import StateSpaceModel, make_filter, run
 from filters.c.source import c_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from tests.models import simulated
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.derivatives import jacobian, step_of, stretch
-from thruster_env.plants.affine import linearize
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.derivatives import jacobian, step_of, stretch
+from thruster_env.model.affine import linearize
 
 DT = 0.1
 LINEARISING = ("ekf", "iekf", "ekf-robust", "vb", "sage-husa", "fading", "h-infinity", "schmidt", "mhe", "gsf")

@@ -9,10 +9,10 @@ from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrappe
 from tests.models import KEY, MODELS, OF_EACH_KIND, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
 from tests.slow import SLOW, slow_but
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plant import make_plant
-from thruster_env.simulation import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import simulate
 
 
 def stepped(filter_, key, inputs, measurements):

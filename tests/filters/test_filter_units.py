@@ -5,7 +5,7 @@ import pytest
 
 from filters import StateSpaceModel, run, thruster_model
 from tests.models import KEY, rescaled, simulated, small, wide_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 KEYS = np.array([KEY])
 UNIT_FREE = ["kf", "kf-steady", "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "ensrf", "denkf", "ienkf"]

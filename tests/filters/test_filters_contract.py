@@ -11,7 +11,7 @@ from filters.ensembles.ensemble import EnsembleFilter
 from filters.particles.weighted import WeightedFilter
 from tests.models import KEY, MODELS, simulated, small, varying_noise, wide_model
 from tests.oracles import equal
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 GAUSSIAN = [name for name, kind in FILTERS.items() if kind.gaussian_likelihood]
 OF_MEMBERS = [name for name, kind in FILTERS.items() if issubclass(kind, (EnsembleFilter, WeightedFilter))]

@@ -7,9 +7,9 @@ from scipy.optimize import minimize_scalar
 
 from filters import EnsembleTransformFilter, FiniteSizeEnsembleFilter, make_filter, run
 from tests.filters.test_square_root_ensembles import SCALES, linear_model, naive_transform, predicted, updated
-from thruster_env.studies import lorenz63
-from thruster_env.studies.benchmark import mean_of_roots
 from tuning.evaluation.runs import state_errors
+from tuning.experiments import lorenz63
+from tuning.experiments.benchmark import mean_of_roots
 
 
 def naive_factor(y, v, r, certainty):

@@ -22,7 +22,7 @@ from filters import (
 )
 from filters.smoothers.online import WithSmoother
 from tests.models import KEY, pendulum, scalar_model, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 KINDS = {
     "kf": KalmanFilter,

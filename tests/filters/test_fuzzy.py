@@ -11,7 +11,7 @@ from filters.gaussian.fuzzy import BLENDINGS
 from filters.gaussian.rules import memberships
 from tests.models import pendulum, random_affine, simulated
 from tests.oracles import kalman_update
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
 

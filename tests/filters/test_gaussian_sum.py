@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from filters import ExtendedKalmanFilter, GaussianSumFilter, KalmanFilter, StateSpaceModel, run
 from tests.models import line_model, simulated
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 KEYS = np.zeros((1, 2))
 

@@ -7,7 +7,7 @@ import pytest
 import filters
 from filters import EstimateState, EstimateStates, StateSpaceModel, make_filter, run, smooth
 from filters.engine.batch_session import Beliefs
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 FINITE, KEY = "must be .*finite", (0, 0)
 WRONG = [(0.3, np.inf), (0.3, -np.inf), (np.inf, 1.0), (np.nan, 1.0)]  # u, z

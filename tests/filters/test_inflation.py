@@ -6,7 +6,7 @@ import pytest
 from filters import FILTERS, make_filter, run
 from filters.ensembles.ensemble import EnsembleFilter
 from tests.models import KEY, plane_model, rescaled, simulated
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 NAMES = [name for name, kind in FILTERS.items() if issubclass(kind, EnsembleFilter)]
 STEPS = 12

@@ -11,7 +11,7 @@ from filters.ensembles.adaptive import relative_move
 from filters.ensembles.spread import width_of
 from tests.filters.test_adaptive_inflation import drifting
 from tests.models import KEY, plane_model, simulated
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 OWN = {"ensemble_size": 8, "adaptive_inflation": 0.3, "least_deviation": 0.05}
 

@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter, StateSpaceModel
 from tests.models import KEY, plane_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 SIZE = 9
 

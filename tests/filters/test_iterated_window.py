@@ -15,8 +15,8 @@ from filters.tensors import torch
 from tests.filters.test_ensemble_twins import step, whole
 from tests.filters.test_filter_paths import assert_compiled_as_python, assert_paths_agree
 from tests.models import KEY, plane_model, random_affine, simulated, varying_noise
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.simulate import simulate
+from thruster_env.core.streams import filter_keys
+from thruster_env.model.simulate import simulate
 
 DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_windows.json").read_text())
 SIZE = 9

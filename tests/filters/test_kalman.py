@@ -9,8 +9,8 @@ from scipy.linalg import solve_discrete_are
 from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
 from tests.models import held_voltages, random_affine, simulated
 from tests.oracles import kalman_update
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 KEYS = np.zeros((1, 2))
 

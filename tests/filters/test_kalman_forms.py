@@ -9,7 +9,7 @@ import pytest
 from filters import KalmanFilter, affine_model, run, thruster_model
 from filters.engine.session import Session
 from tests.models import rescaled, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 KEYS = np.zeros((1, 2))
 FORMS = ["information", "square-root"]

@@ -5,8 +5,8 @@ import pytest
 
 from filters import EnsembleKalmanFilter, KalmanFilter, run, smooth
 from tests.models import wide_model
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.affine import affine_model
+from thruster_env.core.streams import filter_keys
+from thruster_env.model.affine import affine_model
 
 
 def data(model, count=3, steps=7):

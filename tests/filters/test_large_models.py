@@ -20,14 +20,14 @@ from tests.models import (
     varying_noise,
     wide_model,
 )
-from tests.numerics.test_angles import turned, turning, turntable
 from tests.slow import slow_but
-from thruster_env.numerics import equal_functions, matrices, sources
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import shape
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.simulate import simulate
+from tests.thruster_env.core.test_angles import turned, turning, turntable
+from thruster_env.core import equal_functions, matrices, sources
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import shape
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.simulate import simulate
 from tuning.problems.check import check_model
 from tuning.problems.data import Data
 
@@ -60,7 +60,7 @@ CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
 def forget_functions():
     """Empty the caches of all makers, which do not know of limits that a test has changed."""
     for name, module in list(sys.modules.items()):
-        if name.startswith(("thruster_env.numerics", "thruster_env.plants", "filters")):
+        if name.startswith(("thruster_env.core", "thruster_env.model", "filters")):
             for value in list(vars(module).values()):
                 getattr(value, "cache_clear", lambda: None)()
     equal_functions._first.clear()  # a maker's functions of equal arguments are equal there

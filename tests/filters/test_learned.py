@@ -19,7 +19,7 @@ from filters.learned.gains import KalmanNet
 from filters.learned.networks import GainNetwork
 from filters.wrappers.vector import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
 from tuning.search.space import Choice
 from tuning.thruster.find import find_scenario
 

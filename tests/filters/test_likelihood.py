@@ -5,9 +5,9 @@ import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
 from filters.likelihood import information, likelihood
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.problems.seeds import training_seeds
 from tuning.thruster.find import find_scenario

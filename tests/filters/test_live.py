@@ -12,9 +12,9 @@ from scipy.linalg import expm
 from filters import make_filter, thruster_model
 from filters.restarts import FirstRestart
 from tests.slow import slow_but
-from thruster_env.plants.continuous import ContinuousModel
-from thruster_env.plants.diffusion import noise_for_dt
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.continuous import ContinuousModel
+from thruster_env.model.diffusion import noise_for_dt
+from thruster_env.model.state_space import StateSpaceModel
 
 A = np.array([[0.0, 1.0], [-4.0, -0.6]])
 S = np.diag([0.01, 0.5])

@@ -13,8 +13,8 @@ from filters.ensembles.localised import gaspari_cohn
 from filters.tensors import torch
 from tests.filters.test_c import assert_same, built, estimated
 from tests.models import KEY, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.plants.positions import Positions
+from thruster_env.core.compiled import interpreted
+from thruster_env.model.positions import Positions
 
 DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_localised.json").read_text())
 LOCAL = "enkf", "denkf", "ensrf", "letkf"

@@ -13,16 +13,16 @@ from filters.logs.clock import by_the_clock
 from filters.logs.estimate import estimate
 from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
-from thruster_env.logged import logged_model
-from thruster_env.model import thruster_model
-from thruster_env.plants.continuous import in_discrete_time
-from thruster_env.plants.logs.grid import Series
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.own_stamps import at_own_stamps
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.replay import ReplayEnv
-from thruster_env.plants.steps import in_steps
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.logs.grid import Series
+from thruster_env.logs.log import Log
+from thruster_env.logs.own_stamps import at_own_stamps
+from thruster_env.logs.read import read_log
+from thruster_env.logs.steps import in_steps
+from thruster_env.model.continuous import in_discrete_time
+from thruster_env.model.quantities import Quantity
+from thruster_env.thruster.logged import logged_model
+from thruster_env.thruster.model import thruster_model
 from tuning.identification.family import ModelFamily
 from tuning.problems.log_problem import LogProblem
 

@@ -11,11 +11,11 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate
 from filters.logs.figure import draw_log, log_figure
 from filters.logs.findings import compared, findings
-from tests.plants.test_logs import MODEL
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.simulate import simulate
+from tests.thruster_env.logs.test_logs import MODEL
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import Log
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.simulate import simulate
 
 POWER = Quantity("power", "P", "W")
 

@@ -18,11 +18,11 @@ from tests.filters.test_sensitivity import slopes_of
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import simulated
 from tests.slow import slow_but
-from thruster_cli.templates.filter import Template
-from thruster_env.numerics.algebra.graphs import Graph
-from thruster_env.numerics.algebra.programs import Place, values_of
-from thruster_env.numerics.streams import episode_keys
+from thruster_env.core.streams import episode_keys
+from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.programs import Place, values_of
 from tuning.auv.find import find_scenario as find_vehicle
+from tuning.cli.templates.filter import Template
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import untuned_choice

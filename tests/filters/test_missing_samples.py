@@ -10,9 +10,9 @@ from filters import make_filter, run, smooth
 from filters.likelihood import likelihood
 from tests.kalman_by_hand import LinearModel
 from tests.models import line_model, simulated, small, wide_model
-from thruster_env.numerics.checks import as_floats
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
+from thruster_env.core.checks import as_floats
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import Log
 
 INPUTS, MEASUREMENTS = simulated(line_model(), 10, seed=3)
 LOST = np.random.default_rng(2).random(MEASUREMENTS.shape) < 0.4

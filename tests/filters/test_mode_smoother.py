@@ -14,7 +14,7 @@ from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
 from tests.models import pendulum, simulated
 from tests.slow import slow_but
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 MODELS = [moving(0.01), moving(4.0)]
 TRANSITION, P = np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([0.7, 0.3])

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.sources import as_value
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plant import make_plant
-from thruster_env.plants import simulate
-from thruster_env.simulation import simulate as simulate_plant
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.sources import as_value
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
+from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import simulate as simulate_plant
 
 
 class Spring(NamedTuple):

@@ -21,8 +21,8 @@ from filters.monitoring.thresholds import (
     glr_threshold,
 )
 from filters.registry import make_filter
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.quantities import Quantity
+from thruster_env.logs.log import Log
+from thruster_env.model.quantities import Quantity
 from tuning.problems.find import find_problem
 
 

@@ -9,9 +9,9 @@ from filters import StateSpaceModel, make_filter, run
 from filters.gaussian.mixture import Parts, blender
 from pages.filter_models import followed, half_lost
 from tests.models import pendulum
-from tests.numerics.test_angles import turning
-from thruster_env.model import thruster_model
-from thruster_env.plants.affine import affine_model, linearize
+from tests.thruster_env.core.test_angles import turning
+from thruster_env.model.affine import affine_model, linearize
+from thruster_env.thruster.model import thruster_model
 
 
 def moving(q, r=1.0, **changes):

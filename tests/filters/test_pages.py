@@ -19,8 +19,8 @@ from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.filters.test_sensitivity import turn
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import plane_model, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
 
 NAMES = ("iekf", "ukf", "ckf")
 CHANGED = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}, "ckf": {}}

@@ -20,7 +20,7 @@ from tests.filters.test_pages import NAMES, assert_slopes, gaze, gaze_slopes, ma
 from tests.filters.test_sensitivity import ring, slopes_of
 from tests.filters.test_state_scores import data_of
 from tests.models import random_affine, simulated
-from thruster_env.numerics.streams import episode_keys
+from thruster_env.core.streams import episode_keys
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
 

@@ -11,8 +11,8 @@ from filters.engine.session import Session
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import convergence, normals, relative_errors
 from tests.slow import slow_but
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import (
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
@@ -21,7 +21,7 @@ from thruster_env.numerics.streams import (
     filter_keys,
     uniform_block,
 )
-from thruster_env.plants import simulate
+from thruster_env.model import simulate
 
 both_kinds = pytest.mark.parametrize("kind", [ParticleFilter, AuxiliaryParticleFilter])
 quick_kind = pytest.mark.parametrize("kind", slow_but([ParticleFilter, AuxiliaryParticleFilter], [ParticleFilter]))

@@ -19,8 +19,8 @@ from tests.filters.test_particle import (
 )
 from tests.models import KEY, line_model, plane_model, scalar_model, simulated, varying_noise
 from tests.oracles import assert_normal, normals
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
 
 
 @pytest.mark.usefixtures("as_python")

@@ -9,7 +9,7 @@ from filters import affine_model
 from filters import posterior as bounds
 from filters.bounds import riccati_covariances
 from filters.posterior import posterior_bound, posterior_variances
-from thruster_env.model import thruster_model
+from thruster_env.thruster.model import thruster_model
 
 INPUTS = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(5, 4, 1)), 3, axis=1)
 

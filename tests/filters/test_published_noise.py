@@ -14,8 +14,8 @@ from filters import (
     thruster_model,
 )
 from tests.models import held_voltages
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants import simulate
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model import simulate
 
 RUNS = 30
 

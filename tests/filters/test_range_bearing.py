@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, make_filter, run
-from thruster_env.numerics.angles import difference, wrapped
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.angles import difference, wrapped
+from thruster_env.core.streams import filter_keys
+from thruster_env.model.quantities import Quantity
 
 DT, STEPS = 1.0, 30
 SPECTRAL_DENSITY = 0.05  # of the acceleration, m^2/s^3

@@ -11,7 +11,7 @@ from filters.c.source import c_filter
 from filters.tensors import torch
 from tests.models import KEY, plane_model, simulated, wide_model
 from tests.slow import slow_but
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 
 def stay(x, u, c):

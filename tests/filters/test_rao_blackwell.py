@@ -9,14 +9,14 @@ from scipy.stats import multivariate_normal
 from filters import RaoBlackwellisedParticleFilter, StateSpaceModel, affine_model, make_filter, run
 from tests.models import KEY, line_model, plane_model, simulated
 from tests.oracles import assert_normal, normals
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import (
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import (
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
     uniform_block,
 )
-from thruster_env.studies import mixed_linear
+from tuning.experiments import mixed_linear
 
 Q = np.array([[0.04, 0.01, -0.01], [0.01, 0.03, 0.008], [-0.01, 0.008, 0.02]])  # of s, a, b: s and the others too
 R = np.array([[0.1, 0.02], [0.02, 0.05]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 
 GIVEN = {
     "transition": lambda x, u, c: (0.9 * x[0] + u[0],),

@@ -17,9 +17,9 @@ from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings
 from filters.logs.verdict import verdict
 from filters.wrappers.vector import EstimateStates
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.model_env import ModelEnv
-from thruster_env.plants.split import Split
+from thruster_env.env.model_env import ModelEnv
+from thruster_env.logs.log import Log
+from thruster_env.model.split import Split
 from tuning.evaluation.evaluate import evaluate, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.summary import summarised, summary

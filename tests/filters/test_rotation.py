@@ -8,7 +8,7 @@ import pytest
 from filters import make_filter, smooth, thruster_model
 from filters.engine.layout import memory_places
 from filters.ensembles.rotation import rotator
-from thruster_env.numerics.compiled import compiled
+from thruster_env.core.compiled import compiled
 
 N = 9
 

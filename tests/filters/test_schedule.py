@@ -5,11 +5,11 @@ import pytest
 
 from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model
 from tests.models import held_voltages
-from thruster_env.linear.steady_state import steady_state
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plant import make_plant
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
+from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.plant import make_plant
 
 KEYS = np.zeros((1, 2))
 

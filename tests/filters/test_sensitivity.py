@@ -11,13 +11,13 @@ from scipy.stats import multivariate_t, norm
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, run
 from filters.likelihood import likelihood
 from filters.sensitivity import ModelSlopes, sensitivity
-from thruster_env.model import thruster_model
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.parameters import TUNNEL_PHYSICAL
-from thruster_env.plants import simulate
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
+from thruster_env.model.quantities import Quantity
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
 
 
 class Constants(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model
 from filters.engine.session import Session
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 
 def of_three_states():
@@ -99,7 +99,7 @@ def test_the_pure_functions_take_no_root_of_a_covariance_and_no_new_memory_at_ea
     def never(*arguments):
         raise AssertionError("this takes longer than a step")
 
-    monkeypatch.setattr("thruster_env.plants.state_space.covariance_root", never)
+    monkeypatch.setattr("thruster_env.model.state_space.covariance_root", never)
     monkeypatch.setattr("filters.engine.session.new_memory", never)
     belief = filter_.predict(belief, [1.0])
     belief, innovation = filter_.update(belief, [0.2, np.nan])

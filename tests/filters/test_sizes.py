@@ -8,7 +8,7 @@ from filters.engine.restart import LARGEST, row_magnitude
 from filters.registry import FILTERS
 from tests.models import KEY, random_affine, small
 from tests.oracles import kalman_filter
-from thruster_env.numerics.sources import Source
+from thruster_env.core.sources import Source
 
 KEYS = np.array([KEY])
 EXACT = {"kf": {}, "ekf": {}, "iekf": {}, "ukf": {}, "ckf": {}, "mhe": {"loss": "quadratic"}, "schmidt": {}}

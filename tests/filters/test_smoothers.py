@@ -19,9 +19,9 @@ from filters.consistency.nees import normalized_squares
 from filters.smoothers.smooth import smooth
 from tests.filters.test_differentiated import swing_if
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 

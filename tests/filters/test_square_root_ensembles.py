@@ -12,12 +12,12 @@ from filters import (
     make_filter,
     run,
 )
+from filters.algebra.geometric import geometric_mean_of
 from tests.models import KEY, simulated, wide_model
 from tests.oracles import convergence
-from thruster_env.numerics.algebra.geometric import geometric_mean_of
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.sources import is_array
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.sources import is_array
+from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario

@@ -7,7 +7,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
-from thruster_env.model import thruster_model
+from thruster_env.thruster.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned

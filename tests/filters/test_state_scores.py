@@ -10,10 +10,10 @@ from tests.filters.test_differentiated import swing_if
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import pendulum
-from thruster_env.numerics.angles import wrapped
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.angles import wrapped
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 WEIGHTS = np.array([4.0, 0.25])
 CASES = {"affine": (two_channels, KalmanFilter), "angle": (turning_pendulum, ExtendedKalmanFilter)}

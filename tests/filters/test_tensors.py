@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import filters
-from auv_env.model import auv_model
 from filters import StateSpaceModel, make_filter, run, thruster_model
 from filters.likelihood import likelihood
 from tests.filters.test_c import KEPT, OWN, made
@@ -20,8 +19,9 @@ from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, wide_model
 from tests.slow import slow_but
-from thruster_cli.templates.filter import Template
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.auv.model import auv_model
+from thruster_env.core.compiled import interpreted
+from tuning.cli.templates.filter import Template
 
 NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
 MODELS = {

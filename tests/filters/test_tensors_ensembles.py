@@ -18,8 +18,8 @@ from tests.filters.test_pages import wide_pendulum
 from tests.filters.test_tensors import Drag, assert_same, one_thread  # noqa: F401 - a fixture
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
 from tests.slow import slow_but
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
 
 MODELS = {
     "thruster": thruster_model,

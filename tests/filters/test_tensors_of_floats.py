@@ -7,7 +7,7 @@ import pytest
 
 import filters
 from filters import StateSpaceModel, make_filter, run
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 
 torch = pytest.importorskip("torch")
 Z = np.array([0.3, 1.1, 0.4, 0.9])[None, :, None]

@@ -9,8 +9,8 @@ from filters import affine_model, make_filter, run
 from filters.bounds import steady_state
 from filters.consistency.time_constants import forgetting_noise, slopes_along, time_constants
 from tests.linear_problem import LinearProblem
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import interpreted
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import runs_of
 
 DT = 0.1

@@ -9,9 +9,9 @@ import pytest
 from filters import StateSpaceModel, make_filter, run, transformed_model
 from filters.augmented import Unknown, augmented_model
 from tests.models import KEY, simulated, wide_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 RATE, INFLOW = 0.1, 0.05  # of a stirred tank [1/step], [mol/l/step]
 

@@ -9,9 +9,9 @@ from scipy.stats import multivariate_normal
 from filters import StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run
 from tests.filters.test_multiple_models import merged
 from tests.models import wide_model
-from tests.numerics.test_angles import RATE, turning
-from thruster_env.model import thruster_model
-from thruster_env.numerics.compiled import interpreted
+from tests.thruster_env.core.test_angles import RATE, turning
+from thruster_env.core.compiled import interpreted
+from thruster_env.thruster.model import thruster_model
 
 DT = 0.5
 QUANTITIES = {"p": ("position", "p", "m"), "v": ("speed", "v", "m/s"), "a": ("acceleration", "a", "m/s^2")}

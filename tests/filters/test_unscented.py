@@ -7,8 +7,8 @@ import pytest
 
 from filters import CubatureKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, thruster_model
 from tests.models import held_voltages, pendulum, random_affine, simulated
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 
 KEYS = np.zeros((1, 2))
 NUMBERS = [(1.0, 2.0, 0.0), (0.1, 2.0, 1.0), (0.5, 0.0, 0.0), (1.3, 1.0, 2.0)]  # alpha, beta, kappa

@@ -16,8 +16,8 @@ from tests.fuzz import unequal_steps
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
 from tests.models import plane_model, simulated, small
 from tests.slow import slow_but
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.steps import in_any_steps
+from thruster_env.logs.steps import in_any_steps
+from thruster_env.model.affine import affine_model
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

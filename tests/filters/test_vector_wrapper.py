@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from filters import FILTERS, EstimateState, EstimateStates
 from filters.wrappers.ids import ALIASES, filtered_id
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 
 COPIES, STEPS = 3, 30
 MODES = ["NextStep", "SameStep", "Disabled"]

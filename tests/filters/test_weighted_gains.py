@@ -6,7 +6,7 @@ import pytest
 from filters import make_filter, run
 from filters.registry import FILTERS
 from tests.models import random_affine, scalar_model, simulated, wide_model
-from thruster_env.model import thruster_model
+from thruster_env.thruster.model import thruster_model
 
 NO_MORE = {"fading": {"fading": 1.0}, "h-infinity": {"theta": 1e-12}, "schmidt": {}}
 

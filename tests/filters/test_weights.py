@@ -5,12 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from filters.pages.members import of_members
-from filters.pages.stages import Stage, as_calls
-from filters.particles.resampling import systematic_resampler
-from thruster_env.numerics.algebra.matrices import given
-from thruster_env.numerics.algebra.programs import OF_MEMBERS, Place
-from thruster_env.numerics.algebra.samples import (
+from filters.algebra.matrices import given
+from filters.algebra.samples import (
     effective_size,
     normalised,
     weighted_covariance,
@@ -18,7 +14,11 @@ from thruster_env.numerics.algebra.samples import (
     weighted_square,
     weights,
 )
-from thruster_env.numerics.exponential import exponential
+from filters.pages.members import of_members
+from filters.pages.stages import Stage, as_calls
+from filters.particles.resampling import systematic_resampler
+from thruster_env.core.exponential import exponential
+from thruster_env.graphs.programs import OF_MEMBERS, Place
 
 SIZE = 11
 

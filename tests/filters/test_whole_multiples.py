@@ -9,8 +9,8 @@ import pytest
 import filters
 from filters import StateSpaceModel, make_filter, run
 from filters.c.single import single_error
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import filter_keys
 
 STEPS = 200
 

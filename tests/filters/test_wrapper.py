@@ -13,7 +13,7 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from filters.tuned_file import sealed
 from tests.models import TUNED
-from thruster_env.parameters import TUNNEL, derive_constants
+from thruster_env.thruster.parameters import TUNNEL, derive_constants
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
 quiet = pytest.mark.filterwarnings(

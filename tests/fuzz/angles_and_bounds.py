@@ -17,12 +17,12 @@ from filters.wrapped import wrapped_variances
 from tests.filters.test_bounds_at_any_scale import VELOCITY, apart, exact_covariances
 from tests.fuzz.python_interface import _line, _until
 from tests.models import line_model, simulated, small
-from tests.numerics.test_angles import data_of, makers, plain_run, rotated
-from tests.plants.test_logs_of_angles import model, recorded
-from thruster_env.numerics.angles import difference, on_one_branch, wrapped
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log, at_offset
+from tests.thruster_env.core.test_angles import data_of, makers, plain_run, rotated
+from tests.thruster_env.logs.test_logs_of_angles import model, recorded
+from thruster_env.core.angles import difference, on_one_branch, wrapped
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import Log, at_offset
 
 WITHIN = 2e-8  # of angle filters about another heading
 STEPS = 20

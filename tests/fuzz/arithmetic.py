@@ -23,14 +23,14 @@ from filters.c.single import _Single
 from filters.tensors.graphs import order_of
 from filters.tensors.graphs import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
-from thruster_env.numerics.algebra.c_source import statements_of
-from thruster_env.numerics.algebra.graphs import Graph, Number
-from thruster_env.numerics.algebra.programs import Place, Program, callable_of, program_of, values_of, work_names
-from thruster_env.numerics.algebra.tracing import traced
-from thruster_env.numerics.compiled import compiled
-from thruster_env.numerics.python_floats import with_python_floats
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.compiled import compiled
+from thruster_env.core.python_floats import with_python_floats
+from thruster_env.core.streams import filter_keys
+from thruster_env.graphs.c_source import statements_of
+from thruster_env.graphs.graphs import Graph, Number
+from thruster_env.graphs.programs import Place, Program, callable_of, program_of, values_of, work_names
+from thruster_env.graphs.tracing import traced
+from thruster_env.model.state_space import StateSpaceModel
 
 LEAVES = ("x", "y", "x", "y", "49.0", "0.1", "3.0", "7", "-2.5", "0.5", "1", "2", "-3.0", "1e-3")
 OPERATORS = ("+", "-", "*", "/", "%", "//", "+", "*", "%")

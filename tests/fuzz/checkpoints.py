@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.training.setup import TrainingConfiguration, configuration_from_json, make_configuration
+from tuning.policies.setup import TrainingConfiguration, configuration_from_json, make_configuration
 from tuning.thruster.find import find_scenario
 
 KILLS = 20
@@ -78,7 +78,7 @@ def kill_comparison(rng: np.random.Generator, kills: int, seconds: float) -> str
     deadline, done, progress = time.monotonic() + LAST_KILL * seconds, 0, (0, 0)
     with tempfile.TemporaryDirectory() as scratch:
         found, kept = Path(scratch) / "found", {}
-        command = [sys.executable, "-m", "thruster_cli.main", "study", "policies", "--quick", "--seeds", "1"]
+        command = [sys.executable, "-m", "tuning.cli.main", "study", "policies", "--quick", "--seeds", "1"]
         command += ["--steps", "4096", "--jobs", "2", "--out", str(found), "--json", str(found / "result.json")]
         while done < kills and time.monotonic() < deadline:
             news, delay = int(rng.integers(0, 5)), float(rng.uniform(0.0, 1.0))
@@ -163,7 +163,7 @@ def _train(
 
 def _saved_steps(folder: Path) -> int:
     """Steps from which a training goes on."""
-    from thruster_env.training.saved import FINAL, latest_checkpoint
+    from tuning.policies.saved import FINAL, latest_checkpoint
 
     latest = latest_checkpoint(folder)
     if (folder / FINAL).is_dir():
@@ -172,15 +172,15 @@ def _saved_steps(folder: Path) -> int:
 
 
 def _learnt(saved: Path) -> int:
-    from thruster_env.training.environments import make_environments
-    from thruster_env.training.saved import load, read_configuration
+    from tuning.policies.environments import make_environments
+    from tuning.policies.saved import load, read_configuration
 
     return load(saved, make_environments(read_configuration(saved), [0])).model.num_timesteps
 
 
 def _check_training(folder: Path, setup: TrainingConfiguration | None = None) -> None:
     """What is in the folder of a training that has ended is whole, and nothing is left aside."""
-    from thruster_env.training.saved import BEST, FINAL, read_configuration
+    from tuning.policies.saved import BEST, FINAL, read_configuration
 
     setup = setup or read_configuration(folder)
     assert _learnt(folder / FINAL) >= setup.steps and _learnt(folder / BEST) > 0
@@ -193,7 +193,7 @@ def _check_training(folder: Path, setup: TrainingConfiguration | None = None) ->
 
 def _learn(folder: str) -> None:
     """What the process does: learn as standard input says, and tell each step."""
-    from thruster_env.training.learn import train
+    from tuning.policies.learn import train
 
     def tell(steps: int, mean_return: float) -> None:
         print(steps, flush=True)

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.io import savemat
 
 from tests.fuzz.logs import MODEL
-from tests.plants.recorders.files import dataflash, stamped, write_bag, write_ulog
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.logs.recorders.registry import fields
-from thruster_env.plants.logs.write import write_columns
+from tests.thruster_env.logs.recorders.files import dataflash, stamped, write_bag, write_ulog
+from thruster_env.logs.read import read_log
+from thruster_env.logs.recorders.registry import fields
+from thruster_env.logs.write import write_columns
 
 EPOCH = 1_700_000_000  # [s]
 BAGS = {"ros1": ".bag", "sqlite3": "", "mcap": ""}

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import typer
 
-from thruster_cli.app import app
-from thruster_cli.main import main
+from tuning.cli.app import app
+from tuning.cli.main import main
 
 # Small numbers for what would take long, wild ones for everything, words that are right somewhere.
 NUMBERS = "0 1 2 5 -1 0.5 12 1e-300 1e12 1e300 nan inf -inf 0x10".split() + ["1" + "0" * 400]

@@ -14,9 +14,9 @@ import numpy as np
 from tests.filters.test_far_from_zero import LINEARISING, body, estimates
 from tests.fuzz.python_interface import _line, _until
 from tests.models import simulated
-from tests.numerics.test_slopes_at_kinks import slopes_of
-from thruster_env.numerics.algebra.programs import values_of
-from thruster_env.numerics.compiled import interpreted
+from tests.thruster_env.graphs.test_slopes_at_kinks import slopes_of
+from thruster_env.core.compiled import interpreted
+from thruster_env.graphs.programs import values_of
 
 INNER = (  # of which all are zero or have a kink at the origin
     lambda x, y: x,

@@ -9,9 +9,9 @@ import time
 
 import numpy as np
 
-from tests.numerics.test_equal_functions import FACTORIES
-from thruster_env.numerics.captured import captured_numbers, differ_in_numbers_alone, with_numbers
-from thruster_env.numerics.equal_functions import first_equal
+from tests.thruster_env.core.test_equal_functions import FACTORIES
+from thruster_env.core.captured import captured_numbers, differ_in_numbers_alone, with_numbers
+from thruster_env.core.equal_functions import first_equal
 
 NOT_COPIED = "from_text", "with_large_array", "with_members_of_a_local_class", "with_cache", "with_matrix"
 SAME_CODE = [one for one in FACTORIES if one.__name__ not in NOT_COPIED]

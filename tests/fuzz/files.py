@@ -20,10 +20,10 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
-from thruster_env.plants.logs.recorders.registry import fields, read
-from thruster_env.training.environments import make_environments
-from thruster_env.training.setup import configuration_from_json, make_configuration
+from thruster_env.logs.recorders.registry import fields, read
 from tuning.evaluation.tuned import read_tuned
+from tuning.policies.environments import make_environments
+from tuning.policies.setup import configuration_from_json, make_configuration
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study
@@ -164,7 +164,7 @@ def journals(rng: np.random.Generator, seconds: float) -> str:
 
 def recordings(rng: np.random.Generator, seconds: float) -> str:
     """Recorders' files of all formats, damaged anywhere: listed and read, in part at most, or refused."""
-    from tests.plants.recorders.test_bad_recordings import SOME, write_good
+    from tests.thruster_env.logs.recorders.test_bad_recordings import SOME, write_good
 
     with tempfile.TemporaryDirectory() as folder:
         good = {ending: write_good(Path(folder) / f"{ending[1:]}{ending}").read_bytes() for ending in SOME}

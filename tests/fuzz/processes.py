@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-READY = (
-    "import os; from thruster_cli import main; main.signal(2, main.leave); os.write(2, b'ready\\n'); main.run()"
-)
+READY = "import os; from tuning.cli import main; main.signal(2, main.leave); os.write(2, b'ready\\n'); main.run()"
 TUNE = "tune --filter ekf --scenario nominal --no-pruning --storage j --study s --out s.json --trials"
 COMMANDS = ("filters", "inspect", "simulate --steps 2000 --out run.csv", f"{TUNE} 8")
 LIMIT_SECONDS = 120  # after which a command counts as one that hangs
@@ -133,7 +131,7 @@ def outputs_that_take_nothing(rng: np.random.Generator, seconds: float) -> str:
         while time.monotonic() < deadline:
             command = str(rng.choice([*COMMANDS[:3], "filters --json -"]))
             where = str(rng.choice(redirections))
-            line = f"{sys.executable} -m thruster_cli {command} {where}"
+            line = f"{sys.executable} -m tuning.cli {command} {where}"
             done = subprocess.run(
                 ["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=LIMIT_SECONDS
             )

@@ -21,8 +21,8 @@ from filters import FILTERS, EstimateState, EstimateStates, make_filter, run, th
 from filters.engine.belief import Belief, LostBelief
 from filters.registry import filter_type
 from tests.robustness.test_copies import assert_alike
-from tests.thruster_env.test_robustness import random_arguments, run_random_episode
-from thruster_env.numerics.compiled import interpreted
+from tests.thruster_env.thruster.test_robustness import random_arguments, run_random_episode
+from thruster_env.core.compiled import interpreted
 
 WAYS = (
     copy.deepcopy,

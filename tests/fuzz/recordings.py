@@ -20,9 +20,9 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 from tests.fuzz.files import _damaged
-from thruster_env.plants.logs.recorders.registry import contents, read
-from thruster_env.plants.logs.table import read_table
-from thruster_env.plants.logs.write import write_columns
+from thruster_env.logs.recorders.registry import contents, read
+from thruster_env.logs.table import read_table
+from thruster_env.logs.write import write_columns
 
 AUTOPILOTS, BAGS = (".bin", ".ulg"), (".mcap", ".bag", ".db3")
 TABLES = (".npz", ".parquet", ".csv")
@@ -32,7 +32,7 @@ EPOCH = 10**9  # [ns]
 
 def message_counts(rng: np.random.Generator, seconds: float) -> str:
     """Bags and logs of autopilots with bytes zeroed, flipped, doubled or cut off: no message is lost unsaid."""
-    from tests.plants.recorders.test_bad_recordings import write_good
+    from tests.thruster_env.logs.recorders.test_bad_recordings import write_good
 
     counts, end = Counter(), time.monotonic() + seconds
     with tempfile.TemporaryDirectory() as folder:
@@ -91,8 +91,8 @@ def two_definitions(rng: np.random.Generator, seconds: float) -> str:
 
 def transforms_of_bags(rng: np.random.Generator, seconds: float) -> str:
     """Transforms of random frames in bags of all kinds: of each pair the numbers and stamps that were written."""
-    from tests.plants.recorders.test_transforms import FIELDS as NUMBERS
-    from tests.plants.recorders.test_transforms import write_transforms
+    from tests.thruster_env.logs.recorders.test_transforms import FIELDS as NUMBERS
+    from tests.thruster_env.logs.recorders.test_transforms import write_transforms
 
     frames = ["map", "odom", "base_link", "r1.arm", "imu[0]", "Größe"]
     counts, end = Counter(), time.monotonic() + seconds
@@ -219,7 +219,7 @@ def _one_bit(rng: np.random.Generator, data: bytes) -> bytes:
 
 def _write_dataflash(path: Path, orders: list[list[str]], rows: list[np.ndarray]) -> Path:
     """Logs put together, each with its own format of message A."""
-    from tests.plants.recorders.files import dataflash
+    from tests.thruster_env.logs.recorders.files import dataflash
 
     out, row = b"", 0
     for order, part in zip(orders, rows, strict=True):

@@ -25,13 +25,13 @@ from tests.filters.test_c import built, estimated
 from tests.fuzz.python_interface import _line, _until
 from tests.models import KEY, random_affine, rescaled, small
 from tests.oracles import kalman_filter
-from thruster_env.numerics.checks import covariance
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.affine import AffineModel
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.model_env import ModelEnv
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import covariance
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.model_env import ModelEnv
+from thruster_env.logs.log import Log
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.state_space import StateSpaceModel
 
 EXACT = {
     "kf": {"form": ("covariance", "square-root", "ud", "information")},

@@ -21,7 +21,7 @@ from filters.engine.batch import run
 from filters.estimators.estimator import Estimator
 from filters.registry import make_filter
 from tests.fuzz.python_interface import _until
-from thruster_env.numerics.streams import SPAWN_KEYS, derived_generator, derived_seed
+from thruster_env.core.streams import SPAWN_KEYS, derived_generator, derived_seed
 from tuning.problems.digest import digest_of
 from tuning.problems.env_problem import EnvProblem
 

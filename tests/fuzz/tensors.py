@@ -15,8 +15,8 @@ from filters import StateSpaceModel, run
 from tests.fuzz.arithmetic import drawn
 from tests.fuzz.python_interface import _line, _until
 from tests.models import small
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import filter_keys
 
 NAMES = ("ekf", "ukf", "ckf", "iekf", "fading", "vb", "schmidt", "ekf-robust", "enkf", "etkf")
 STEPS = 6

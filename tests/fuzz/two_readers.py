@@ -19,8 +19,8 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate_with
 from filters.registry import make_filter
 from tests.fuzz.logs import MODEL
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.plants.replay import ReplayEnv
+from thruster_env.core.compiled import interpreted
+from thruster_env.env.replay import ReplayEnv
 
 ROWS = 25
 DT = 0.01

@@ -19,11 +19,11 @@ from benchmarks.counting import (
 )
 from benchmarks.workloads import normals, step_by_size, step_of_env, step_of_filter, step_of_members, times
 from filters import make_filter, thruster_model
-from thruster_env.dynamics import substep
-from thruster_env.numerics import arrays
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import FILTER_PROCESS, normal_block
-from thruster_env.plant import make_plant
+from thruster_env.core import arrays
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import FILTER_PROCESS, normal_block
+from thruster_env.thruster.dynamics import substep
+from thruster_env.thruster.plant import make_plant
 
 
 @pytest.mark.parametrize(

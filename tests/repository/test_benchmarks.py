@@ -15,9 +15,9 @@ from benchmarks.rows import Row
 from benchmarks.speed_page import HEADER, NO_BREAK, check_page, write_page
 from benchmarks.timing import Timing
 from filters import EnsembleKalmanFilter, thruster_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from thruster_env.plant import make_plant
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.thruster.plant import make_plant
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pyulog")
-from tests.plants.recorders.files import write_ulog
+from tests.thruster_env.logs.recorders.files import write_ulog
 
 PAGE = (Path(__file__).parents[2] / "docs" / "boat.md").read_text()
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
@@ -39,7 +39,7 @@ def dive(folder, number, run):
 def test_every_line_leads_to_the_alarm(tmp_path):
     (tmp_path / "bin").mkdir()
     command = tmp_path / "bin" / "thruster"
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m thruster_cli "$@"\n')
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m tuning.cli "$@"\n')
     command.chmod(0o755)
     paths = [str(tmp_path / "bin"), os.environ["PATH"]]
     environment = {**os.environ, "PATH": os.pathsep.join(paths), "PYTHONPATH": str(Path(__file__).parents[2])}

@@ -18,17 +18,17 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
 from pages import filter_gaussian, filter_horizon, filter_particles
-from thruster_env.channels import CHANNELS
-from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.effects.flow import FLOW_SIGNALS
-from thruster_env.effects.reference import REFERENCE_SIGNALS
-from thruster_env.effects.uncertainty import DISTRIBUTIONS
-from thruster_env.env import BowThrusterEnv
-from thruster_env.model import thruster_model
-from thruster_env.parameters import PRESETS
-from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
-from thruster_env.tasks import BowThrusterLinearEnv
-from thruster_env.vector_env import BowThrusterVectorEnv
+from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.thruster.channels import CHANNELS
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
+from thruster_env.thruster.effects.uncertainty import DISTRIBUTIONS
+from thruster_env.thruster.env import BowThrusterEnv
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.tasks import BowThrusterLinearEnv
+from thruster_env.thruster.vector_env import BowThrusterVectorEnv
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "plant.md").read_text()

@@ -10,39 +10,25 @@ from pathlib import Path
 
 import pytest
 
-from thruster_env.numerics.compiled import package_of
 from tuning.problems.plant_packages import PLANT_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = (
-    "thruster_env",
-    "auv_env",
-    "filters",
-    "tuning",
-    "thruster_cli",
-)  # a user's folder has none of these names
-NUMERICS, PLANTS, TRAINING, STUDIES = (
-    f"thruster_env/{name}" for name in ("numerics", "plants", "training", "studies")
-)
-LAYERS = (NUMERICS, PLANTS, *PACKAGES[:-1], TRAINING, STUDIES, PACKAGES[-1])
-FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-every_package = pytest.mark.parametrize("package", LAYERS)
+FLOORS = "thruster_env", "filters", "tuning"  # a floor knows those before it
+FILES = [path for floor in FLOORS for path in sorted((ROOT / floor).rglob("*.py"))]
 
-ALLOWED = {
-    NUMERICS: set(),
-    PLANTS: {NUMERICS},
-    "thruster_env": {NUMERICS, PLANTS},
-    "auv_env": {NUMERICS, PLANTS},
-    "filters": {NUMERICS, PLANTS},
-    "tuning": {NUMERICS, PLANTS, "filters"},
-    TRAINING: {NUMERICS, PLANTS, "thruster_env", "auv_env", "filters", "tuning"},
-    STUDIES: {NUMERICS, PLANTS, "thruster_env", "auv_env", "filters", "tuning"},
-    "thruster_cli": set(LAYERS),
+ROOMS = {  # of thruster_env, and the rooms that each knows
+    "core": set(),
+    "graphs": {"core"},
+    "model": {"core"},
+    "effects": {"core"},
+    "render": {"core"},
+    "logs": {"core", "model"},
+    "env": {"core", "model", "effects", "render", "logs"},
+    "thruster": {"core", "model", "effects", "render", "logs", "env"},
+    "auv": {"core", "model", "effects", "render", "logs", "env"},
 }
-TUNING_OF_PLANTS = {
-    "tuning/thruster": {"thruster_env"},
-    "tuning/auv": {"auv_env"},
-}  # the packages of tuning that know a plant
+PLANTS = {"thruster", "auv"}
+KNOW_PLANTS = ("tuning/thruster/", "tuning/auv/", "tuning/policies/", "tuning/experiments/", "tuning/cli/")
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
 PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
@@ -50,7 +36,7 @@ OF_TENSORS = (  # networks in models and estimators
     "filters/tensors/",
     "filters/learned/",
     "tuning/learning/",
-    "thruster_env/numerics/torch_threads.py",
+    "thruster_env/core/torch_threads.py",
 )
 
 
@@ -73,9 +59,15 @@ def packages_of(path):
     return {name.partition(".")[0] for name in imports_of(path)}
 
 
-def layers_of(path):
-    """The packages that a file knows."""
-    return {package_of(name).replace(".", "/") for name in imports_of(path)}
+def name_of(path):
+    """The path from the checkout's folder, with slashes."""
+    return path.relative_to(ROOT).as_posix()
+
+
+def rooms_of(path):
+    """The rooms of thruster_env that a file knows."""
+    parts = (name.split(".") for name in imports_of(path))
+    return {part[1] for part in parts if part[0] == "thruster_env" and len(part) > 1} & ROOMS.keys()
 
 
 def test_imports_are_found_wherever_they_hide():
@@ -85,38 +77,41 @@ def test_imports_are_found_wherever_they_hide():
 
 
 def test_there_is_something_to_read():
-    assert ROOT / PLANTS / "state_space.py" in FILES and len(FILES) > 20
+    assert ROOT / "thruster_env/model/state_space.py" in FILES and len(FILES) > 20
 
 
 def those(condition):
     """Names of the files for which a condition holds."""
-    return [path.relative_to(ROOT).as_posix() for path in FILES if condition(path)]
+    return [name_of(path) for path in FILES if condition(path)]
 
 
-def own_package_of(path):
-    return package_of(".".join(path.relative_to(ROOT).with_suffix("").parts)).replace(".", "/")
+def floor_of(path):
+    return FLOORS.index(path.relative_to(ROOT).parts[0])
 
 
-def known_to(path):
-    """Our packages that a file may import."""
-    package = path.relative_to(ROOT).parent.as_posix()
-    return ALLOWED[own_package_of(path)] | {own_package_of(path)} | TUNING_OF_PLANTS.get(package, set())
+def test_floors_know_those_below_alone():
+    assert not those(lambda path: packages_of(path) & set(FLOORS[floor_of(path) + 1 :]))
 
 
-def test_a_package_knows_only_the_packages_below():
-    assert not those(lambda path: layers_of(path) & set(LAYERS) - known_to(path))
+def test_rooms_of_the_ground_floor_go_in_no_circle():
+    TopologicalSorter(ROOMS).prepare()  # raises CycleError, which names the circle
+    for path in FILES:
+        floor, room = path.relative_to(ROOT).parts[:2]
+        if floor == "thruster_env" and room != "__init__.py":
+            assert rooms_of(path) <= ROOMS[room] | {room}, name_of(path)
 
 
-def test_packages_of_tuning_know_those_of_plants_by_the_finder_alone():
-    packages = {package.replace("/", ".") for package in TUNING_OF_PLANTS}
-    outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
-    knowing = [path for path in outside if own_package_of(path) == "tuning" and imports_of(path) & packages]
-    assert not knowing and set(PLANT_PACKAGES.values()) == {f"{package}.find" for package in packages}
+def test_filters_know_no_plant_and_tuning_knows_them_by_the_finder_alone():
+    knowing = those(lambda path: floor_of(path) > 0 and rooms_of(path) & PLANTS)
+    assert knowing and all(name.startswith(KNOW_PLANTS) for name in knowing)
+    of_plants = {"tuning.thruster", "tuning.auv"}
+    assert not those(lambda path: not name_of(path).startswith(KNOW_PLANTS) and imports_of(path) & of_plants)
+    assert set(PLANT_PACKAGES.values()) == {f"{package}.find" for package in of_plants}
 
 
 def test_imports_of_training_go_in_no_circle_not_even_within_functions():
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in FILES}
-    code = {name: path.read_text() for name, path in files.items() if name.startswith("thruster_env.training.")}
+    code = {name: path.read_text() for name, path in files.items() if name.startswith("tuning.policies.")}
     for name, text in code.items():  # what only a type checker sees is left out
         code[name] = re.sub(r"^if TYPE_CHECKING:\n(?:    .*\n|\n)+", "", text, flags=re.MULTILINE)
     graph = {name: imports_of(files[name], text) & code.keys() - {name} for name, text in code.items()}
@@ -125,7 +120,7 @@ def test_imports_of_training_go_in_no_circle_not_even_within_functions():
 
 
 def test_only_tuning_imports_optuna():
-    assert not those(lambda path: "optuna" in packages_of(path) and own_package_of(path) != "tuning")
+    assert not those(lambda path: "optuna" in packages_of(path) and floor_of(path) != 2)
 
 
 def test_the_page_alone_imports_bokeh_and_computes_nothing():
@@ -135,13 +130,15 @@ def test_the_page_alone_imports_bokeh_and_computes_nothing():
 
 
 def test_only_training_imports_packages_that_learn_policies():
-    assert not those(lambda path: packages_of(path) & LEARNING - {"torch"} and own_package_of(path) != TRAINING)
+    assert not those(
+        lambda path: packages_of(path) & LEARNING - {"torch"} and not name_of(path).startswith("tuning/policies/")
+    )
 
 
 def test_torch_is_imported_by_training_and_where_networks_are_alone():
-    knowing = those(lambda path: "torch" in packages_of(path) and own_package_of(path) != TRAINING)
+    knowing = those(lambda path: "torch" in packages_of(path) and not name_of(path).startswith("tuning/policies/"))
     assert knowing and all(name.startswith(OF_TENSORS) for name in knowing)
-    outside = [path for path in FILES if not path.relative_to(ROOT).as_posix().startswith(OF_TENSORS)]
+    outside = [path for path in FILES if not name_of(path).startswith(OF_TENSORS)]
     of_tensors = {name for path in outside for name in imports_of(path) if name.startswith("filters.tensors")}
     assert of_tensors == {"filters.tensors", "filters.tensors.torch"}  # which imports torch when it is called
 
@@ -162,20 +159,19 @@ def test_text_files_are_utf_8_whatever_the_terminal_has():
                 assert "encoding" in {keyword.arg for keyword in call.keywords}, f"{path}:{call.lineno}"
 
 
-@every_package
-def test_a_package_says_that_it_is_typed(package):
-    assert (ROOT / package / "__init__.py").is_file()
-    assert (ROOT / package / "py.typed").is_file()
+@pytest.mark.parametrize("floor", FLOORS)
+def test_a_package_says_that_it_is_typed(floor):
+    assert (ROOT / floor / "__init__.py").is_file() and (ROOT / floor / "py.typed").is_file()
 
 
 def test_the_command_line_starts_without_packages_that_learn_policies():
-    code = f"import sys, thruster_cli.app; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
+    code = f"import sys, tuning.cli.app; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 
 def test_training_of_estimators_imports_torch_when_it_is_called():
-    code = "import sys, tuning.api.train_estimator, thruster_cli.train_estimator; print('torch' in sys.modules)"
+    code = "import sys, tuning.api.train_estimator, tuning.cli.train_estimator; print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
 

@@ -8,7 +8,7 @@ import pytest
 
 from filters.likelihood import likelihood
 from pages.machine_code import TABLES, body
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
 
 PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()
 

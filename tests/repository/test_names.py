@@ -5,7 +5,14 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("thruster_env", "auv_env", "filters", "tuning", "thruster_cli", "pages", "benchmarks", "examples")
+PACKAGES = (
+    "thruster_env",
+    "filters",
+    "tuning",
+    "pages",
+    "benchmarks",
+    "examples",
+)
 
 
 def words_to_avoid():

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.repository.test_house import LAYERS, PACKAGES
+from tests.repository.test_house import FLOORS
 from thruster_env import __version__
 from tuning.search.samplers import NEEDS
 
@@ -33,7 +33,7 @@ def named_extras(text):
 
 def test_every_extra_that_is_named_exists():
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    sources = [path for package in FLOORS for path in (ROOT / package).rglob("*.py")]
     named = {extra for path in [*pages, *sources] for extra in named_extras(path.read_text())}
     assert {"rl", "db"} <= named <= set(EXTRAS)
     for package, extra in NEEDS.values():
@@ -60,7 +60,7 @@ def test_every_package_is_known_wherever_packages_are_listed():
     included = {name.removesuffix("*") for name in settings["setuptools"]["packages"]["find"]["include"]}
     warned = next(line for line in settings["pytest"]["ini_options"]["filterwarnings"] if line.startswith("error"))
     there = {path.parent.name for path in ROOT.glob("*/py.typed")}
-    assert there == set(PACKAGES) == included == set(settings["mypy"]["files"])
+    assert there == set(FLOORS) == included == set(settings["mypy"]["files"])
     assert there == set(re.search(r"\((.*?)\)", warned)[1].split("|"))
 
 
@@ -93,8 +93,8 @@ def test_a_wheel_holds_every_file_of_every_package_and_nothing_else(packed):
     (wheel,) = dist.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
-    of_packages = {name for name in files if name.partition("/")[0] in PACKAGES}
-    assert {f"{package}/py.typed" for package in LAYERS} <= found
+    of_packages = {name for name in files if name.partition("/")[0] in FLOORS}
+    assert {f"{package}/py.typed" for package in FLOORS} <= found
     assert sorted(found ^ of_packages) == []
     assert wheel.name.split("-")[:2] == ["thruster_env", __version__]
 

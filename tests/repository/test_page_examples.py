@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from thruster_cli.app import app
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tuning.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT / "docs")): path.read_text() for path in sorted((ROOT / "docs").rglob("*.md"))}
@@ -21,7 +21,7 @@ ELSEWHERE = {  # pages whose programs another test runs
     "plant.md": "test_docs.py",
     "filters.md": "test_docs.py",
     "machine_code.md": "test_machine_code_page.py",
-    "policies.md": "../training/test_policies_page.py",
+    "policies.md": "../tuning/policies/test_policies_page.py",
     "boat.md": "test_boat_page.py",
     **{page: "test_examples.py" for page in PAGES if page.startswith("howto/")},
 }
@@ -32,9 +32,13 @@ NOT_RUN = {  # programs, by page and what is in them
         "mine.toml",
     ): "its file comes from a minute's search: tests/tuning/test_identify.py",
     ("ranking.md", "kalman_filter"): "a fragment on FilterPy: tests/filters/test_estimator_adapters.py",
-    ("real_data.md", "mine.toml"): "needs what the page's identification writes: tests/thruster_cli",
+    ("real_data.md", "mine.toml"): "needs what the page's identification writes: tests/tuning/cli",
     ("real_data.md", "import spring"): "the same, of a model of one's own",
-    ("benchmarks.md", "studies"): "needs the tuned files of the page's studies: tests/studies",
+    ("benchmarks.md", "studies"): "needs the tuned files of the page's studies: tests/tuning/experiments",
+    ("extending.md", "scale_error"): "a fragment: the effect is the reader's",
+    ("extending.md", "fading"): "the same, of a filter that there is: tests/filters",
+    ("extending.md", "Tank"): "the same, of a plant: tests/thruster_env",
+    ("extending.md", "tank_model"): "the same",
     ("size.md", "lorenz_96"): "a fragment of a model",
     ("policies.md", "VecNormalize"): "needs Stable-Baselines3, as howto/stable_baselines.md does, which runs",
 }

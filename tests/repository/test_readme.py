@@ -8,7 +8,7 @@ import pytest
 import typer
 from PIL import Image
 
-from thruster_cli.app import app
+from tuning.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

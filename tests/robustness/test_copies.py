@@ -15,7 +15,7 @@ from filters import FILTERS, EstimateState, EstimateStates, StateSpaceModel, mak
 from filters.augmented import Unknown, augmented_model
 from filters.engine.session import Session
 from tests.models import pendulum, scalar_model, small, wide_model
-from tests.thruster_env.test_robustness import AMPLIFIER, FLOW, REFERENCE, SENSORS, UNCERTAINTY
+from tests.thruster_env.thruster.test_robustness import AMPLIFIER, FLOW, REFERENCE, SENSORS, UNCERTAINTY
 from tuning.evaluation.evaluate import evaluate
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
@@ -215,7 +215,7 @@ def test_a_pickle_loads_in_a_fresh_process():
     env = gym.make("filters:BowThruster-EKF-v0")
     env.reset(seed=1)
     source = (
-        "import pickle, sys; from thruster_env.numerics.compiled import interpreted\n"
+        "import pickle, sys; from thruster_env.core.compiled import interpreted\n"
         "with interpreted():\n"
         "    env = pickle.load(sys.stdin.buffer); print(env.step([3.0])[0].tobytes().hex())"
     )

@@ -10,11 +10,11 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
 from filters.tuned_file import read_tuned_file
-from thruster_cli.simulate import command
-from thruster_env.numerics.checks import as_floats, short_repr, vector
-from thruster_env.parameters import TUNNEL
-from thruster_env.studies.comparison import compare
-from thruster_env.training.setup import configuration_from_json
+from thruster_env.core.checks import as_floats, short_repr, vector
+from thruster_env.thruster.parameters import TUNNEL
+from tuning.cli.simulate import command
+from tuning.experiments.comparison import compare
+from tuning.policies.setup import configuration_from_json
 from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.thruster.scenarios import SCENARIOS

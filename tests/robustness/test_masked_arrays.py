@@ -8,13 +8,13 @@ import pytest
 from filters import EstimateState, EstimateStates, make_filter, run
 from filters.likelihood import likelihood
 from tests.models import KEY, line_model, simulated, wide_model
-from tests.plants.test_logs import MODEL
-from thruster_env.numerics.checks import as_floats, vector
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.replay import ReplayEnv
-from thruster_env.plants.simulate import simulate
+from tests.thruster_env.logs.test_logs import MODEL
+from thruster_env.core.checks import as_floats, vector
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.logs.log import Log
+from thruster_env.logs.read import read_log
+from thruster_env.model.simulate import simulate
 from tuning.problems.check import check_data
 from tuning.problems.data import Data
 from tuning.problems.env_problem import EnvProblem

@@ -7,11 +7,11 @@ import weakref
 import numpy as np
 
 from filters import make_filter, run
-from thruster_env.numerics import compiled
-from thruster_env.numerics.algebra import programs
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants.simulate import simulate
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core import compiled
+from thruster_env.core.streams import episode_keys
+from thruster_env.graphs import programs
+from thruster_env.model.simulate import simulate
+from thruster_env.model.state_space import StateSpaceModel
 
 KEPT = 64  # models whose code the caches keep
 TEXT = """

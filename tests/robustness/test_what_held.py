@@ -14,15 +14,15 @@ from filters.logs.estimate import LogEstimate
 from filters.logs.findings import findings
 from tests.filters.test_filter_paths import assert_paths_agree
 from tests.models import KEY, line_model, scalar_model, simulated, small
-from tests.numerics.test_angles import data_of, makers, plain_run, rotated
-from tests.plants.test_logs import MODEL
 from tests.slow import slow_but
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.replay import ReplayEnv
+from tests.thruster_env.core.test_angles import data_of, makers, plain_run, rotated
+from tests.thruster_env.logs.test_logs import MODEL
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.logs.log import Log
+from thruster_env.logs.read import read_log
 
 LOGS, LEVEL = 600, 3.9  # deviations that a binomial share stays within, but once in 10 000 seeds
 

@@ -10,10 +10,10 @@ from filters.consistency.nees import normalized_squares
 from filters.consistency.verdicts import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
-from thruster_cli import consistency
-from thruster_cli.tables import choice_table
-from thruster_cli.tuning_report import gains
-from thruster_env.numerics.compiled import interpreted
+from thruster_env.core.compiled import interpreted
+from tuning.cli import consistency
+from tuning.cli.tables import choice_table
+from tuning.cli.tuning_report import gains
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison

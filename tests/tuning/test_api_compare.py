@@ -14,9 +14,9 @@ from tests import pendulum_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair
-from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.fitting import default_filters
 from tuning.evaluation.knowledge import KNOWS, known

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import tuning
-from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from thruster_env.plants.logs.write import write_log
-from thruster_env.preset_file import read_preset
-from thruster_env.studies.identification import record
+from thruster_env.logs.write import write_log
+from thruster_env.thruster.preset_file import read_preset
+from tuning.experiments.identification import record
 
 FREE = ["motor_damping", "voltage_gain"]
 OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")

@@ -11,11 +11,11 @@ from filters import EstimateState
 from tests.pendulum_problem import problem as pendulum
 from tests.slow import slow_but
 from tests.small_problems import pair
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.logs.write import write_log
-from thruster_env.plants.simulate import simulate
+from thruster_env.logs.log import Log
+from thruster_env.logs.read import read_log
+from thruster_env.logs.write import write_log
+from thruster_env.model.affine import affine_model
+from thruster_env.model.simulate import simulate
 from tuning.api.problems import problem_of, problems_of
 from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem

@@ -17,9 +17,9 @@ import tuning
 from filters import EstimateState
 from filters.c.source import c_filter
 from filters.monitoring import Monitor
-from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_cli.tuning_report import as_json as tuning_as_json
-from thruster_cli.tuning_report import report
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tuning.cli.tuning_report import as_json as tuning_as_json
+from tuning.cli.tuning_report import report
 from tuning.problems.find import find_problem
 from tuning.reporting.lines_parts import lines_section
 
@@ -35,7 +35,7 @@ def study():
 
 def plain(data):
     """Numbers as JSON has them."""
-    from thruster_cli.output import as_text
+    from tuning.cli.output import as_text
 
     return json.loads(as_text(data))
 

@@ -9,9 +9,9 @@ import tuning
 from filters import EstimateState, Unknown, augmented_model, make_filter
 from filters.tuned_file import AUGMENTED, read_tuned_file
 from tests.models import scalar_model
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from thruster_env.training.setup import make_configuration
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned
+from tuning.policies.setup import make_configuration
 from tuning.problems.augmented import AugmentedProblem, augmented, name_and_unknown, unknowns_of
 from tuning.problems.find import find_given, find_problem
 from tuning.problems.model_problem import ModelProblem

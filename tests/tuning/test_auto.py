@@ -14,8 +14,8 @@ from rich.progress import Progress
 
 import tuning
 from filters.registry import FILTERS
-from thruster_cli.main import main
 from tuning.api.run import warn_of_few_trials
+from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned

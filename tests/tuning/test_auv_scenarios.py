@@ -4,13 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import auv_env  # noqa: F401 - registers the envs
 import thruster_env  # noqa: F401 - as well
-from auv_env.manoeuvres import MANOEUVRES
+import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState, make_filter, run
 from tests.slow import slow_but
 from tests.tuned_files import write_untuned
-from thruster_env.numerics.streams import episode_keys
+from thruster_env.auv.manoeuvres import MANOEUVRES
+from thruster_env.core.streams import episode_keys
 from tuning.auv.find import find_scenario
 from tuning.auv.scale import computed_scale
 from tuning.auv.scenarios import SAILING, SCENARIOS

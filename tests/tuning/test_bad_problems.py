@@ -7,7 +7,7 @@ from rich.console import Console
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.run import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem

@@ -11,9 +11,7 @@ from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair, thruster
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.studies import lorenz63
-from thruster_env.studies.benchmark import noise_free_problem
+from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -38,6 +36,8 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.residuals import noise_estimation, residuals
 from tuning.evaluation.summary import summarised, summary
 from tuning.evaluation.worth import warnings_of, worth
+from tuning.experiments import lorenz63
+from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.parameter import Parameter
 from tuning.reporting.gains import gains
 from tuning.search.correlations import correlations_of, full_covariance

@@ -7,8 +7,8 @@ import tuning
 from filters import make_filter
 from filters.consistency.blow_up import blow_up_sentence, root_mean_square
 from filters.consistency.verdicts import sentences
-from thruster_cli.tuning_report import as_json, report
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
+from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.runs_problem import RunsProblem
 

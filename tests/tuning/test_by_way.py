@@ -8,9 +8,9 @@ import pytest
 
 import tuning
 from tests.linear_problem import LinearProblem
-from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.ways.problems import linear
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
 from tuning.api import by_way
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from filters.augmented import Unknown
-from thruster_cli.main import main
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.plants.affine import affine_model
+from thruster_env.core.compiled import interpreted
+from thruster_env.model.affine import affine_model
+from tuning.cli.main import main
 from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison

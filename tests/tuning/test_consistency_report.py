@@ -22,9 +22,9 @@ from filters.consistency.verdicts import (
 from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members, record_members
 from tests.models import scalar_model
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.consistency_figures import consistency_figure
 from tuning.thruster.find import find_scenario

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from thruster_cli.templates import env as template
+from tuning.cli.templates import env as template
 from tuning.problems.digest import digest_of
 from tuning.problems.env_problem import EnvProblem
 

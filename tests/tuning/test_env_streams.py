@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from filters import EstimateState, StateSpaceModel
-from tests.numerics.test_streams import largest_correlation
 from tests.pendulum_problem import model as pendulum_model
-from thruster_env.plants.model_env import ModelEnv
+from tests.thruster_env.core.test_streams import largest_correlation
+from thruster_env.env.model_env import ModelEnv
 from tuning.problems.env_problem import EnvProblem
 
 SEEDS = range(40)

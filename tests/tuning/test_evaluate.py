@@ -7,8 +7,8 @@ from filters import affine_model, make_filter, thruster_model
 from filters.bounds import riccati_covariances
 from filters.consistency.nees import normalized_squares
 from filters.posterior import posterior_bound
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.plants import simulate
+from thruster_env.core.compiled import interpreted
+from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.runs import _means_over_steps
 from tuning.evaluation.tuned import summary
@@ -81,7 +81,7 @@ def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_e
 
 def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, data, ekf):
     from filters import run
-    from thruster_env.model import observe
+    from thruster_env.thruster.model import observe
 
     filter_ = oracle_choice("ekf", nominal).filter(nominal)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)

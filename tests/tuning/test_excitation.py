@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.control.controllers import PIController
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plant import make_plant
+from thruster_env.core.streams import episode_keys
+from thruster_env.thruster.control.controllers import PIController
+from thruster_env.thruster.plant import make_plant
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
 from tuning.thruster.excitation import ClosedLoop, voltages_of
 from tuning.thruster.find import find_scenario

@@ -9,11 +9,11 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite, write_untuned
-from thruster_env.training.setup import configuration_from_json, in_scenario, make_configuration
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
+from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.reporting.report import write_report
 from tuning.thruster.find import find_scenario
 

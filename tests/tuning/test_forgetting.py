@@ -7,7 +7,7 @@ import tuning
 from filters import affine_model, run
 from filters.consistency.intervals import Interval
 from tests.linear_problem import LinearProblem
-from thruster_cli.tuning_report import as_json, report, way_out
+from tuning.cli.tuning_report import as_json, report, way_out
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence
 from tuning.problems.model_problem import ModelProblem

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, affine_model, run
-from thruster_cli.tune import tune
-from thruster_cli.tuning_report import as_json, report
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model import simulate
+from tuning.cli.tune import tune
+from tuning.cli.tuning_report import as_json, report
 from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (

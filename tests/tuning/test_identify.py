@@ -11,9 +11,9 @@ import pytest
 
 from filters import ExtendedKalmanFilter, run
 from tests.filters.test_sensitivity import pendulum
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants import simulate
-from thruster_env.plants.logs.log import Log
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.logs.log import Log
+from thruster_env.model import simulate
 from tuning.identification import identify, profile_figure, profiles, validate
 from tuning.identification.family import ModelFamily, with_ranges
 from tuning.identification.result import covariance

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.continuous import ContinuousModel
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import in_any_steps
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.steps import in_any_steps
+from thruster_env.model.continuous import ContinuousModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification import identify
 from tuning.identification.objective import Objective
 from tuning.problems.coordinates import Coordinates

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 
 import tuning
-from thruster_env.numerics.streams import episode_keys
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.simulate import simulate
+from thruster_env.core.streams import episode_keys
+from thruster_env.model.affine import affine_model
+from thruster_env.model.simulate import simulate
 from tuning.identification.validation import validate
 from tuning.logs.identify import remarks
 

@@ -8,11 +8,11 @@ from filters.starts import Starts
 from tests.filters.test_sensitivity import pendulum
 from tests.models import random_affine
 from tests.tuning.test_identify import FREE, TRUTH, recorded
-from thruster_env.logged import Recorder, logged_model
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plant import make_plant
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.simulate import simulate
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.logs.log import Log
+from thruster_env.model.simulate import simulate
+from thruster_env.thruster.logged import Recorder, logged_model
+from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify, validate
 from tuning.identification.starts import starts_of
 from tuning.problems.data import Data

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.tuning.test_log_problem import GUESS, MODEL, logs_of
-from thruster_env.plants.logs.findings import Recording
-from thruster_env.plants.logs.log import Log, cut_at_gaps
-from thruster_env.plants.logs.read import read_log
-from thruster_env.plants.logs.write import write_columns
+from thruster_env.logs.findings import Recording
+from thruster_env.logs.log import Log, cut_at_gaps
+from thruster_env.logs.read import read_log
+from thruster_env.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.identify import split_runs
 from tuning.logs.problem import log_problem

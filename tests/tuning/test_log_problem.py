@@ -11,15 +11,15 @@ import pytest
 from filters import run
 from filters.likelihood import likelihood
 from pages import log_tables
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.simulate import simulate
-from thruster_env.studies.hidden_truth import hide_truth
+from thruster_env.logs.log import Log
+from thruster_env.model.affine import affine_model
+from thruster_env.model.simulate import simulate
 from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
 from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.experiments.hidden_truth import hide_truth
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
 from tuning.problems.check import checked_problem
@@ -97,7 +97,7 @@ def test_every_third_run_is_held_out_or_those_that_are_named():
         (lambda: LogProblem(logs_of(60), GUESS, lead=60), "a log must have at least 63 rows.*but run0 has 61"),
         (lambda: LogProblem(logs_of(15), GUESS), "at least 2 blocks with measurements held out, but run0 give 1"),
         (lambda: LogProblem(logs_of(200), GUESS, held_out=["x"]), "held out must be among run0, but got 'x'"),
-        (lambda: LogProblem([], GUESS), "logs must be some thruster_env.plants.logs.log.Log"),
+        (lambda: LogProblem([], GUESS), "logs must be some thruster_env.logs.log.Log"),
         (lambda: LogProblem(logs_of(200) * 2, GUESS), "must have different names, but got run0, run0"),
         (lambda: LogProblem(logs_of(200), GUESS, scale=[1.0]), "a scale must come with logs of all true states"),
         (

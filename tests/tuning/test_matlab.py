@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import thruster_cli
-from thruster_env.plants.affine import AffineModel
-from thruster_env.plants.state_space import StateSpaceModel
+import tuning.cli
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
 from tuning.reporting.matlab import function_name, matlab_function
 from tuning.reporting.traced import traced
@@ -101,7 +101,7 @@ def test_what_cannot_be_written_out_says_where():
 
 def test_the_template_that_thruster_new_writes_can_be_exported():
     names = {"__name__": "template"}
-    source = (Path(thruster_cli.__file__).parent / "templates" / "problem.py").read_text()
+    source = (Path(tuning.cli.__file__).parent / "templates" / "problem.py").read_text()
     exec(compile(source, "problem.py", "exec"), names)
     model = names["model"](4.0)
     text = matlab_function(Choice("ekf", {}, {}), model, "mine", 0.1)

@@ -8,10 +8,10 @@ import pytest
 import tuning
 from filters import StateSpaceModel, make_filter, run
 from filters.starts import WIDE, cov_of_measured_starts, wide_cov
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from tests.thruster_cli.test_cli_log_findings import OWN
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.logs.write import write_columns
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tests.tuning.cli.test_cli_log_findings import OWN
+from thruster_env.logs.write import write_columns
+from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.problem import log_problem
 from tuning.problems.log_problem import MEASURED

@@ -7,8 +7,8 @@ import pytest
 
 from tests.tuning.test_identify import FREE, TRUTH, pendulum, recorded
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
-from thruster_env.logged import Recorder
-from thruster_env.plant import make_plant
+from thruster_env.thruster.logged import Recorder
+from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify
 from tuning.identification.gates import kept_variance, lost_information
 from tuning.identification.null_tests import NullTest

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import tuning
-from thruster_env.numerics.characters import verbatim
-from thruster_env.plants.affine import affine_model
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.characters import verbatim
+from thruster_env.model.affine import affine_model
+from thruster_env.model.quantities import Quantity
 from tuning.api.progress import working
 from tuning.reporting.page import Table, markdown_page
 

@@ -7,7 +7,7 @@ import optuna
 import pytest
 
 from filters.consistency.intervals import Interval
-from thruster_cli.main import main
+from tuning.cli.main import main
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.sizes import SizeRow, sufficient_size
 from tuning.search.enqueued import BASELINE

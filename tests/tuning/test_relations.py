@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.tuning.ways.problems import linear, task_of
-from thruster_cli.app import app
+from tuning.cli.app import app
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE

@@ -10,7 +10,7 @@ import optuna
 import pytest
 
 from filters.consistency.intervals import Interval
-from thruster_cli.main import main
+from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned

@@ -8,7 +8,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState, run
 from filters.bounds import riccati_covariances
-from thruster_env.model import model_of_plant
+from thruster_env.thruster.model import model_of_plant
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
 from tuning.thruster.find import find_scenario
@@ -193,8 +193,8 @@ def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
 def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
     import tuning.problems.bound as module
 
-    monkeypatch.setattr("thruster_env.numerics.number_cache._known", {})
-    monkeypatch.setattr("thruster_env.numerics.compiled.CompiledOrPython.folder", None)  # nothing on the disk
+    monkeypatch.setattr("thruster_env.core.number_cache._known", {})
+    monkeypatch.setattr("thruster_env.core.compiled.CompiledOrPython.folder", None)  # nothing on the disk
     asked, computed = [], module.posterior_variances
     monkeypatch.setattr(
         module, "posterior_variances", lambda *given, **named: asked.append(1) or computed(*given, **named)

@@ -58,7 +58,7 @@ def posterior_variances(*given, **named):
     found["bounds"] += 1
     return computed(*given, **named)
 bound.posterior_variances = posterior_variances
-from thruster_cli.main import main
+from tuning.cli.main import main
 sys.argv[0] = "thruster"
 try:
     main()

@@ -2,7 +2,7 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
-from thruster_env.studies import lorenz63
+from tuning.experiments import lorenz63
 from tuning.search.filter_parameters import size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, distributions, parameters_of, trial_parameters, untuned_choice

@@ -7,7 +7,7 @@ from html import unescape
 import numpy as np
 import pytest
 
-from thruster_env.numerics.plots import BLUE, MOST_POINTS, RUST, panels, thinned
+from thruster_env.core.plots import BLUE, MOST_POINTS, RUST, panels, thinned
 from tuning.reporting.page import Code, Pair, Picture, Section, Table, html_page
 from tuning.reporting.svg import figure_svg, on_dark, plain
 

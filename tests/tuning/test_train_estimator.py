@@ -13,7 +13,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import Track, unit_scales
 from filters.learned.file import LEARNED, read
 from tests.models import plane_model
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.loss import Loss
 from tuning.learning.settings import Settings

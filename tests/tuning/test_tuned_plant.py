@@ -14,20 +14,20 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, thruster_model
 from filters.tuned_file import made_with
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import of_version, rewrite, write_untuned
-from thruster_env.effects.flow import Gusts
-from thruster_env.numerics.compiled import interpreted
-from thruster_env.parameters import PRESETS
-from thruster_env.plant import make_plant
-from thruster_env.plant_data import differences, plant_data
-from thruster_env.preset_file import PresetFile, write_preset
-from thruster_env.training.setup import make_configuration
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from thruster_env.core.compiled import interpreted
+from thruster_env.thruster.effects.flow import Gusts
+from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.plant_data import differences, plant_data
+from thruster_env.thruster.preset_file import PresetFile, write_preset
 from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.logs.problem import log_problem, problems_in
 from tuning.logs.read import as_tuned
+from tuning.policies.setup import make_configuration
 from tuning.problems.files import scenario_of
 from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan
@@ -109,7 +109,7 @@ def test_a_linear_system_is_another_plant(nominal):
 
 def test_a_model_of_one_s_own_and_a_file_of_before_are_not_compared(nominal, tmp_path):
     env = gym.make("BowThruster-v0", dt=0.02)
-    model = "thruster_env.model:thruster_model"
+    model = "thruster_env.thruster.model:thruster_model"
     assert EstimateState(env, tuned=str(nominal), model=model).filter.model.substeps == thruster_model().substeps
 
     path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), partial(of_version, version=2))

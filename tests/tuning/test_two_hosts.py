@@ -12,7 +12,7 @@ from tests.hosts import Refused, database, two_hosts
 from tuning.search.storage import PROCESS
 
 WORKERS, TRIALS, SECONDS = 2, 80, 120
-TUNE = "from thruster_cli.main import run; run()"
+TUNE = "from tuning.cli.main import run; run()"
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def test_a_killed_process_leaves_no_trial_in_a_finished_study(as_python, tmp_pat
 @pytest.mark.slow
 def test_two_commands_on_one_journal_end_it_together(tmp_path):
     options = f"tune --filter kf --problem nominal --no-pruning --trials 16 --study s --storage {tmp_path / 'j'}"
-    command = [sys.executable, "-m", "thruster_cli", *options.split()]
+    command = [sys.executable, "-m", "tuning.cli", *options.split()]
     processes = [
         subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         for _ in range(2)

@@ -8,7 +8,7 @@ from filters.consistency.intervals import RESAMPLES
 from filters.consistency.nees import normalized_squares, whitened
 from filters.consistency.report import consistency_report
 from tests.linear_problem import LinearProblem
-from thruster_env.plants.affine import affine_model
+from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.sizes import close_size
 from tuning.likelihood.gradient import goal_of

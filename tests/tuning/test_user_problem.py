@@ -18,9 +18,9 @@ from filters import EstimateState
 from filters.engine.batch import run
 from filters.tuned_file import read_tuned_file
 from tests import pendulum_problem
-from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite
-from thruster_env.numerics.compiled import interpreted
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned

@@ -7,7 +7,7 @@ import optuna
 import pytest
 
 from filters.tuned_file import sealed
-from thruster_cli.main import main
+from tuning.cli.main import main
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.verify import Difference, verify

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from thruster_env.numerics.modules import as_module, object_named, safe_paths
+from thruster_env.core.modules import as_module, object_named, safe_paths
 
-TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes thruster_cli multiprocessing".split()
+TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes tuning.cli multiprocessing".split()
 PROBLEM = """
-from thruster_cli.templates.env import SpringEnv, model
+from tuning.cli.templates.env import SpringEnv, model
 from tuning.problems.env_problem import EnvProblem
 import my_helper
 
@@ -53,8 +53,8 @@ def test_workers_run_no_file_beside_the_data(folder):
 
 @pytest.mark.slow
 def test_the_command_as_a_module_runs_no_file_beside_the_data_either(folder):
-    (folder / "thruster_cli.py").unlink()  # which is what Python itself would run
-    done = started(folder, sys.executable, "-m", "thruster_cli", "evaluate", "--filter", "ekf", "--seeds", "2",
+    (folder / "tuning.cli.py").unlink()  # which is what Python itself would run
+    done = started(folder, sys.executable, "-m", "tuning.cli", "evaluate", "--filter", "ekf", "--seeds", "2",
                    "--problem", "my_problem:problem")  # fmt: skip
     assert done.returncode == 0, done.stderr
 
@@ -65,7 +65,7 @@ def test_our_main_programs_and_processes_that_are_spawned_do_not_look_there_firs
     assert "JSONDecodeError" in done.stderr, "it is the worker, which was told nothing"
     spawn = """
 import multiprocessing, sys
-from thruster_env.numerics.modules import safe_paths
+from thruster_env.core.modules import safe_paths
 sys.path[:] = [one for one in sys.path if one]
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")

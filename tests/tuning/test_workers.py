@@ -17,7 +17,7 @@ import pytest
 import typer
 from optuna.trial import TrialState
 
-from thruster_cli.app import app
+from tuning.cli.app import app
 from tuning.search.plan import Plan
 from tuning.search.samplers import make_sampler
 from tuning.search.space import distributions
@@ -108,7 +108,7 @@ def postgres():
 @pytest.mark.slow
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_finished(tmp_path):
     journal, tuned = tmp_path / "j", tmp_path / "tuned.json"
-    command = "from thruster_cli.main import run; run()"
+    command = "from tuning.cli.main import run; run()"
     arguments = (
         f"tune --workers 2 --trials 100000 --no-pruning --study s --storage {journal} --out {tuned}".split()
     )

@@ -24,8 +24,8 @@ from tests.users import (
     range_bearing,
     reactor,
 )
-from thruster_env.studies.users.runs import PANEL, found_problems, name_of
 from tuning.evaluation.evaluate import evaluate
+from tuning.experiments.users.runs import PANEL, found_problems, name_of
 
 PAGES = (
     altitude,

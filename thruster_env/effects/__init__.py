@@ -1,1 +1,1 @@
-"""Disturbances of a thruster: amplifier, ambient flow, reference signals and uncertain parameters."""
+"""Disturbances of any plant: effects as frozen values, sensor effects and recorded series."""

@@ -11,7 +11,7 @@ from filters.estimators.find import label_of
 from filters.filter import Filter
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import at_least, short_repr
+from thruster_env.core.checks import at_least, short_repr
 from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
 from tuning.api.problems import given_for, is_filter, problems_of

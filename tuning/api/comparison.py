@@ -11,9 +11,9 @@ import numpy as np
 
 from filters.consistency.intervals import Interval, slightly
 from filters.plot_styles import colour_of
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import panels
-from thruster_env.numerics.text_tables import plain_text
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import panels
+from thruster_env.core.text_tables import plain_text
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from filters.logs.estimate import estimate as estimate_log
 from filters.logs.findings import findings
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 from tuning.api.estimates import LogEstimates
 from tuning.logs.model_of_logs import model_of_logs
 from tuning.logs.problem import name_of

@@ -17,8 +17,8 @@ from filters.logs.estimate import LogEstimate
 from filters.logs.findings import LogFindings
 from filters.logs.verdict import verdict
 from filters.monitoring.monitor import Monitor, monitor_of
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.write import write_columns
+from thruster_env.logs.log import Log
+from thruster_env.logs.write import write_columns
 from tuning.api.showing import drawn, frame, html, number
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
 if TYPE_CHECKING:
-    from thruster_env.plants.state_space import StateSpaceModel
+    from thruster_env.model.state_space import StateSpaceModel
 
 NOMINAL = "nominal"  # the problem of a filter that is not tuned, where none is named
 

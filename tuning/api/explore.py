@@ -6,7 +6,7 @@ import html
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 from tuning.api.evaluate import subject_of
 from tuning.api.problems import problem_of
 from tuning.api.study import Study

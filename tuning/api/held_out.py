@@ -12,8 +12,8 @@ from filters.consistency.intervals import Interval
 from filters.consistency.report import ConsistencyReport
 from filters.estimators.find import label_of
 from filters.filter import Filter
-from thruster_env.numerics.checks import at_least
-from thruster_env.numerics.text_tables import plain_text
+from thruster_env.core.checks import at_least
+from thruster_env.core.text_tables import plain_text
 from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import RULE, TUNED, baselines

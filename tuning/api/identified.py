@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.showing import drawn, frame, html
 from tuning.identification.profiles import profile_figure, profiles
 from tuning.identification.result import Identification

@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.console import Console
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.logs.log import Log
+from thruster_env.core.checks import short_repr
+from thruster_env.logs.log import Log
 from tuning.api.identified import Identified
 from tuning.api.progress import console_for
 from tuning.identification.excitation import check_excitation

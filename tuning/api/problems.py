@@ -8,8 +8,8 @@ from typing import Any
 from filters.estimators.find import is_foreign, is_trained
 from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.modules import is_code
+from thruster_env.core.checks import short_repr
+from thruster_env.core.modules import is_code
 from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named

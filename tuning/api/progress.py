@@ -19,8 +19,8 @@ from rich.progress import (
 from rich.text import Text
 
 from filters.estimators.find import label_of
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.progress import listening
+from thruster_env.core.checks import short_repr
+from thruster_env.core.progress import listening
 from tuning.api.notebook import NotebookLine
 from tuning.evaluation.knowledge import TUNING
 from tuning.search.interruption import STOPPING

@@ -10,8 +10,8 @@ from typing import Any
 import optuna
 from optuna.study import StudyDirection
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.files import check_target, write_whole
+from thruster_env.core.checks import short_repr
+from thruster_env.core.files import check_target, write_whole
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.run import quiet_optuna

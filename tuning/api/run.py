@@ -12,8 +12,8 @@ from typing import NamedTuple
 from rich.console import Console
 
 from filters.estimators.find import label_of
-from thruster_env.numerics.checks import at_least, one_of, short_repr
-from thruster_env.numerics.files import check_target
+from thruster_env.core.checks import at_least, one_of, short_repr
+from thruster_env.core.files import check_target
 from tuning.api.by_way import Followed, answered, check_way, follow, way_sentence
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out

@@ -13,7 +13,7 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.estimators.find import label_of
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor
-from thruster_env.numerics.text_tables import plain_text
+from thruster_env.core.text_tables import plain_text
 from tuning.api.held_out import HeldOut
 from tuning.api.run import Tuning
 from tuning.api.showing import about, drawn, frame, html, number

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
 from tuning.api.run import aim_of, run_tuning, with_budget

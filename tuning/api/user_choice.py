@@ -6,7 +6,7 @@ from typing import Any
 
 from filters.filter import Filter
 from filters.registry import filter_type
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice, untuned_choice

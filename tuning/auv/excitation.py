@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from auv_env.manoeuvres import MANOEUVRES
-from auv_env.plant import Plant
-from thruster_env.numerics.checks import one_of
-from thruster_env.plants.disturbances.effects import set_field
+from thruster_env.auv.manoeuvres import MANOEUVRES
+from thruster_env.auv.plant import Plant
+from thruster_env.core.checks import one_of
+from thruster_env.effects.effects import set_field
 from tuning.problems.excitation import EXCITATIONS, Excitation
 
 TORQUE = 1  # index of K_prop among the inputs of a manoeuvre

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 from tuning.auv.scenario import Scenario
 
 SEQUENCES = 200  # input sequences for a stored scale

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from auv_env.channels import MAX_CHANNELS
-from auv_env.model import MODELS, model_of_plant, state_range
-from auv_env.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
-from auv_env.plant_data import check_same_plant, plant_data
-from auv_env.quantities import STATES
-from auv_env.simulation import simulate
 from filters.bounds import path_bound
 from filters.wrapped import wrapped_variances
-from thruster_env.numerics.checks import one_of, positive, short_repr, vector
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.auv.channels import MAX_CHANNELS
+from thruster_env.auv.model import MODELS, model_of_plant, state_range
+from thruster_env.auv.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
+from thruster_env.auv.plant_data import check_same_plant, plant_data
+from thruster_env.auv.quantities import STATES
+from thruster_env.auv.simulation import simulate
+from thruster_env.core.checks import one_of, positive, short_repr, vector
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.auv.excitation import commands_of
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
@@ -45,7 +45,7 @@ class Scenario(BaseScenario):
             path: fixed numbers, computed by `scale.computed_scale`.
         states: those of the model, "velocities" (6), "motion" (8), "navigation" (12) or "current" (14). With
             "velocities" roll and pitch are inputs, true ones.
-        preset: the vehicle, as for `auv_env.plant.make_plant`; so are all that follow.
+        preset: the vehicle, as for `thruster_env.auv.plant.make_plant`; so are all that follow.
         dt: sample time [s].
         propeller_torque: divided by thrust [m]; None makes the torque an input.
         initial_state: None, twelve numbers, or a mapping.
@@ -94,7 +94,7 @@ class Scenario(BaseScenario):
     @property
     def env_id(self) -> str:
         """`SegorogeniAUV-v0`."""
-        return "auv_env:SegorogeniAUV-v0"
+        return "thruster_env.auv:SegorogeniAUV-v0"
 
     @property
     def plant_arguments(self) -> dict:
@@ -109,7 +109,7 @@ class Scenario(BaseScenario):
         return make_plant(**self.plant_arguments)
 
     def model(self, **changes) -> StateSpaceModel:
-        """What the filter assumes; changes are arguments of `auv_env.model.model_of_plant`."""
+        """What the filter assumes; changes are arguments of `thruster_env.auv.model.model_of_plant`."""
         held = {"states": self.states, "parameter_factors": dict(self.parameter_factors) or None}
         return model_of_plant(self.plant, **{**held, **changes})
 

@@ -11,7 +11,7 @@ import math
 import sys
 from typing import Any
 
-from auv_env.plant import make_plant
+from thruster_env.auv.plant import make_plant
 from tuning.auv.excitation import OfManoeuvre
 from tuning.auv.scale import computed_scale
 from tuning.auv.scenario import Scenario

@@ -17,7 +17,7 @@ from filters.engine.batch import run
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_type, make_filter
-from thruster_env.numerics.checks import one_of
+from thruster_env.core.checks import one_of
 from tuning.evaluation.evaluate import (
     Evaluation,
     compute_metrics,

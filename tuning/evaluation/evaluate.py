@@ -26,7 +26,7 @@ from filters.ensembles.recording import record_members
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.restarts import Restarts, restarts_of
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data, runs_of

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from thruster_env.numerics.progress import told
+from thruster_env.core.progress import told
 from tuning.evaluation.baselines import (
     BY_IMPORTANCE,
     GIVEN,

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from filters.registry import filter_type
-from thruster_env.numerics.progress import tell
+from thruster_env.core.progress import tell
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,

@@ -10,7 +10,7 @@ import numpy as np
 from filters.consistency.nees import sums_of_squares, whitened
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from thruster_env.numerics.angles import difference, is_angle
+from thruster_env.core.angles import difference, is_angle
 from tuning.problems.data import Data
 
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite

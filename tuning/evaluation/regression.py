@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from filters.consistency.intervals import Interval, mean_interval
-from thruster_env.numerics.angles import is_angle
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import is_angle
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.problems.data import Data
 

@@ -13,7 +13,7 @@ import numpy as np
 from filters.consistency.nees import normalized_squares
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from thruster_env.numerics.angles import difference
+from thruster_env.core.angles import difference
 from tuning.evaluation.log_scores import log_scores_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data, where_true
 from tuning.problems.in_parts import estimates_in_parts

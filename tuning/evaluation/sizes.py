@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.posterior import ALL_UP_TO
-from thruster_env.numerics.progress import told
+from thruster_env.core.progress import told
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts

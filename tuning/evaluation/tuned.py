@@ -28,9 +28,9 @@ from filters.tuned_file import (
     sealed,
 )
 from filters.tuned_model import check_same_quantities, model_data
-from thruster_env.numerics.checks import at_least, covariance, positive, short_repr
-from thruster_env.numerics.files import write_whole
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import at_least, covariance, positive, short_repr
+from thruster_env.core.files import write_whole
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.stored import ROLES, comparison_as_data, sizes_as_data

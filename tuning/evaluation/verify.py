@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import metrics, problem_in, read_tuned
 from tuning.evaluation.versions import versions

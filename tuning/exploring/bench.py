@@ -8,8 +8,8 @@ from functools import cached_property
 
 from filters.filter import Filter
 from filters.registry import FILTERS
-from thruster_env.numerics.checks import at_least, one_of, short_repr
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.checks import at_least, one_of, short_repr
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.exploring.disturbed import disturbed
 from tuning.exploring.exported import command_of, file_of, lines_of

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 from tuning.exploring.bench import Bench
 from tuning.exploring.view import View
 

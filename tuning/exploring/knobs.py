@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import at_least, between, one_of
+from thruster_env.core.checks import at_least, between, one_of
 from tuning.evaluation.baselines import TUNED, baselines
 from tuning.exploring.disturbed import disturbances_of
 from tuning.problems.parameter import Parameter

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.streams import filter_keys
+from thruster_env.core.streams import filter_keys
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem

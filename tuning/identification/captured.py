@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from filters.pages.traced import traced_model
-from thruster_env.numerics.algebra.graphs import Number
-from thruster_env.numerics.algebra.tracing import traced
-from thruster_env.numerics.captured import captured_numbers, differ_in_numbers_alone, with_numbers
-from thruster_env.numerics.derivatives import by_complex_step
-from thruster_env.numerics.equal_functions import bound_call
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import AnyStepModel, in_any_steps
+from thruster_env.core.captured import captured_numbers, differ_in_numbers_alone, with_numbers
+from thruster_env.core.derivatives import by_complex_step
+from thruster_env.core.equal_functions import bound_call
+from thruster_env.graphs.graphs import Number
+from thruster_env.graphs.tracing import traced
+from thruster_env.logs.steps import AnyStepModel, in_any_steps
+from thruster_env.model.state_space import StateSpaceModel
 
 FUNCTIONS = "transition", "observe", "transition_jacobian", "observe_jacobian"
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thruster_env.plants.logs.log import Log
+from thruster_env.logs.log import Log
 from tuning.identification.objective import Objective
 from tuning.identification.result import covariance, is_narrow
 

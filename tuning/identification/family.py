@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.checks import finite, short_repr
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import finite, short_repr
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.parameter import Parameter, squared
 from tuning.search.parameters import r_name
 

@@ -10,10 +10,10 @@ from functools import partial
 import numpy as np
 
 from filters.starts import Starts
-from thruster_env.numerics.checks import at_least, short_repr
-from thruster_env.numerics.streams import START_POINTS, derived_generator
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.streams import START_POINTS, derived_generator
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.null_tests import NullTest, from_nothing, null_tests
 from tuning.identification.objective import Objective

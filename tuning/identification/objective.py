@@ -15,9 +15,9 @@ from filters.differentiated.runs import same_functions
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
-from thruster_env.numerics.checks import one_of, short_repr
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import one_of, short_repr
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.captured import CapturedConstants
 from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of

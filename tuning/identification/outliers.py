@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.adaptive.robust import RobustExtendedKalmanFilter
 from filters.starts import Starts
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.objective import Objective
 from tuning.identification.runs import runs_of
 from tuning.identification.starts import estimates_of

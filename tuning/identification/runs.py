@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.steps import in_steps
+from thruster_env.core.checks import short_repr
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import Log
+from thruster_env.logs.steps import in_steps
 from tuning.problems.data import Data, mask_of, padded
 from tuning.problems.log_checks import check_times
 
@@ -18,7 +18,7 @@ from tuning.problems.log_checks import check_times
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
-    Logs on their own stamps have step ratios as their last input (`thruster_env.plants.steps`).
+    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.steps`).
 
     Raises:
         ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.

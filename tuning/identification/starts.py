@@ -11,8 +11,8 @@ from filters.engine.batch import Estimates, run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts, as_the_prior_says, wide_cov
-from thruster_env.numerics.angles import difference
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import difference
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.log_parts import LEAD
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from filters.engine.batch import Estimates
 from filters.starts import Starts, as_the_prior_says
-from thruster_env.numerics.angles import difference, on_one_branch
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import difference, on_one_branch
+from thruster_env.core.sources import as_value
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.result import Identification
 from tuning.identification.starts import estimates_of, starts_of
 from tuning.problems.data import Data

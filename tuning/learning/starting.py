@@ -13,8 +13,8 @@ from filters.learned import read_estimator
 from filters.learned.equations import Equations
 from filters.learned.estimator import LearnedEstimator, Scales
 from filters.learned.file import LEARNED
-from thruster_env.numerics.angles import wrapped_where
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import wrapped_where
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import ORACLE, baselines
 from tuning.evaluation.evaluate import values_of
 from tuning.problems.data import Data

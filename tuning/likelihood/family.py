@@ -12,8 +12,8 @@ from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_fu
 from filters.estimators.find import is_foreign
 from filters.pages.page_filter import PageFilter
 from filters.registry import filter_type, make_filter
-from thruster_env.numerics.checks import one_of
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import one_of
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.noise import TunedCovariance
 from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data

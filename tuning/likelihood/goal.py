@@ -10,9 +10,9 @@ from filters.consistency.intervals import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import ModelSlopes, Truth
 from filters.likelihood import Likelihood
-from thruster_env.numerics.checks import one_of
-from thruster_env.numerics.sources import is_array
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import one_of
+from thruster_env.core.sources import is_array
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.family import Family
 from tuning.problems.data import Data

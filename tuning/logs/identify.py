@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.modules import object_named
-from thruster_env.plants.continuous import in_discrete_time
-from thruster_env.plants.logs.findings import has_outliers, remarks_on
-from thruster_env.plants.logs.log import Log, cut_at_gaps
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import in_any_steps
+from thruster_env.core.checks import short_repr
+from thruster_env.core.modules import object_named
+from thruster_env.logs.findings import has_outliers, remarks_on
+from thruster_env.logs.log import Log, cut_at_gaps
+from thruster_env.logs.steps import in_any_steps
+from thruster_env.model.continuous import in_discrete_time
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
 from tuning.identification.values import write_values

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.modules import is_code
-from thruster_env.plants.continuous import ContinuousModel
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.recorders.registry import ENDINGS
-from thruster_env.plants.logs.table import SUFFIXES
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.core.modules import is_code
+from thruster_env.logs.log import Log
+from thruster_env.logs.recorders.registry import ENDINGS
+from thruster_env.logs.table import SUFFIXES
+from thruster_env.model.continuous import ContinuousModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.plant_packages import logs_package
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from filters.tuned_file import made_with, read_tuned_file, tune_options
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.replay import read_for
+from thruster_env.core.checks import short_repr
+from thruster_env.env.replay import read_for
+from thruster_env.logs.log import Log
 from tuning.logs.read import check_model, read_named, texts
 from tuning.problems.augmented import name_and_unknown
 from tuning.problems.find import named

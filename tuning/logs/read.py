@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from filters.tuned_file import read_tuned_file, tune_options
-from thruster_env.numerics.checks import finite, short_repr
-from thruster_env.numerics.modules import object_named
-from thruster_env.plants.continuous import in_discrete_time
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.replay import ANY_DT, read_for
+from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.modules import object_named
+from thruster_env.env.replay import ANY_DT, read_for
+from thruster_env.logs.log import Log
+from thruster_env.model.continuous import in_discrete_time
 from tuning.problems.plant_packages import logs_package
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line

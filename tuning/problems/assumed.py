@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from filters.tuned_file import NOISE, PRIOR
-from thruster_env.numerics.angles import on_one_branch
-from thruster_env.numerics.checks import at_least, positive, short_repr
-from thruster_env.numerics.modules import said
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import on_one_branch
+from thruster_env.core.checks import at_least, positive, short_repr
+from thruster_env.core.modules import said
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter

@@ -13,8 +13,8 @@ import numpy as np
 
 from filters.augmented import Unknown, augmented_model
 from filters.tuned_file import AUGMENTED, PRIOR
-from thruster_env.numerics.checks import one_of, positive, short_repr
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import one_of, positive, short_repr
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import rows_argument
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from filters.posterior import gathering_code, posterior_variances, sequences_taken
-from thruster_env.numerics.number_cache import cached_numbers
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.number_cache import cached_numbers
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 

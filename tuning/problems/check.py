@@ -7,10 +7,10 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.quantities import Quantities, Quantity
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.core.sources import as_value
+from thruster_env.model.quantities import Quantities, Quantity
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 

@@ -14,14 +14,10 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
-from thruster_env.numerics.compiled import package_of, registered_packages
+from thruster_env.core.user_functions import OURS
 
 Of = Callable[[Any], Iterator[str]]  # texts of a value
-OURS = {
-    "tuning",
-    "thruster_env.training",
-    "thruster_cli",
-}  # compile nothing; studies are as a user's
+EXPERIMENTS = "tuning.experiments."  # whose problems are as a user's
 INSTALLED = ("site-packages", "dist-packages")
 ABOUT_A_MODULE = {"__name__", "__file__", "__doc__", "__spec__", "__package__", "__loader__", "__builtins__"}
 NO_MEMBERS = {  # of a class: what Python writes into it
@@ -151,13 +147,18 @@ def within(value: Any) -> Any:
     return None
 
 
+def is_ours(module: str) -> bool:
+    """Whether a module is this project's, experiments apart."""
+    return module.partition(".")[0] in OURS and not module.startswith(EXPERIMENTS)
+
+
 def is_of_a_library(module: str | None) -> bool:
     """Whether a module is this project's, of the standard library or installed, by its name."""
     name = module or ""
-    package = package_of(name)
+    package = name.partition(".")[0]
     if package == "__main__":
         return False
-    if package in OURS or package in registered_packages() or package in sys.stdlib_module_names:
+    if is_ours(name) or package in sys.stdlib_module_names:
         return True
     files = (getattr(sys.modules.get(one), "__file__", None) or "" for one in (name, package))
     return any(folder in file for file in files for folder in INSTALLED)
@@ -165,8 +166,7 @@ def is_of_a_library(module: str | None) -> bool:
 
 def keeps_plain_attributes(module: str | None) -> bool:
     """Whether a module is this project's or the user's: what their objects hold says all of them."""
-    package = package_of(module or "")
-    return package in OURS or package in registered_packages() or not is_of_a_library(module)
+    return is_ours(module or "") or not is_of_a_library(module)
 
 
 def name_of(value: Any) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thruster_env.numerics.checks import finite, short_repr
+from thruster_env.core.checks import finite, short_repr
 from tuning.problems.parameter import Parameter
 
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale

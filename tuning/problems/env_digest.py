@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from thruster_env.numerics.global_generators import GlobalGenerators
+from thruster_env.core.global_generators import GlobalGenerators
 from tuning.problems.code_digest import is_of_a_library
 from tuning.problems.digest import digest_of, held_by, layers
 

@@ -9,10 +9,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import as_floats, covariance, short_repr
-from thruster_env.numerics.global_generators import GlobalGenerators
-from thruster_env.numerics.modules import said
-from thruster_env.numerics.streams import (
+from thruster_env.core.checks import as_floats, covariance, short_repr
+from thruster_env.core.global_generators import GlobalGenerators
+from thruster_env.core.modules import said
+from thruster_env.core.streams import (
     ACTION_SPACE,
     ADDED_NOISE,
     GLOBAL_GENERATORS,
@@ -21,7 +21,7 @@ from thruster_env.numerics.streams import (
     episode_keys,
     filter_keys,
 )
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from thruster_env.numerics.checks import covariance_root
-from thruster_env.numerics.global_generators import GlobalGenerators
-from thruster_env.numerics.streams import ADDED_NOISE, GLOBAL_GENERATORS, derived_seed, draw_key, normal_block
+from thruster_env.core.checks import covariance_root
+from thruster_env.core.global_generators import GlobalGenerators
+from thruster_env.core.streams import ADDED_NOISE, GLOBAL_GENERATORS, derived_seed, draw_key, normal_block
 from tuning.problems.model_problem import NamedArguments
 
 if TYPE_CHECKING:

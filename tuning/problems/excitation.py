@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.numerics.checks import at_least, finite, positive, vector
-from thruster_env.numerics.streams import EXCITATION, uniform_block
-from thruster_env.plants.disturbances.effects import LONGEST, Effect, Registry, set_field
-from thruster_env.plants.disturbances.sensors import probability
+from thruster_env.core.checks import at_least, finite, positive, vector
+from thruster_env.core.streams import EXCITATION, uniform_block
+from thruster_env.effects.effects import LONGEST, Effect, Registry, set_field
+from thruster_env.effects.sensors import probability
 
 EXCITATIONS = Registry("excitation")
 MOST_STEPS = int(LONGEST)  # for which a level is held

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.checks import FEW, any_case, meant, short_repr
-from thruster_env.numerics.modules import is_code, object_named, said
+from thruster_env.core.checks import FEW, any_case, meant, short_repr
+from thruster_env.core.modules import is_code, object_named, said
 from tuning.problems.augmented import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario

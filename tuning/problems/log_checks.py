@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.plants.diffusion import same_dt
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.logs.overlap import shared_by
+from thruster_env.core.checks import short_repr
+from thruster_env.logs.log import Log
+from thruster_env.logs.overlap import shared_by
+from thruster_env.model.diffusion import same_dt
 
 
 def checked_logs(given: Any) -> tuple[Log, ...]:
     """Logs of one problem as a tuple; ValueError unless they have one sample time and different names."""
     logs = (given,) if isinstance(given, Log) else tuple(given) if isinstance(given, Sequence) else ()
     if not logs or not all(isinstance(log, Log) for log in logs):
-        raise ValueError(f"logs must be some thruster_env.plants.logs.log.Log, but got {short_repr(given)}")
+        raise ValueError(f"logs must be some thruster_env.logs.log.Log, but got {short_repr(given)}")
     check_times(logs)
     names = [log.name for log in logs]
     if len(set(names)) < len(names):

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.numerics.checks import at_least, short_repr
-from thruster_env.plants.logs.log import Log
+from thruster_env.core.checks import at_least, short_repr
+from thruster_env.logs.log import Log
 
 LEAD = 50  # steps at the start of a block that are filtered and not scored
 WANTED = 72  # approximate number of blocks that logs are cut into: tests and standard errors need many
@@ -94,7 +94,7 @@ def parts_of(
 ) -> Parts:
     """Cut logs into blocks for training, for the choice of the ensemble size, and for held-out evaluation.
 
-    Each run is cut at its gaps (`thruster_env.plants.logs.log.Log.pieces`), and each piece into consecutive blocks
+    Each run is cut at its gaps (`thruster_env.logs.log.Log.pieces`), and each piece into consecutive blocks
     of one length, so that they can be compared with one another; a block's lead-in are the rows before it, and the
     first rows of a piece that make no block belong to its first lead-in. A block that is measured in less than a
     quarter of the usual share of its rows is left out. Held out are the named runs, else every third run of three

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
-from thruster_env.numerics.checks import at_least, one_of
-from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.logs.findings import remarks_on
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.replay import ReplayEnv
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.plants.steps import as_rows, in_any_steps
+from thruster_env.core.checks import at_least, one_of
+from thruster_env.core.streams import filter_keys
+from thruster_env.env.replay import ReplayEnv
+from thruster_env.logs.findings import remarks_on
+from thruster_env.logs.log import Log
+from thruster_env.logs.steps import as_rows, in_any_steps
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
@@ -48,7 +48,7 @@ class LogProblem(AssumedProblem):
     blocks may differ in length, and each counts in full; where true states are known at some steps only, these
     are scored.
 
-    Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.plants.steps`), without
+    Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.logs.steps`), without
     true states, and a tuned file is for the model of a step of dt.
 
     Without true states there is no scale, and the negative log-likelihood of the innovations is minimised. The

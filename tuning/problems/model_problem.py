@@ -12,12 +12,12 @@ import numpy as np
 from filters.baselines.baselines import OpenLoop
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE, PRIOR
-from thruster_env.numerics.angles import difference
-from thruster_env.numerics.checks import as_floats, short_repr
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plants.model_env import ModelEnv
-from thruster_env.plants.simulate import simulate
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import difference
+from thruster_env.core.checks import as_floats, short_repr
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.env.model_env import ModelEnv
+from thruster_env.model.simulate import simulate
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.bound import average_bound
 from tuning.problems.check import check_quantities

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from optuna.distributions import FloatDistribution, IntDistribution
 
-from thruster_env.numerics.checks import at_least, finite, short_repr
+from thruster_env.core.checks import at_least, finite, short_repr
 
 
 class Place(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 
 DEEPEST = 10  # levels of mappings and lists
 

@@ -10,8 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.numerics.checks import short_repr
-from thruster_env.numerics.streams import POLICY, RANDOM_ACTIONS, derived_generator, derived_seed
+from thruster_env.core.checks import short_repr
+from thruster_env.core.streams import POLICY, RANDOM_ACTIONS, derived_generator, derived_seed
 from tuning.problems.excitation import Excitation, excitation_of
 
 Policy = str | Mapping | Excitation | Callable

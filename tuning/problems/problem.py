@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.plants.quantities import Quantities
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.quantities import Quantities
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import seeds
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from filters.starts import PRIOR
-from thruster_env.numerics.checks import as_floats, short_repr
-from thruster_env.plants.logs.columns import STATE
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import as_floats, short_repr
+from thruster_env.logs.columns import STATE
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import FIRST_SCORED_STEP
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.parameter import Parameter

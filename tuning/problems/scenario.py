@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 
-from thruster_env.numerics.checks import at_least, short_repr, vector
-from thruster_env.plants.env import as_json
+from thruster_env.core.checks import at_least, short_repr, vector
+from thruster_env.env.env import as_json
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.excitation import Excitation, Steps, excitation_of
 from tuning.problems.plain import frozen, plain

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.checks import at_least
+from thruster_env.core.checks import at_least
 
 MOST_SEEDS = 20_000  # runs of 500 steps with so many seeds take a gigabyte
 SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on ...

@@ -15,8 +15,8 @@ from filters.consistency.report import ConsistencyReport
 from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
 from filters.plot_styles import colour_of
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import BLUE, DARK, RUST, panels, save_figure
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import BLUE, DARK, RUST, panels, save_figure
 from tuning.reporting.panels import COLUMNS, plotted_states
 
 if TYPE_CHECKING:

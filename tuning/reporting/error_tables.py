@@ -9,8 +9,8 @@ import numpy as np
 from rich.table import Table
 
 from filters.consistency.intervals import Interval
-from thruster_env.numerics.text_tables import table
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.text_tables import table
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.evaluate import Evaluation
 
 ABOVE = "above\n[%]"  # head of the columns that need a bound

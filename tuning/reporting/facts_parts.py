@@ -8,7 +8,7 @@ from math import isfinite, sqrt
 from optuna.trial import TrialState
 
 from filters.registry import filter_type
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.versions import versions
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem
 from tuning.reporting.page import Section, Table, Words

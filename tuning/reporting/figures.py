@@ -10,8 +10,8 @@ import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.plot_styles import colour_of
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, plotted_states

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from filters.consistency.intervals import slightly
-from thruster_env.numerics.text_tables import table
+from thruster_env.core.text_tables import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import belief_sentences, noise_sentence

@@ -10,8 +10,8 @@ import re
 
 import numpy as np
 
-from thruster_env.plants.affine import AffineModel
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.reporting.traced import traced
 from tuning.search.space import Choice
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from textwrap import wrap
 
-from thruster_env.numerics.characters import verbatim
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.characters import verbatim
+from thruster_env.model.quantities import Quantity
 
 MOST_PANELS = 6  # of states in one figure
 COLUMNS = 3  # of panels side by side

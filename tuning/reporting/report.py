@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from filters.registry import filter_type
-from thruster_env.numerics.files import check_target, write_whole
+from thruster_env.core.files import check_target, write_whole
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.stored import stored_comparison, stored_sizes

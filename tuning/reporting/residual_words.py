@@ -6,7 +6,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval, span
 from filters.consistency.verdicts import confidence, mean_sentence
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation

@@ -6,7 +6,7 @@ import numpy as np
 
 from filters.consistency.verdicts import sentences
 from filters.registry import filter_type
-from thruster_env.numerics.sources import is_array
+from thruster_env.core.sources import is_array
 from tuning.evaluation.baselines import TUNED, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison

@@ -9,12 +9,12 @@ import numpy as np
 
 from filters.filter import Filter
 from filters.plot_styles import MEASURED, colour_of
-from thruster_env.numerics.angles import wrapped, wrapped_where
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import GREY, new_figure, thinned, tidy
-from thruster_env.numerics.sources import as_value
-from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.angles import wrapped, wrapped_where
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import GREY, new_figure, thinned, tidy
+from thruster_env.core.sources import as_value
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.reporting.panels import axis_label, plotted_states
 from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, line_of, one_run

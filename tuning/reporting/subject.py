@@ -10,7 +10,7 @@ from typing import NamedTuple
 import optuna
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.numerics.checks import at_least, short_repr
+from thruster_env.core.checks import at_least, short_repr
 from tuning.evaluation.tuned import problem_in, read_tuned
 from tuning.evaluation.versions import versions
 from tuning.problems.find import find_given

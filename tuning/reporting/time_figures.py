@@ -12,10 +12,10 @@ import numpy as np
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from filters.plot_styles import TRUTH, colour_of
-from thruster_env.numerics.angles import with_breaks, wrapped_where
-from thruster_env.numerics.characters import TITLE, verbatim
-from thruster_env.numerics.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
-from thruster_env.plants.quantities import Quantity
+from thruster_env.core.angles import with_breaks, wrapped_where
+from thruster_env.core.characters import TITLE, verbatim
+from thruster_env.core.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
 from tuning.reporting.limits import limit_errors, limit_values

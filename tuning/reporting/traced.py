@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from thruster_env.numerics.user_functions import needs_floats
+from thruster_env.core.user_functions import needs_floats
 from tuning.reporting import symbols
 from tuning.reporting.symbols import Branch, Symbol, Tape, on_symbols, text
 

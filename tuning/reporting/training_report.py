@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from filters.filter import Filter
-from thruster_env.numerics.files import write_whole
+from thruster_env.core.files import write_whole
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
 from tuning.reporting.alternatives import of_estimates

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from thruster_env.numerics.files import write_whole
+from thruster_env.core.files import write_whole
 from tuning.evaluation.evaluate import evaluate, likelihood_gain, score_ratio
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page

@@ -14,8 +14,8 @@ from contextlib import suppress
 import numpy as np
 
 from filters.engine.batch import run
-from thruster_env.numerics.compiled import is_interpreting
-from thruster_env.numerics.threads import cores
+from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.processes import end, orders_of, parent_says_stop, plan_of, read_orders, start

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from thruster_env.numerics.progress import tell
+from thruster_env.core.progress import tell
 
 STOPPING = "stopping after the running task; Ctrl-C again stops at once"
 

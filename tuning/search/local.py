@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 
-from thruster_env.numerics.streams import LOCAL_TRIALS, derived_generator
+from thruster_env.core.streams import LOCAL_TRIALS, derived_generator
 from tuning.search.plan import Plan
 
 LARGEST = 0.1  # step over the width of a linear range; over a decade of a logarithmic one it is ten times this ...

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import one_of, short_repr
+from thruster_env.core.checks import one_of, short_repr
 from tuning.evaluation.evaluate import Evaluation, mse
 from tuning.problems.problem import Problem
 

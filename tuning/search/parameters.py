@@ -12,7 +12,7 @@ import numpy as np
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
-from thruster_env.numerics.checks import covariance
+from thruster_env.core.checks import covariance
 from tuning.problems.parameter import Argument, Parameter, Place, squared
 from tuning.problems.problem import Problem
 from tuning.search.correlations import correlations_of, full_covariance

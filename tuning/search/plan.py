@@ -12,8 +12,8 @@ import optuna
 from optuna.distributions import BaseDistribution, IntDistribution
 
 from filters.registry import filter_type
-from thruster_env.numerics.checks import positive, short_repr
-from thruster_env.numerics.modules import is_code
+from thruster_env.core.checks import positive, short_repr
+from thruster_env.core.modules import is_code
 from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of

@@ -15,7 +15,7 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from thruster_env.numerics.modules import as_module, working_folder_last
+from thruster_env.core.modules import as_module, working_folder_last
 from tuning.problems.augmented import within
 from tuning.problems.find import find_same
 from tuning.problems.log_problem import LogProblem

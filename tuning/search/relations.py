@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 from tuning.problems.parameter import Parameter
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"

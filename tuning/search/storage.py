@@ -14,7 +14,7 @@ from optuna.storages import BaseStorage
 from optuna.storages.journal import JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
-from thruster_env.numerics.checks import short_repr
+from thruster_env.core.checks import short_repr
 from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
 from tuning.search.storage_url import first_line, is_misspelt, public_url, without_secrets
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 import optuna
 
-from thruster_env.numerics.threads import cores
+from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.plan import Plan

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thruster_env.control.controllers import PIController
-from thruster_env.control.gains import lambda_gains
-from thruster_env.effects.reference import REFERENCE_SIGNALS
-from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import NEXT_REFERENCE, READINGS
-from thruster_env.linear.operating import operating_points
-from thruster_env.plant import Plant
-from thruster_env.plants.disturbances.effects import Effect, set_field
-from thruster_env.task import Task
+from thruster_env.effects.effects import Effect, set_field
+from thruster_env.thruster.control.controllers import PIController
+from thruster_env.thruster.control.gains import lambda_gains
+from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
+from thruster_env.thruster.engine.copies import Copies
+from thruster_env.thruster.engine.memory import NEXT_REFERENCE, READINGS
+from thruster_env.thruster.linear.operating import operating_points
+from thruster_env.thruster.plant import Plant
+from thruster_env.thruster.task import Task
 from tuning.problems.excitation import EXCITATIONS, Excitation
 
 

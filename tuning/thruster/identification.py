@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.logged import NO_BAND, Recorder, lag_weights, with_recorder
-from thruster_env.model import model_of_plant
-from thruster_env.numerics.checks import short_repr
-from thruster_env.parameters import ThrusterParameters, checked
-from thruster_env.plant import Plant
-from thruster_env.plants.logs.grid import NEIGHBOURS
-from thruster_env.plants.logs.log import Log, at_offset
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.checks import short_repr
+from thruster_env.logs.grid import NEIGHBOURS
+from thruster_env.logs.log import Log, at_offset
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.logged import NO_BAND, Recorder, lag_weights, with_recorder
+from thruster_env.thruster.model import model_of_plant
+from thruster_env.thruster.parameters import ThrusterParameters, checked
+from thruster_env.thruster.plant import Plant
 from tuning.problems.parameter import Parameter, squared
 from tuning.search.parameters import r_name
 

@@ -8,13 +8,13 @@ from typing import Any, overload
 
 import numpy as np
 
-from thruster_env.logged import NO_BAND, logged_plant, with_recorder
-from thruster_env.model import model_of_plant
-from thruster_env.modelled import ModelledThruster
-from thruster_env.parameters import PRESETS
-from thruster_env.plants.logs.log import Log
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.preset_file import is_file, read_preset
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.logged import NO_BAND, logged_plant, with_recorder
+from thruster_env.thruster.model import model_of_plant
+from thruster_env.thruster.modelled import ModelledThruster
+from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
 from tuning.problems.scenario import BaseScenario
@@ -112,14 +112,14 @@ def family_of_preset(
 
 
 def preset_of(found: Any, family: Any, logs: Sequence[str]):
-    """The identified thruster as the content of a preset file, `thruster_env.preset_file.PresetFile`.
+    """The identified thruster as the content of a preset file, `thruster_env.thruster.preset_file.PresetFile`.
 
     Args:
         found: from `tuning.identification.identify`.
         family: its `ThrusterFamily`.
         logs: names of the runs.
     """
-    from thruster_env.preset_file import PresetFile
+    from thruster_env.thruster.preset_file import PresetFile
 
     plant, seen = family.plant_at(found.values), family.recorder_at(found.values)
     offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
@@ -159,6 +159,6 @@ def _taken_off(logs: Sequence[Log], channel: str) -> float:
 
 def write_identified(path: str | Path, found: Any, family: Any, logs: Sequence[str]) -> None:
     """Write the identified thruster as a preset file; arguments are those of `preset_of`."""
-    from thruster_env.preset_file import write_preset
+    from thruster_env.thruster.preset_file import write_preset
 
     write_preset(path, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")

@@ -6,10 +6,10 @@ import numpy as np
 
 from filters.baselines.baselines import OpenLoop
 from filters.engine.batch import run
-from thruster_env.linear.steady_state import jacobians, steady_state
-from thruster_env.model import model_of_plant
-from thruster_env.numerics.checks import at_least
-from thruster_env.plant import Plant
+from thruster_env.core.checks import at_least
+from thruster_env.thruster.linear.steady_state import jacobians, steady_state
+from thruster_env.thruster.model import model_of_plant
+from thruster_env.thruster.plant import Plant
 from tuning.thruster.scenario import Scenario
 
 SEQUENCES = 1200  # voltage sequences for a stored scale

@@ -11,18 +11,18 @@ import numpy as np
 
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE
-from thruster_env.channels import CHANNELS
-from thruster_env.linear.analysis import equilibrium
-from thruster_env.linear.linear_plant import make_linear_plant
-from thruster_env.linear.steady_state import state_range
-from thruster_env.model import model_of_plant
-from thruster_env.numerics.checks import positive, short_repr, vector
-from thruster_env.numerics.streams import episode_keys, filter_keys
-from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
-from thruster_env.plant_data import check_same_plant, plant_data
-from thruster_env.plants.state_space import StateSpaceModel
-from thruster_env.preset_file import is_file, preset_mapping
-from thruster_env.simulation import simulate
+from thruster_env.core.checks import positive, short_repr, vector
+from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.channels import CHANNELS
+from thruster_env.thruster.linear.analysis import equilibrium
+from thruster_env.thruster.linear.linear_plant import make_linear_plant
+from thruster_env.thruster.linear.steady_state import state_range
+from thruster_env.thruster.model import model_of_plant
+from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
+from thruster_env.thruster.plant_data import check_same_plant, plant_data
+from thruster_env.thruster.preset_file import is_file, preset_mapping
+from thruster_env.thruster.simulation import simulate
 from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
@@ -47,8 +47,8 @@ class Scenario(BaseScenario):
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
             core: fixed numbers, by which errors are divided, computed by `scale.computed_scale`.
         system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
-        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow. The content of a file
-            is stored in place of its path.
+        preset: the thruster, as for `thruster_env.thruster.plant.make_plant`; so are all that follow. The content
+            of a file is stored in place of its path.
         dt: sample time [s].
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: constant flow U_0 [m/s].
@@ -109,7 +109,7 @@ class Scenario(BaseScenario):
         return (make_plant if self.system is None else make_linear_plant)(**self.plant_arguments)
 
     def model(self, **changes) -> StateSpaceModel:
-        """What the filter assumes; changes are arguments of `thruster_env.model.model_of_plant`."""
+        """What the filter assumes; changes are arguments of `thruster_env.thruster.model.model_of_plant`."""
         if not self._are_noise(changes):
             return model_of_plant(self.plant, **{"parameter_factors": dict(self.parameter_factors), **changes})
         return self._assumed.replace(**{name: cov for name, cov in changes.items() if cov is not None})

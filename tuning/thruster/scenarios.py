@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from thruster_env.numerics.checks import one_of
+from thruster_env.core.checks import one_of
 from tuning.problems.excitation import BinarySequence, Dwells, MultiSine
 from tuning.thruster.excitation import ClosedLoop
 from tuning.thruster.scale import computed_scale

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.bounds import steady_state
-from thruster_env.plants.affine import linearize
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.affine import linearize
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.family import Family
 from tuning.problems.data import Data
 from tuning.ways.task import Task

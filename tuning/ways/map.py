@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.gradient import minimum_within
 from tuning.search.objectives import LIKELIHOOD
 from tuning.ways.task import Task

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from thruster_env.numerics.angles import difference
+from thruster_env.core.angles import difference
 from tuning.evaluation.residuals import predicted
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.search.space import Choice

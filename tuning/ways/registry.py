@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thruster_env.numerics.checks import one_of
+from thruster_env.core.checks import one_of
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.ways.adaptive import sage_husa, vb
 from tuning.ways.als import als

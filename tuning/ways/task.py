@@ -14,8 +14,8 @@ import numpy as np
 
 from filters.likelihood import Likelihood
 from filters.registry import filter_type
-from thruster_env.numerics.streams import WAY_OF_TUNING, derived_generator
-from thruster_env.plants.state_space import StateSpaceModel
+from thruster_env.core.streams import WAY_OF_TUNING, derived_generator
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all

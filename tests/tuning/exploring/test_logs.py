@@ -5,7 +5,7 @@ import pytest
 
 import tuning
 from tests.tuning.test_identify_stamps import DT, recorded, smooth, stamps_of
-from thruster_env.plants.logs.read import read_log
+from thruster_env.logs.read import read_log
 from tuning.evaluation.evaluate import evaluate
 from tuning.exploring.bench import Bench
 from tuning.logs.problem import log_problem

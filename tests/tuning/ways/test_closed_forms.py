@@ -6,9 +6,9 @@ import pytest
 from filters import affine_model
 from tests.slow import slow_but
 from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
-from thruster_env.plants.simulate import simulate
-from thruster_env.studies.ways.problems import ring
+from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
+from tuning.experiments.ways.problems import ring
 from tuning.likelihood.family import symmetric_units
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter

@@ -10,7 +10,7 @@ from bokeh.document import Document
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
-from thruster_env.plants.quantities import Quantity
+from thruster_env.model.quantities import Quantity
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.export import KINDS
 from tuning.exploring.page.session import Session

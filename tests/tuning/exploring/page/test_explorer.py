@@ -10,11 +10,11 @@ import pytest
 
 pytest.importorskip("bokeh")
 
-import thruster_cli.explore as command
 import tuning
+import tuning.cli.explore as command
 from tests.linear_problem import LinearProblem
-from thruster_cli.explore import _bench, _forward
-from thruster_cli.log_options import BlockOptions, GridOptions
+from tuning.cli.explore import _bench, _forward
+from tuning.cli.log_options import BlockOptions, GridOptions
 from tuning.exploring.page.server import Server
 
 

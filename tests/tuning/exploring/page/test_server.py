@@ -17,7 +17,7 @@ from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from thruster_cli import explore
+from tuning.cli import explore
 from tuning.exploring.page import server as module
 from tuning.exploring.page.server import LOOPBACK, Server
 

@@ -1,0 +1,158 @@
+"""What pages of sigma-point filters say: the root of a covariance, and points as the columns of a matrix.
+
+With L L' = P, the unit vectors U = [0, I, -I] and a vector 1 of ones, the points x, x + g L_i, x - g L_i are the
+columns of x 1' + g L U.
+
+Source of the root's derivative: Murray (2016), "Differentiation of the Cholesky decomposition", arXiv:1602.07527.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from filters.algebra.matrices import operation, plus, same, through
+from filters.algebra.operations import of_constant, with_transposed
+from thruster_env.core.angles import wrapped
+from thruster_env.core.triangles import RESOLUTION
+from thruster_env.graphs.graphs import arctan2, where
+
+UNKNOWN = 1e-9  # a pivot that is zero and moves by more, relative to its entry, has a root without derivative
+
+
+@operation(same)
+def root(p):
+    """The lower triangular L with L L' = p, which may be singular: a column whose pivot is rounding is zero."""
+    lower = np.full(p.shape, 0.0, dtype=p.dtype)
+    for j in range(len(p)):
+        d = p[j, j] - sum(lower[j, k] * lower[j, k] for k in range(j))
+        singular = d <= RESOLUTION * p[j, j]
+        pivot = where(singular, 1.0, d) ** 0.5
+        lower[j, j], reciprocal = where(singular, 0.0, pivot), where(singular, 0.0, 1.0 / pivot)
+        for i in range(j + 1, len(p)):
+            lower[i, j] = (p[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))) * reciprocal
+    return lower
+
+
+@operation(same)
+def root_slope(lower, dp):
+    """The slope of the root L of P: L Phi(L^-1 dP L'^-1), where Phi is the lower triangle with half the diagonal.
+
+    It is worked out column by column, as the root is; of a singular P it is NaN if the slope dP leaves its range.
+    """
+    slope = np.full(dp.shape, 0.0, dtype=np.result_type(lower, dp))
+    for j in range(len(dp)):
+        singular = lower[j, j] == 0.0
+        reciprocal = where(singular, 0.0, 1.0 / where(singular, 1.0, lower[j, j]))
+        d = dp[j, j] - 2.0 * sum(lower[j, k] * slope[j, k] for k in range(j))
+        lost = where(abs(d) > UNKNOWN * abs(dp[j, j]), math.nan, 0.0)
+        slope[j, j] = where(singular, lost, 0.5 * d * reciprocal)
+        for i in range(j + 1, len(dp)):
+            known = sum(slope[i, k] * lower[j, k] + lower[i, k] * slope[j, k] for k in range(j))
+            slope[i, j] = (dp[i, j] - known - lower[i, j] * slope[j, j]) * reciprocal
+    return slope
+
+
+@operation(lambda x: (x[0], 2 * x[0] + 1))
+def units(x):
+    """The columns [0, I, -I], of as many rows as a vector x has."""
+    one = np.eye(len(x))
+    return np.concatenate([np.zeros((len(x), 1)), one, -one], axis=1)
+
+
+@operation(lambda a: a[1:])
+def ones(a):
+    """A vector of ones, as many as a matrix has columns."""
+    return np.ones(a.shape[1])
+
+
+@operation(lambda a, b: (*a, *b), lambda a, b: a is b)
+def outer(a, b):
+    """The matrix a b' of two vectors."""
+    return np.ravel(a)[:, None] * np.ravel(b)
+
+
+@operation(lambda a: (a[0], a[0]), lambda a: True)
+def square(a):
+    """The symmetric matrix A A'."""
+    return a @ a.T
+
+
+@operation(lambda a: a[:1])
+def first(a):
+    """The first column of a matrix."""
+    return a[:, 0]
+
+
+@operation(lambda a: (a[0], a[1] - 1))
+def others(a):
+    """The columns of a matrix without the first."""
+    return a[:, 1:]
+
+
+@operation(lambda u, nodes: nodes)
+def hats(u, nodes):
+    """Weights (s,) of increasing nodes at which something is known, for what is linear between them at u (1,)."""
+    found = []
+    for s in range(len(nodes)):
+        weight = 1.0
+        if s > 0:
+            weight = least(weight, (u[0] - nodes[s - 1]) / (nodes[s] - nodes[s - 1]))
+        if s < len(nodes) - 1:
+            weight = least(weight, (nodes[s + 1] - u[0]) / (nodes[s + 1] - nodes[s]))
+        found.append(where(0.0 < weight, weight, 0.0))
+    return np.array(found)
+
+
+def least(a, b):
+    """The smaller one of two numbers."""
+    return where(b < a, b, a)
+
+
+def on_circle(y, angles):
+    """Columns whose rows that are angles (flags) lie within half a turn of their circular mean."""
+    return on_one_side(y, tuple(angles)) if any(angles) else y
+
+
+@operation(same)
+def on_one_side(y, angles):
+    """The same, if some are."""
+
+    def moved(row):
+        middle = arctan2(np.sin(row).sum(), np.cos(row).sum())
+        return middle + wrapped(row - middle)
+
+    return np.array([moved(row) if angle else row for row, angle in zip(y, angles, strict=True)])
+
+
+# Derivatives; slopes of None are zero
+
+
+@root.derivative
+def _of_root(result, arguments, slopes):
+    return through(lambda slope: root_slope(result, slope), slopes[0])
+
+
+@outer.derivative
+def _of_outer(result, arguments, slopes):
+    (a, b), (da, db) = arguments, slopes
+    if a is b:
+        return through(lambda slope: with_transposed(outer(slope, a)), da)
+    return plus(through(lambda slope: outer(slope, b), da), through(lambda slope: outer(a, slope), db))
+
+
+@square.derivative
+def _of_square(result, arguments, slopes):
+    return through(lambda slope: with_transposed(slope @ arguments[0].T), slopes[0])
+
+
+units.derivative(of_constant)
+ones.derivative(of_constant)
+
+
+@first.derivative
+@others.derivative
+@on_one_side.derivative
+def _of_part(result, arguments, slopes):
+    return through(lambda slope: slope if result.operation is on_one_side else result.operation(slope), slopes[0])

@@ -1,0 +1,178 @@
+"""What pages say of numbers: reciprocals, conditions and choices, traces, how many channels are seen.
+
+A choice works out both sides. So a page that divides guards its divisor, not its quotient.
+"""
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+
+from filters.algebra.matrices import (
+    Matrix,
+    entries_product,
+    magnitude,
+    operation,
+    plus,
+    power,
+    reciprocal,
+    same,
+    shifted,
+    through,
+)
+from thruster_env.graphs.graphs import where
+
+
+def _by_entries(function, *given):
+    """What a function of numbers makes of the entries of arrays."""
+    with np.errstate(invalid="ignore"):
+        found = np.frompyfunc(function, len(given), 1)(*given)
+    return np.array(found.tolist()) if np.ndim(found) else found
+
+
+@operation(same)
+def exceeds(a, value):
+    """Whether a number, or each entry, is larger than a number that is known now."""
+    return _by_entries(operator.gt, a, value)
+
+
+@operation(lambda a: ())
+def is_number(a):
+    """Whether a number is one, and not NaN."""
+    return a == a
+
+
+@operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
+def choose(condition, a, b):
+    """`a` if the condition holds, else `b`, of numbers or of matrices; the condition may be one of each entry."""
+    return _by_entries(where, condition, a, b)
+
+
+@operation(lambda shape: ())
+def trace(a):
+    """The sum of the diagonal."""
+    return sum(a[i, i] for i in range(len(a)))
+
+
+@operation(lambda shape: ())
+def count(seen):
+    """How many channels are seen."""
+    return sum(where(one, 1.0, 0.0) for one in seen)
+
+
+@operation(same)
+def exponential(v):
+    """Exp of a number, or of each entry of a vector."""
+    return np.exp(v)
+
+
+@operation(lambda a: ())
+def logarithm(a):
+    """The natural logarithm of a number."""
+    return np.log(a)
+
+
+@operation(same)
+def at_most(v, value):
+    """Entries of a vector, none of which is larger than a number that is known now."""
+    return np.array([where(one > value, value, one) for one in v])
+
+
+@operation(same)
+def at_least(a, value):
+    """A number, or entries, none of which is smaller than a number that is known now; this in place of NaN."""
+    return _by_entries(lambda one: where(one > value, one, value), a)
+
+
+@operation(lambda v, value: v)
+def below(v, value):
+    """1 for entries of a vector that are not larger than a number that is known now, else 0."""
+    return np.array([where(one > value, 0.0, 1.0) for one in v])
+
+
+@operation(lambda v: (v[0], v[0]), lambda v: True)
+def diagonal(v):
+    """The diagonal matrix of a vector."""
+    return np.diag(np.ravel(v))
+
+
+def constant(value: float, like):
+    """A number that is known, beside a number `like` that may not be, or a vector of it."""
+    return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else np.full(np.shape(like), value)[()]
+
+
+@reciprocal.derivative
+def _of_reciprocal(result, arguments, slopes):
+    return through(lambda slope: slope * result * result * -1.0, slopes[0])
+
+
+@power.derivative
+def _of_power(result, arguments, slopes):
+    a, exponent = arguments
+    return through(lambda slope: slope * power(a, exponent - 1.0) * exponent, slopes[0])
+
+
+@logarithm.derivative
+def _of_logarithm(result, arguments, slopes):
+    return through(lambda slope: slope / arguments[0], slopes[0])
+
+
+@exponential.derivative
+def _of_exponential(result, arguments, slopes):
+    return through(lambda slope: entries_product(result, slope) if result.shape else result * slope, slopes[0])
+
+
+@entries_product.derivative
+def _of_entries(result, arguments, slopes):
+    (a, b), (da, db) = arguments, slopes
+    by_a = through(lambda slope: entries_product(slope, b), da)
+    return plus(by_a, through(lambda slope: entries_product(a, slope), db))
+
+
+@at_most.derivative
+def _of_limit(result, arguments, slopes):
+    v, value = arguments
+    return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@at_least.derivative
+def _of_lower_limit(result, arguments, slopes):
+    a, value = arguments
+    return through(lambda slope: choose(exceeds(a, value), slope, slope * 0.0), slopes[0])
+
+
+@magnitude.derivative
+def _of_magnitude(result, arguments, slopes):
+    return through(lambda slope: choose(exceeds(arguments[0], 0.0), slope, slope * -1.0), slopes[0])
+
+
+@diagonal.derivative
+def _of_diagonal(result, arguments, slopes):
+    return through(diagonal, slopes[0])
+
+
+@shifted.derivative
+def _of_shifted(result, arguments, slopes):
+    return slopes[0]
+
+
+@trace.derivative
+def _of_trace(result, arguments, slopes):
+    return through(trace, slopes[0])
+
+
+@choose.derivative
+def _of_choice(result, arguments, slopes):
+    condition, *values = arguments
+    moves = (a * 0.0 if slope is None else slope for a, slope in zip(values, slopes[1:], strict=True))
+    return choose(condition, *moves)
+
+
+@below.derivative
+@exceeds.derivative
+@is_number.derivative
+@count.derivative
+def _of_decision(result, arguments, slopes):
+    """Of what is constant but for jumps."""
+    return None

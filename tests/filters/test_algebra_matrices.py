@@ -1,0 +1,172 @@
+"""Algebra of matrices: on arrays, as graphs, differentiated, and as calls of functions made for sizes."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, multivariate_t
+
+from filters.algebra import densities, operations
+from filters.algebra.calls import calls_of
+from filters.algebra.densities import heavier, log_density, outlier_weight, tail_of
+from filters.algebra.derivatives import slopes_of
+from filters.algebra.matrices import Matrix, evaluate, given, in_order
+from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import first, on_circle, ones, others, outer, root, square, units
+from filters.algebra.scalars import at_least, choose, exceeds
+from thruster_env.graphs.programs import Place
+
+RNG = np.random.default_rng(0)
+N, M = 3, 2
+
+
+def covariance_of(size):
+    root = RNG.normal(size=(size, size))
+    return root @ root.T + np.eye(size)
+
+
+def values_of_sizes(n, m):
+    """Of the matrices that the formulas below are made of."""
+    return {
+        "P": covariance_of(n),
+        "R": covariance_of(m),
+        "H": RNG.normal(size=(m, n)),
+        "F": RNG.normal(size=(n, n)),
+        "x": RNG.normal(size=n),
+        "v": RNG.normal(size=m),
+        "z": np.where(np.arange(m) == 1, np.nan, 0.5) if m > 1 else np.zeros(m),
+    }
+
+
+def innovation_covariance(g):
+    seen = present(g["z"])
+    return sym(only(seen, g["H"]) @ g["P"] @ only(seen, g["H"]).T + uncorrelated(seen, g["R"]))
+
+
+def posterior(g):
+    h, r = only(present(g["z"]), g["H"]), uncorrelated(present(g["z"]), g["R"])
+    return joseph(g["P"], divide(g["P"] @ h.T, sym(h @ g["P"] @ h.T + r)), h, r)
+
+
+FORMULAS = {
+    "predicted": lambda g: sym(g["F"] @ g["P"] @ g["F"].T),
+    "sums": lambda g: g["F"] @ g["x"] - g["x"] * 2.0 + (-g["F"].T) @ g["x"],
+    "seen": innovation_covariance,
+    "gain": lambda g: divide(g["P"] @ g["H"].T, sym(g["H"] @ g["P"] @ g["H"].T + g["R"])),
+    "corrected": lambda g: (
+        g["x"] + divide(g["P"] @ g["H"].T, innovation_covariance(g)) @ only(present(g["z"]), g["v"])
+    ),
+    "posterior": posterior,
+    "any gain": lambda g: joseph(g["P"], g["H"].T, g["H"], g["R"]),
+    "rest": lambda g: (eye(g["x"]) - g["F"]) @ wrap(g["x"] + g["x"], (True, False) + (False,) * (len(g["x"]) - 2)),
+    "root": lambda g: root(g["P"]),
+    "points": lambda g: g["H"] @ (outer(g["x"], ones(units(g["x"]))) + (root(g["P"]) * 0.7) @ units(g["x"])),
+    "scatter": lambda g: (
+        square(others(g["F"])) + outer(first(g["F"]), first(g["F"])) + outer(g["x"], g["F"] @ g["x"])
+    ),
+    "circle": lambda g: on_circle(g["F"], (True, False) + (True,) * (len(g["x"]) - 2)),
+    "entries": lambda g: abs(g["x"]) * g["x"] ** 3.0 / (1.0 + g["x"] ** 2.0) - 0.3 + at_least(g["x"], 0.0) ** 4.0,
+    "chosen": lambda g: choose(exceeds(g["F"], 0.0), 2.0 - g["F"] ** 4.0, 2.0 + g["F"] * g["F"] ** 3.0),
+    "density": lambda g: log_density(only(present(g["z"]), g["v"]), innovation_covariance(g), present(g["z"])),
+}
+ENTRIES = ("P", "R", "H", "F", "x", "v", "z")
+
+
+def as_matrices(values):
+    first = given("P", values["P"].shape, symmetric=True)
+    others = {k: given(k, a.shape, symmetric=k == "R", like=first) for k, a in values.items() if k != "P"}
+    return {"P": first, **others}
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_a_formula_of_matrices_is_that_of_arrays(name):
+    values = values_of_sizes(N, M)
+    matrices = as_matrices(values)
+    wanted = FORMULAS[name](matrices)
+    found = evaluate([wanted], {matrices[k]: values[k] for k in ENTRIES})[0]
+    np.testing.assert_allclose(found, FORMULAS[name](values), rtol=1e-12, atol=1e-13)
+    assert np.shape(found) == wanted.shape
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("moving", [("P", "R", "H", "F", "x", "v"), ("P",), ("R", "v"), ("H", "F", "x")])
+def test_slopes_are_those_of_central_differences(name, moving):
+    values = values_of_sizes(N, M)
+    directions = {k: RNG.normal(size=values[k].shape) for k in moving}
+    directions = {k: a + a.T if k in "PR" else a for k, a in directions.items()}
+    matrices = as_matrices(values)
+    moves = {
+        matrices[k]: given(f"d{k}", a.shape, symmetric=k in "PR", like=matrices["P"])
+        for k, a in directions.items()
+    }
+    slope = slopes_of([FORMULAS[name](matrices)], moves)[0]
+
+    def at(h):
+        return FORMULAS[name]({k: a + h * directions[k] if k in moving else a for k, a in values.items()})
+
+    expected = (8 * (at(1e-3) - at(-1e-3)) - (at(2e-3) - at(-2e-3))) / 12e-3
+    if slope is None:
+        assert not np.any(expected)
+        return
+    known = {matrices[k]: values[k] for k in ENTRIES} | {moves[matrices[k]]: directions[k] for k in moving}
+    np.testing.assert_allclose(evaluate([slope], known)[0], expected, rtol=1e-7, atol=1e-7 * abs(expected).max())
+
+
+def test_of_the_best_gain_no_derivative_is_formed():
+    matrices = as_matrices(values_of_sizes(N, M))
+    moves = {matrices["P"]: given("dP", (N, N), symmetric=True, like=matrices["P"])}
+    divided = lambda wanted: [one for one in in_order(wanted) if one.operation is operations.quotient]  # noqa: E731
+    slopes = slopes_of([posterior(matrices), FORMULAS["corrected"](matrices)], moves)
+    assert {one.shape for one in divided(slopes)} == {(N, M), (M,)}
+    assert len([one for one in divided(slopes) if one.shape == (N, M)]) == 2  # the gains of two filters themselves
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("sizes", [(2, 1), (3, 2), (8, 7), (40, 3)])
+def test_calls_of_functions_are_the_formula(name, sizes):
+    values = values_of_sizes(*sizes)
+    first, place = None, 0
+    matrices, numbers = {}, []
+    for key, value in values.items():
+        matrices[key] = given(Place("numbers", place), value.shape, symmetric=key in "PR", like=first)
+        first, place = first or matrices[key], place + value.size
+        numbers.append(value.ravel())
+    wanted = FORMULAS[name](matrices)
+    expected = np.array(FORMULAS[name](values))
+    known = {one: one.operation for one in matrices.values()}
+    rows = np.zeros(expected.size)
+    work = calls_of([(Place("rows", 0), wanted)], known, {})
+    work(rows, np.zeros(1), np.concatenate(numbers), np.zeros(1))
+    np.testing.assert_allclose(rows.reshape(expected.shape), expected, rtol=1e-10, atol=1e-11)
+
+
+def test_what_stands_in_a_formula_twice_is_there_once():
+    g = as_matrices(values_of_sizes(N, M))
+    assert g["H"] @ g["P"] is g["H"] @ g["P"] and g["P"].T is g["P"] and g["H"].T.T is g["H"]
+    assert sym(g["H"] @ g["P"] @ g["H"].T).arguments[2] is g["P"] @ g["H"].T
+    assert isinstance(posterior(g), Matrix) and posterior(g).operation is operations.of_best_gain
+    assert FORMULAS["any gain"](g).operation is not operations.of_best_gain
+
+
+def test_densities_are_those_of_scipy():
+    s, v = covariance_of(3), RNG.normal(size=3)
+    there, z = [0, 2], np.array([0.0, np.nan, 1.0])
+    seen = present(z)
+    masked, innovation = uncorrelated(seen, s), only(seen, v)
+    part = s[np.ix_(there, there)]
+    normal = log_density(innovation, masked, seen)
+    assert normal == pytest.approx(multivariate_normal(cov=part).logpdf(v[there]), rel=1e-12)
+    q = v[there] @ np.linalg.solve(part, v[there])
+    for degrees in (3.0, 30.0):
+        found = normal + heavier(q, seen, np.array(tail_of(degrees, 3)))
+        student = multivariate_t(shape=part * (degrees - 2) / degrees, df=degrees).logpdf(v[there])
+        assert found == pytest.approx(student, rel=1e-10)
+        weight = outlier_weight(q, seen, np.array(tail_of(degrees, 3)))
+        assert weight == pytest.approx((degrees + 2) / (degrees - 2 + q), rel=1e-12)
+    assert heavier(q, seen, np.array(tail_of(np.inf, 3))) == 0.0
+    assert outlier_weight(q, seen, np.array(tail_of(np.inf, 3))) == 1.0
+
+
+def test_a_covariance_that_is_none_has_no_density():
+    seen = np.array([True, True])
+    assert np.isnan(log_density(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), seen))
+    with pytest.raises(TypeError, match="no derivative"):
+        slopes_of([densities.dot(x := given("x", (2,)), x)], {x: given("dx", (2,), like=x)})

@@ -1,0 +1,153 @@
+from functools import partial
+
+import numpy as np
+import pytest
+
+from thruster_env.core.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
+from thruster_env.core.tuples import (
+    column_reader,
+    column_writer,
+    matrix_of,
+    matrix_reader,
+    matrix_writer,
+    scaled_sum,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+
+ROW = np.arange(10.0, 22.0)
+TABLE = ROW.reshape(3, 4)
+
+
+@pytest.mark.parametrize(("names", "value"), [("", ()), ("a", (1,)), ("ab", (1, 2))])
+def test_source_of_a_tuple_is_a_tuple_at_every_length(names, value):
+    assert eval(tuple_of(names), {"a": 1, "b": 2}) == value
+
+
+def test_source_of_a_matrix_goes_by_rows():
+    assert eval(matrix_of(2, 3, lambda i, j: f"{10 * i + j}")) == ((0, 1, 2), (10, 11, 12))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_column_is_read_downwards(count):
+    assert column_reader(count)(TABLE, 2) == tuple(TABLE[:count, 2])
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_column_is_written_where_it_belongs_and_nowhere_else(first):
+    table, expected = TABLE.copy(), TABLE.copy()
+    expected[first : first + 2, 3] = (-1.0, -2.0)
+    assert column_writer(2, first)(table, 3, (-1.0, -2.0)) is None
+    np.testing.assert_array_equal(table, expected)
+
+
+@pytest.mark.parametrize("start", [0, 3])
+def test_a_vector_is_read_and_written_from_its_start(start):
+    assert vector_reader(4, start)(ROW) == tuple(ROW[start : start + 4])
+    row, expected = ROW.copy(), ROW.copy()
+    expected[start : start + 2] = (-1.0, -2.0)
+    vector_writer(2, start)(row, (-1.0, -2.0))
+    np.testing.assert_array_equal(row, expected)
+
+
+@pytest.mark.parametrize("start", [0, 5])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 3), (3, 2)])
+def test_a_matrix_is_read_and_written_by_rows(rows, columns, start):
+    size = rows * columns
+    read = matrix_reader(rows, columns, start)(ROW)
+    np.testing.assert_array_equal(read, ROW[start : start + size].reshape(rows, columns))
+    row, expected = ROW.copy(), ROW.copy()
+    expected[start : start + size] = -np.arange(size)
+    matrix_writer(rows, columns, start)(row, tuple(map(tuple, -np.arange(size).reshape(rows, columns))))
+    np.testing.assert_array_equal(row, expected)
+
+
+def test_scaled_sum_is_x_plus_a_y_and_does_not_change_its_arguments():
+    x, y = (1.0, 2.0, np.array([3.0, 4.0])), (10.0, 20.0, np.array([30.0, 40.0]))
+    a, b, c = scaled_sum(3)(x, 0.5, y)
+    assert (a, b) == (6.0, 12.0)
+    np.testing.assert_array_equal(c, [18.0, 24.0])
+    np.testing.assert_array_equal(x[2], [3.0, 4.0])
+
+
+def test_written_out_functions_see_the_names_they_were_given():
+    plus = written_out("plus", "x", "y = x * factor", "y + 1", factor=3)
+    assert plus.__name__ == "plus"
+    assert plus(2) == 7
+
+
+def test_one_function_is_made_for_one_shape():
+    assert matrix_reader(2, 2) is matrix_reader(2, 2)
+    assert matrix_reader(2, 2, 1) is not matrix_reader(2, 2)
+
+
+@inlined
+def shuffle(row, table):
+    x = scaled_sum_2(read_vector(row), 2.0, read_column(table, 1))
+    a = read_matrix(row)
+    store_column(table, 0, (a[1][0], a[0][1]))
+    store_vector(row, x)
+    store_matrix(row, ((x[0], a[1][1]), (a[0][0], x[1])))
+
+
+scaled_sum_2, read_vector, read_column, read_matrix = (
+    scaled_sum(2),
+    vector_reader(2, 1),
+    column_reader(2),
+    matrix_reader(2, 2, 3),
+)
+store_column, store_vector, store_matrix = column_writer(2, 1), vector_writer(2), matrix_writer(2, 2, 7)
+
+
+def test_compiled_readers_and_writers_do_what_the_python_ones_do():
+    fingerprint = function_fingerprint(shuffle, within=__name__)
+
+    def run(row, table):
+        fingerprint  # noqa: B018 - part of the cache's key
+        shuffle(row, table)
+
+    expected_row, expected_table = ROW.copy(), TABLE.copy()
+    run(expected_row, expected_table)
+    row, table = ROW.copy(), TABLE.copy()
+    compiled(run)(row, table)
+    np.testing.assert_array_equal(row, expected_row)
+    np.testing.assert_array_equal(table, expected_table)
+    assert (row != ROW).any() and (table != TABLE).any()
+
+
+def test_nothing_is_compiled_within_interpreted_even_after_an_error():
+    def function(x):
+        return x
+
+    with pytest.raises(RuntimeError, match="stop"):
+        with interpreted():
+            assert is_interpreting()
+            assert compiled(function) is function
+            with interpreted():
+                pass
+            assert compiled(function) is function
+            raise RuntimeError("stop")
+    assert not is_interpreting()
+
+
+def test_a_fingerprint_tells_functions_apart_and_is_stable():
+    def one(x):
+        return x + 1.0
+
+    def other(x):
+        return x + 2.0
+
+    fingerprint = partial(function_fingerprint, within=__name__)
+    assert fingerprint(one) == fingerprint(one, None)
+    assert (
+        len(
+            {
+                function_fingerprint(within=__name__),
+                function_fingerprint(one, within=__name__),
+                function_fingerprint(other, within=__name__),
+            }
+        )
+        == 3
+    )

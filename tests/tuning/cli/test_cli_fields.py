@@ -1,0 +1,140 @@
+"""Recorders' files on the command line: what is in them, and the same numbers as of a table."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from tests.thruster_env.logs.recorders.files import h5py, write_bag, write_ulog
+from tests.thruster_env.logs.recorders.test_formats import bag_topics
+from tests.tuned_files import write_untuned
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.core.text_tables import plain_text
+from thruster_env.logs.recorders.registry import fields
+from thruster_env.logs.table import read_table
+from tuning.cli.fields import as_table, sparkline
+
+COLUMNS = ("--column", "V_s=actuator_outputs.output[2]", "--column", "thrust=load_cell#1.force")
+
+
+def recorded(path, table, kind="double"):
+    """A run of `thruster simulate` as a ULog of numbers of a kind, the command and the load cell on topics."""
+    ticks = 3_000_000 + np.round(1e6 * table.numbers("time_s")).astype(np.int64)
+    u, force = table.numbers("voltage_V"), table.numbers("measured_thrust_N")
+    known = ~np.isnan(u)
+    outputs = {"timestamp": ticks[known], "output[2]": u[known]}
+    cells = [("load_cell", k, f"{kind} force;", {"timestamp": ticks, "force": k * force}) for k in (0, 1)]
+    write_ulog(path, [("actuator_outputs", 0, f"{kind}[4] output;", outputs), *cells])
+
+
+def columns_of(path):
+    with open(path, encoding="utf-8") as file:
+        rows = [*csv.reader(file)]
+    return {name: np.array(cells, float) for name, *cells in zip(*rows, strict=True) if name != "time_s"}
+
+
+@pytest.mark.parametrize(("kind", "within"), [("double", 1e-9), ("float", 1e-5)])
+def test_an_estimate_of_a_ulog_is_that_of_the_csv_of_the_run(thruster, tmp_path, kind, within):  # noqa: F811
+    write_untuned(tmp_path / "tuned.json")
+    assert thruster("simulate", "--out", "run.csv", "--steps", 300, "--seed", 4).returncode == 0
+    recorded(tmp_path / "run.ulg", read_table(tmp_path / "run.csv"), kind)
+    for log, more in (("run.csv", ()), ("run.ulg", COLUMNS)):
+        done = thruster("estimate", log, "--tuned", "tuned.json", *more, "--out", f"{log}.est.csv")
+        assert done.returncode == 0, done.stderr
+    of_table, of_ulog = (columns_of(tmp_path / f"{log}.est.csv") for log in ("run.csv", "run.ulg"))
+    estimated = [name for name in of_ulog if name in of_table]
+    assert len(estimated) >= 4
+    for name in estimated:
+        some = ~np.isnan(of_table[name]) & ~np.isnan(of_ulog[name])
+        assert some.sum() >= 299
+        off = abs(of_table[name][some] - of_ulog[name][some]).max()
+        assert off <= within * max(1.0, abs(of_table[name][some]).max()), name
+
+
+def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):  # noqa: F811
+    ticks = 10_000 * np.append(np.arange(50), np.arange(150, 200))
+    rows = {"timestamp": ticks, "output[0]": np.arange(100.0), "output[1]": -5.0}
+    name = "a_topic_of_a_name_so_long_that_no_terminal_of_eighty_columns_shows_it_in_one_line"
+    write_ulog(
+        tmp_path / "a.ulg",
+        [("actuator_outputs", 0, "double[3] output;", rows), (name, 0, "double[3] output;", rows)],
+    )
+    said = thruster("log", "a.ulg").stdout
+    (line,) = [one for one in said.splitlines() if "actuator_outputs.output[0]" in one]
+    assert line.split() == [
+        "actuator_outputs.output[0]",
+        "100",
+        "49.75",
+        "1.01",
+        "0",
+        "1.99",
+        "0",
+        "99",
+        "▁▂▃▄▅▆▇█",
+    ]
+    assert f"{name}.output[1]" in said and "a.ulg: ULog, 6 fields" in said
+    data = as_json("log", "a.ulg", "--only", "OUTPUTS.OUT")
+    assert data["format"] == "ULog" and [one["name"] for one in data["fields"]] == [
+        f"actuator_outputs.output[{k}]" for k in range(3)
+    ]
+    first = data["fields"][0]
+    assert (first["samples"], first["least"], first["greatest"], len(first["course"])) == (100, 0.0, 99.0, 8)
+    assert first["longest_gap_s"] == pytest.approx(1.01) and first["rate_hz"] == pytest.approx(99 / 1.99)
+    assert (
+        thruster("log", "a.ulg", "--json", "out.json").stdout.startswith("a.ulg: ULog")
+        and (tmp_path / "out.json").exists()
+    )
+    for arguments, message in (
+        (("a.ulg", "--only", "rudder"), "a field whose name contains 'rudder', but a.ulg has none among 6 fields"),
+        (("a.csv", "--only", "x"), "--only must go with a recorder's file, .ulg, "),
+        (("a.ulg", "--json", "b.mcap"), "--json must be no log"),
+        (("a.ulg", "--column", "V_s=actuator_output.output[0]"), "near it are actuator_outputs.output"),
+    ):
+        (tmp_path / "a.csv").write_text("time_s,voltage,thrust\n0,1,2\n1,2,3\n2,3,5\n")
+        done = thruster("log", *arguments)
+        assert done.returncode == 2 and message in " ".join(done.stderr.split()), done.stderr
+
+
+def test_a_recorders_file_is_read_as_a_log_where_columns_are_told(thruster, as_json, tmp_path):  # noqa: F811
+    assert thruster("simulate", "--out", "run.csv", "--steps", 200, "--seed", 4).returncode == 0
+    recorded(tmp_path / "run.ulg", read_table(tmp_path / "run.csv"))
+    data = as_json("log", "run.ulg", *COLUMNS)
+    assert data["samples"] == {"input:V_s": 200, "measurement:thrust": 201} and data["rows"] == 201
+    (tmp_path / "run.toml").write_text(
+        '[columns]\nV_s = "actuator_outputs.output[2]"\nthrust = "load_cell#1.force"\n'
+    )
+    assert as_json("log", "run.ulg") == data
+    assert len(as_json("log", "run.ulg", "--only", "force")["fields"]) == 2
+    with h5py.File(tmp_path / "named.h5", "w") as file:
+        for name in ("time_s", "voltage_V", "measured_thrust_N"):
+            file[name] = read_table(tmp_path / "run.csv").numbers(name)
+    assert as_json("log", "named.h5", "--preset", "tunnel")["rows"] == 201  # by their names, as columns of a table
+    write_bag(tmp_path / "bag", bag_topics(), "mcap")
+    said = thruster("log", "bag", "--only", "vel").stdout
+    assert said.startswith("bag: bag of ROS 2, 6 fields") and "/vel.twist.linear.x" in said
+
+
+def test_on_a_terminal_fields_stand_under_their_topics(tmp_path):
+    ticks = 10_000 * np.arange(100)
+    rows = {"timestamp": ticks, "output[0]": ticks / 1e6, "output[1]": 5.0}
+    write_ulog(tmp_path / "a.ulg", [("act", k, "double[2] output;", rows) for k in (0, 1)])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["t"], file["u"] = np.arange(9.0), np.arange(9.0)
+    lines = plain_text([as_table(tmp_path / "a.ulg", fields(tmp_path / "a.ulg"), True)], 99).splitlines()
+    words = [line.split() for line in lines]
+    course = "▁▂▃▄▅▆▇█"
+    ours = [
+        ["act", "100", "100", "0.01", "0", "0.99"],
+        [".output[0]", "0", "0.99", course],
+        [".output[1]", "5", "5"],
+    ]
+    place = words.index(ours[0])
+    assert words[place : place + 3] == ours and words[place + 3] == ["act#1", *ours[0][1:]]
+    alone = plain_text([as_table(tmp_path / "a.h5", fields(tmp_path / "a.h5"), True)], 99)
+    assert ["u", "9", "1", "1", "0", "8", "0", "8", "▁▂▃▄▅▆▇█"] in [line.split() for line in alone.splitlines()]
+
+
+def test_a_sparkline_goes_from_the_least_to_the_greatest():
+    assert sparkline([0.0, 7.0, 3.4, float("nan"), -7.0]) == "▅█▆ ▁"
+    assert sparkline([2.0, 2.0]) == "" and sparkline([]) == ""
+    assert sparkline([-1.7e308, 1.7e308, 0.0]) == "▁█▅"

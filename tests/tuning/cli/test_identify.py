@@ -1,0 +1,276 @@
+"""`thruster identify`: tables, files that every preset takes, and one clear line for a mistake."""
+
+import re
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+from tests.models import scalar_model
+from tests.thruster_env.thruster.test_t200 import OTHER, recorded_rows, write_table
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.core.streams import episode_keys
+from thruster_env.logs.log import Log
+from thruster_env.logs.write import write_log
+from thruster_env.model.simulate import simulate
+from thruster_env.thruster.logged import logged_model
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
+from thruster_env.thruster.preset_file import PresetFile, read_preset, write_preset
+from tuning.experiments.identification import TRUTH, record
+from tuning.identification.values import with_values
+from tuning.problems.files import scenario_of
+from tuning.problems.find import find_problem
+from tuning.thruster.logs import of_preset
+
+FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
+WHOSE = "--preset tunnel_physical --sensor thrust --sensor speed"
+OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")
+
+
+@pytest.fixture
+def logs(tmp_path):
+    recorded = record(0, 4, 300)
+    for place, log in enumerate(recorded):
+        write_log(tmp_path / f"run{place}.csv", log)
+    return [f"run{place}.csv" for place in range(len(recorded))]
+
+
+@pytest.mark.slow
+def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_json, logs, tmp_path):  # noqa: F811
+    found = as_json("identify", *logs, *OF_LOGS, "--free", FREE, "--starts", 1, "--out", "mine.toml")
+    assert found["held_out"] == ["run2.csv"] and found["files"] == ["mine.toml"]
+    for name, value in found["values"].items():
+        assert abs(value - TRUTH[name]) < 4 * found["standard_errors"][name], name
+    checked = found["validation"]
+    assert checked["identified"]["log_likelihood"] > checked["start"]["log_likelihood"] + 1000
+    kept = read_preset("mine.toml")
+    assert kept.parameters.voltage_gain == found["values"]["voltage_gain"]
+    assert kept.parameters.added_mass == TUNNEL_PHYSICAL.added_mass
+    assert kept.dead_band == (found["values"]["dead_band_low"], found["values"]["dead_band_high"])
+    model = logged_model(preset="mine.toml")
+    assert model.n == 3 and model.constants.bias_0 == found["values"]["bias_thrust"]
+    r = [found["values"][name] for name in ("R11", "R22")]
+    assert np.diag(model.measurement_noise_cov).tolist() == pytest.approx(r, rel=1e-12)
+    inside = as_json("inspect", "--preset", "mine.toml", "--out", "x.pdf")
+    assert inside["preset"] == "mine.toml" and (tmp_path / "x.pdf").read_bytes().startswith(b"%PDF")
+    before = (tmp_path / "mine.toml").read_text()
+    for command in (("identify", *logs), ("identify", "--bollard", "t.csv"), ("tune", "--scenario", "nominal")):
+        done = thruster(*command, "--preset", "mine.toml", "--out", "mine.toml")
+        assert done.returncode == 2 and "must not replace an input file, but got mine.toml for both" in done.stderr
+    assert (tmp_path / "mine.toml").read_text() == before
+    assert thruster("simulate", "--preset", "mine.toml", "--steps", 20, "--out", "sim.csv").returncode == 0
+    env = gym.make("BowThruster-v0", preset="mine.toml").unwrapped
+    assert env.plant.parameters == kept.parameters
+    assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
+
+
+@pytest.mark.slow
+def test_a_load_cell_that_will_not_be_there_is_predicted(as_json, logs):  # noqa: F811
+    free = "--free", "motor_damping,voltage_gain,lift_coefficient", "--hold-noise", "--starts", 1
+    found = as_json("identify", *logs, *OF_LOGS, *free, "--predicted", "thrust", "--degrees", 20)
+    checked = {name: found["validation"][name]["one_step"]["thrust"] for name in ("start", "identified")}
+    assert checked["identified"] < 0.9 * checked["start"]
+
+
+WITHOUT_LOG = [
+    ((), "identify must have at least one log"),
+    (("--step", "x.csv"), "--step must come with --bollard"),
+    (("--bollard", "none.csv"), "none.csv cannot be read"),
+]
+WITH_LOG = [
+    (("--free", "mass"), "free parameters must be of lift_coefficient, .*, but got 'mass'"),
+    (("--start", "voltage_gain=1e9"), "the start of voltage_gain must be within"),
+    (("--predicted", "lift"), "a predicted channel must be one of thrust, speed, but got 'lift'"),
+    (("--range", "voltage_gain=5:1"), "the range of voltage_gain must be from low to high, but got 5 and 1"),
+    (
+        ("--free", "clock_offset_thrust", "--range", "clock_offset_thrust=-1:99"),
+        "the range of clock_offset_thrust must be within a quarter of the shortest log, .* from -1 to 99",
+    ),
+    (("--gate", "nan"), "gate must be positive, but got nan"),
+    (("--starts", "10000"), "starts must be at most 1000, but got 10000"),
+    (("--range", "voltage_gain=5"), "--range must have the form NAME=LOW:HIGH, but got 'voltage_gain=5'"),
+    (("--filter", "kf"), "a thruster must be identified with the ekf, but got filter kf"),
+    (("--held-out", "run0.csv"), "at least one log must be left to learn from"),
+    (("--out", "x.json"), "--out must end in .toml"),
+    (("--plot", "x.tex"), "--plot must end in .png, .svg or .pdf, but got 'x.tex'"),
+]
+MISTAKES = [
+    *((("identify", *arguments), message) for arguments, message in WITHOUT_LOG),
+    *((("identify", "run0.csv", *OF_LOGS, *arguments), message) for arguments, message in WITH_LOG),
+    (("identify", "run0.csv", "--preset", "none.toml"), "a preset file must be readable, but none.toml is not"),
+    (("identify", "run0.csv", "--bollard", "table.csv"), "give either logs or --bollard TABLE.csv"),
+    (("identify", "--bollard", "t.csv", "--free", "x"), "--free must come with logs, .* but got --free x"),
+    (
+        ("identify", "--bollard", "t.csv", "--hold-noise"),
+        "--hold-noise must come with logs, .* but got --hold-noise",
+    ),
+    (("identify", "--bollard", "t.csv", "--range", "a=1:2"), "--range must come with logs"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES)
+def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, arguments, message):  # noqa: F811
+    done = thruster(*arguments)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert re.search(message, done.stderr), done.stderr
+    assert not list(tmp_path.glob("*.toml"))
+
+
+@pytest.mark.slow
+def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_path):  # noqa: F811
+    (log,) = record(0, 1, 100)
+    write_log("flat.csv", replace(log, inputs=np.full_like(log.inputs, 6.0)))
+    done = thruster("identify", "flat.csv", *OF_LOGS, "--free", f"{FREE},Q11")
+    assert done.returncode == 2
+    said = done.stderr.splitlines()[-1]  # before it there may be a line on compilation
+    assert "constant inputs do not determine" in said and "voltage_gain, dead_band_low" in said
+    assert not list(tmp_path.rglob("*.toml"))
+
+
+@pytest.mark.slow
+def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):  # noqa: F811
+    truth = OTHER.thruster._replace(
+        **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
+        added_mass=0.6,
+    )
+    write_table(tmp_path / "table.csv", recorded_rows(OTHER))
+    model = thruster_model(preset=truth, max_voltage=12.0, sensors=["speed"], measurement_noise_cov=[0.25])
+    inputs = np.repeat([[[2.0], [10.0], [-8.0]]], 60, axis=1)
+    drawn = simulate(model, episode_keys([0]), inputs).measurements[0]
+    write_log("step.csv", Log("step", 0.01, inputs[0], drawn, model.input_quantities, model.measurements))
+    renamed = (tmp_path / "step.csv").read_text().replace("measured_speed_rad_per_s", "tacho")
+    (tmp_path / "step.csv").write_text(renamed)
+    column = "--column", "speed=tacho"
+    found = as_json("identify", "--bollard", "table.csv", "--step", "step.csv", *column, "--out", "mine.toml")
+    assert found["held_out_supplies"] == [14.0, 18.0]
+    assert found["thruster"]["lift_coefficient"] == pytest.approx(truth.lift_coefficient, rel=1e-4)
+    values, errors = found["step"]["values"], found["step"]["standard_errors"]
+    assert abs(values["motor_rate"] - 1.5) < 3 * errors["motor_rate"] < 0.3
+    assert abs(values["added_mass"] - 0.6) < 3 * errors["added_mass"] < 0.3
+    kept = read_preset("mine.toml").parameters
+    assert kept.voltage_gain / kept.motor_damping == pytest.approx(
+        truth.voltage_gain / truth.motor_damping, rel=1e-4
+    )
+    assert kept.added_mass == values["added_mass"]
+    inputs = np.full((60, 1), 2.0)
+    write_log("flat.csv", Log("step", 0.01, inputs, drawn[:61], model.input_quantities, model.measurements))
+    done = thruster("identify", "--bollard", "table.csv", "--step", "flat.csv")
+    assert done.returncode == 2 and "a step response must have a step of the voltage" in done.stderr
+
+
+def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):  # noqa: F811
+    path = tmp_path / "mine.toml"
+    write_preset(path, PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
+    made = of_preset(find_problem("nominal"), str(path), sequences=4)
+    path.unlink()  # the scenario holds what it said
+    assert made.plant.parameters.voltage_gain == 1300.0 and made.model().constants.dead_band_high == 0.7
+    assert np.isfinite(made.scale).all() and made.scale != find_problem("nominal").scale
+    again = scenario_of(made.as_mapping(), made.name, "t.json")
+    assert again.digest == made.digest != find_problem("nominal").digest
+    assert of_preset(made, None) is made
+    done = thruster("compare", "--filter", "ekf", "--scenario", "published_tunnel", "--preset", "t200")
+    assert (
+        done.returncode == 2 and "(--preset) must come with scenarios of the thruster's equations" in done.stderr
+    )
+
+
+def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):  # noqa: F811
+    (tmp_path / "run0.toml").write_text("dt = 0.01\n")
+
+    def files():
+        return {path.name: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    before = files()
+    for line, message in [
+        (
+            f"identify run0.csv {WHOSE} --out run0.toml",
+            "beside run0.csv",
+        ),
+        (
+            f"identify run0.csv {WHOSE} --out run1.toml",
+            "beside run1.csv",
+        ),
+        ("new preset run1.toml", "beside run1.csv"),
+        ("simulate --steps 5 --out run1.csv", "logs are never overwritten, but run1.csv exists"),
+        (
+            f"estimate run0.csv {WHOSE} --out run1.csv",
+            "logs are never overwritten, but run1.csv exists",
+        ),
+        ("inspect --json run1.csv", "--json must be no log"),
+        ("simulate --steps 5 --out new.csv --json run0.toml", "beside run0.csv"),
+    ]:
+        done = thruster(*line.split())
+        assert done.returncode == 2 and message in done.stderr, line
+        assert done.stderr.count("thruster:") == 1 and "Traceback" not in done.stderr, line
+        assert files() == before, line
+
+
+MOTOR = """
+from typing import NamedTuple
+
+from thruster_env.model.continuous import ContinuousModel
+
+
+class Constants(NamedTuple):
+    substep: float
+    gain: float = 60.0
+    friction: float = 3.0
+
+
+def rates(x, u, c):
+    return (c.gain * u[0] - c.friction * x[0],)
+
+
+def speed(x, c):
+    return (x[0],)
+
+
+motor = ContinuousModel(
+    rates=rates,
+    observe=speed,
+    densities=[4.0],
+    constants=Constants(0.05),
+    arguments={"prior_mean": [0.0], "prior_cov": [1.0], "measurement_noise_cov": [0.01], "inputs": 1,
+               "measurements": ["speed"]},
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
+    rng, speed, rows = np.random.default_rng(1), 0.0, []
+    (tmp_path / "plant.py").write_text(MOTOR)
+    stamps, volts = np.cumsum(rng.uniform(0.01, 0.09, size=400)), 0.0
+    for k, length in enumerate(np.diff(stamps, append=stamps[-1] + 0.05)):
+        volts = rng.choice([-1.0, 1.0]) if k % 10 == 0 else volts
+        rows.append(f"{stamps[k]:.6f},{volts:g},{speed + 0.1 * rng.normal():.6f}")
+        decay = np.exp(-2.0 * length)  # exact from stamp to stamp: gain 40, friction 2
+        speed = decay * speed + 20.0 * volts * (1 - decay) + np.sqrt((1 - decay**2) / 4) * rng.normal()
+    (tmp_path / "run.csv").write_text("\n".join(["time_s,u_1,speed", *rows]))
+    given = ("run.csv", "--model", "plant:motor", "--no-grid", "--dt", "0.05")
+    found = as_json("identify", *given, "--free", "gain,friction", "--starts", "1", "--out", "found.toml")
+    for name, truth in {"gain": 40.0, "friction": 2.0, "R": 0.01}.items():
+        assert abs(found["values"][name] - truth) < 4 * found["standard_errors"][name], name
+    again = as_json("estimate", *given, "--preset", "found.toml", "--skip", "0")
+    assert again["grid"] is False
+    assert again["log_likelihood"] == pytest.approx(found["validation"]["identified"]["log_likelihood"], rel=1e-9)
+    tuned = as_json("tune", "--filter", "ekf", "--log", *given, "--trials", "4", "--out", "tuned.json")
+    assert tuned["held_out"] and as_json("verify", "tuned.json", "--model", "plant:motor")
+    on_stamps = as_json("estimate", *given, "--tuned", "tuned.json")
+    assert on_stamps["grid"] is False and np.isfinite(on_stamps["log_likelihood"])
+    done = thruster("identify", *given, "--free", "gain", "--filter", "kf")
+    assert done.returncode == 2 and "must be identified with the ekf, but got filter kf" in done.stderr
+
+
+def test_values_of_a_model_belong_to_a_sample_time(tmp_path):
+    (tmp_path / "mine.toml").write_text("[values]\nQ11 = 0.5\nR = 2.0\n[identified]\ndt = 0.01\n")
+    alone = with_values(scalar_model, tmp_path / "mine.toml")
+    assert alone(0.01).process_noise_cov.item() == pytest.approx(0.5, rel=1e-12)
+    with pytest.raises(ValueError, match=r"the dt of a log must be that of .*mine.toml, 0.01 s, .* but is 0.02 s"):
+        alone(0.02)
+    made = with_values(lambda dt=0.01: scalar_model(), tmp_path / "mine.toml")(0.02)
+    assert made.process_noise_cov.item() == pytest.approx(1.0, rel=1e-12)
+    assert made.measurement_noise_cov.item() == pytest.approx(2.0, rel=1e-12)

@@ -1,0 +1,202 @@
+"""`thruster new`: what it writes works as it stands, and it never writes over anything."""
+
+import importlib
+import pickle
+import runpy
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tuning
+from filters import EstimateState, make_filter, run
+from filters.likelihood import likelihood
+from filters.registry import filter_type
+from tests.filters.test_differentiated import swing_if
+from tests.models import pendulum, simulated, swing
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.core.compiled import interpreted
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
+from thruster_env.thruster.preset_file import read_preset
+from tuning.evaluation.baselines import rule_of_thumb
+from tuning.likelihood.gradient import tune_by_gradient
+from tuning.problems.find import find_problem
+from tuning.search.filter_parameters import filter_parameters
+
+
+@pytest.fixture
+def new(thruster, monkeypatch, tmp_path):  # noqa: F811
+    """Write a file and say what its module is called; modules are forgotten afterwards."""
+    monkeypatch.syspath_prepend(tmp_path)
+    known = set(sys.modules)
+
+    def write(kind, name):
+        done = thruster("new", kind, name)
+        assert done.returncode == 0 and f"wrote {name}." in done.stdout
+        text = next(tmp_path.glob(f"{name}.*")).read_text()
+        assert "template" not in text
+        return name
+
+    yield write
+    for name in set(sys.modules) - known:
+        if name.startswith("a_new_"):
+            del sys.modules[name]
+
+
+@pytest.mark.slow
+def test_a_problem_can_be_tuned(new, as_json):  # noqa: F811
+    name = new("problem", "a_new_problem")
+    found = as_json("tune", "--problem", f"{name}:problem", "--filter", "ekf", "--trials", 2)
+    held_out = found["held_out"][f"{name}:problem"]
+    assert held_out["tuned"]["score"][0] < 2 and found["trials"] == 2
+
+
+def naive_correntropy(model, bandwidth, iterations, inputs, measurements):
+    """Means of one run of Chen's filter, as the paper has it, for a model with one channel."""
+    x, p, found = model.prior_mean, model.prior_cov, []
+    for k, z in enumerate(measurements):
+        if k:
+            for _ in range(model.substeps):
+                f = np.array(model.transition_jacobian(tuple(x), tuple(inputs[k - 1]), model.constants))
+                x, p = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants)), f @ p @ f.T
+            p = p + model.process_noise_cov
+        h = np.array(model.observe_jacobian(tuple(x), model.constants))
+        v, r = z - np.array(model.observe(tuple(x), model.constants)), model.measurement_noise_cov
+        root, step = np.linalg.cholesky(p), p @ h.T @ np.linalg.solve(h @ p @ h.T + r, v)
+        for _ in range(iterations):
+            e_x, e_z = np.linalg.solve(root, step), (v - h @ step) / np.sqrt(r[0, 0])
+            spread = root @ np.diag(np.exp(e_x**2 / (2 * bandwidth**2))) @ root.T
+            noise = r * np.exp(e_z[0] ** 2 / (2 * bandwidth**2))
+            gain = spread @ h.T @ np.linalg.inv(h @ spread @ h.T + noise)
+            step = gain @ v
+        rest = np.eye(len(x)) - gain @ h
+        x, p = x + step, rest @ p @ rest.T + gain @ r @ gain.T
+        found.append(x)
+    return np.array(found)
+
+
+def test_a_filter_is_that_of_its_paper_on_every_path(new):
+    kind = importlib.import_module(new("filter", "a_new_filter")).ANewFilter
+    assert filter_type("a_new_filter:ANewFilter").filter_class is kind
+    model = thruster_model(measurement_noise_cov=0.2)
+    inputs, z = simulated(model, 30)
+    z[0, 9] += 8.0  # an outlier
+    filter_ = make_filter("a_new_filter:ANewFilter", model, bandwidth=2.0, iterations=3)
+    estimates = run(filter_, None, inputs, z)
+    expected = naive_correntropy(model, 2.0, 3, inputs[0], z[0])
+    np.testing.assert_allclose(estimates.means[0], expected, rtol=1e-9, atol=1e-9)
+    belief, _ = filter_.update(filter_.init(), z[0, 0])
+    for k, u in enumerate(inputs[0]):
+        belief, _ = filter_.update(filter_.predict(belief, u), z[0, k + 1])
+    np.testing.assert_allclose(belief.mean, expected[-1], rtol=1e-9)
+    assert pickle.loads(pickle.dumps(filter_)).bandwidth == 2.0
+    wide = run(make_filter("a_new_filter:ANewFilter", model, bandwidth=1e9), None, inputs, z)
+    np.testing.assert_allclose(wide.means, run(make_filter("ekf", model), None, inputs, z).means, rtol=1e-9)
+
+
+def test_a_filter_is_differentiated_and_stands_around_an_env(new):
+    new("filter", "a_new_slope")
+    model = thruster_model()
+    inputs, z = simulated(model, 20)
+    q, r = np.array([np.diag([1.0, 0.0]), np.zeros((2, 2))]), np.array([np.zeros((1, 1)), np.eye(1)])
+
+    def level(q11, r11):
+        cov = model.process_noise_cov + np.diag([q11, 0.0])
+        changed = model.replace(process_noise_cov=cov, measurement_noise_cov=model.measurement_noise_cov + r11)
+        return run(make_filter("a_new_slope:ANewSlope", changed), None, inputs, z).log_likelihoods.sum()
+
+    with interpreted():
+        found = likelihood(model, inputs, z, q, r, filter=make_filter("a_new_slope:ANewSlope", model))
+        h = 1e-4 * np.array([model.process_noise_cov[0, 0], model.measurement_noise_cov[0, 0]])
+        expected = [(level(*step) - level(*-step)) / (2 * step.sum()) for step in np.diag(h)]
+        np.testing.assert_allclose(found.gradients[0], expected, rtol=1e-5)
+        env = EstimateState(gym.make("BowThruster-v0"), filter="a_new_slope:ANewSlope")
+        env.reset(seed=1)
+        *_, info = env.step(env.action_space.sample())
+    assert np.isfinite(info["estimate"]).all()
+
+
+def test_a_filter_runs_on_a_model_that_cannot_be_traced(new):
+    kind = importlib.import_module(new("filter", "a_new_call")).ANewCall
+    inputs, z = simulated(pendulum(), 10, count=2, missing=0.2)
+    with interpreted():
+        one, other = (run(kind(model=pendulum(transition=f)), None, inputs, z) for f in (swing, swing_if))
+    np.testing.assert_allclose(one.means, other.means, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(one.covs, other.covs, rtol=1e-7, atol=1e-9)
+
+
+def test_studies_search_the_range_of_a_filters_parameter(new):
+    new("filter", "a_new_range")
+    (found,) = filter_parameters(filter_type("a_new_range:ANewRange"), True)
+    assert (found.name, found.low, found.high, found.default, found.log) == ("bandwidth", 1.0, 20.0, 3.0, True)
+    choice = rule_of_thumb("a_new_range:ANewRange", find_problem("outliers"))
+    assert choice.numbers == {"bandwidth": 3.0} and choice.filter(find_problem("outliers")).bandwidth == 3.0
+
+
+def test_an_env_is_estimated_and_is_a_problem(new):
+    module = importlib.import_module(new("env", "a_new_env"))
+    with interpreted():
+        env = EstimateState(module.SpringEnv(), filter="ekf")
+        env.reset(seed=1)
+        errors = []
+        for _ in range(100):
+            *_, info = env.step(env.action_space.sample())
+            errors.append(info["estimate"] - info["state"])
+    stds = np.sqrt(np.diag(info["estimate_cov"]))
+    assert (np.std(errors, axis=0) < 2 * stds).all()
+    problem = find_problem("a_new_env:problem")
+    assert problem.name == "a_new_env:problem" and len(problem.data([3, 4]).states[0]) == 301
+
+
+def test_a_model_estimates_the_log_that_it_writes(new, as_json, monkeypatch, tmp_path):  # noqa: F811
+    name = new("model", "a_new_model")
+    with interpreted():
+        runpy.run_path(str(tmp_path / f"{name}.py"), run_name="__main__")
+    whose = f"{name}.csv", "--model", f"{name}:model"
+    found = as_json("estimate", *whose, "--filter", "ekf")
+    assert found["nis_band"][0] < found["mean_nis"] < found["nis_band"][1]
+
+
+def test_a_preset_is_a_thruster(new, as_json):  # noqa: F811
+    name = new("preset", "a_new_preset")
+    found = read_preset(f"{name}.toml").parameters
+    for one, other in zip(found, TUNNEL_PHYSICAL, strict=True):
+        assert one == (pytest.approx(other, rel=1e-6) if isinstance(other, float) else other)
+    assert as_json("inspect", "--preset", f"{name}.toml")["picture"] == str(Path("out", f"inspect-{name}-12V.png"))
+    assert gym.make("BowThruster-v0", preset=f"{name}.toml").unwrapped.plant.parameters == found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ("modle", "x"),
+            "what is new must be one of problem, model, env, filter, preset, but got 'modle'; did you mean",
+        ),
+        (("model", "there"), "a new model must not replace a file, but there.py is there"),
+        (("preset", "x.py"), "a new preset must end in .toml, but got 'x.py'"),
+        (("env", "my-env"), "a module must have a name of letters, digits and _, but got 'my-env'"),
+        (("problem", "numpy"), "a new module must not hide one that is installed, but got 'numpy'"),
+        (("problem", "none/x"), "must be where it can be written"),
+    ],
+)
+def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # noqa: F811
+    (tmp_path / "there.py").write_text("mine\n")
+    (tmp_path / "none").write_text("a file\n")
+    done = thruster("new", *arguments)
+    assert done.returncode == 2 and line in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"there.py", "none"}
+    assert (tmp_path / "there.py").read_text() == "mine\n"
+
+
+@pytest.mark.slow
+def test_gradients_and_ways_tune_a_users_filter(new):
+    name = f"{new('filter', 'a_new_way')}:ANewWay"
+    study = tuning.tune("nominal", name, way="likelihood", progress=False)
+    evaluated = study.held_out
+    assert evaluated is not None and study.choice.numbers["bandwidth"] == 3.0
+    found = tune_by_gradient(name, find_problem("nominal"), find_problem("nominal").data(range(8)))
+    assert found.agree and found.best.converged

@@ -1,0 +1,127 @@
+"""`thruster play` without a policy: PI, voltages, a log, with an estimate beside the truth, and without torch."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.render import video
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.rendering.history import Moment, Overlay
+from tuning.cli import episodes
+
+
+@pytest.fixture
+def frames(monkeypatch):
+    """What would go into the video."""
+    kept = []
+    monkeypatch.setattr(episodes, "write_video", lambda path, pictures, rate: kept.append((path, pictures, rate)))
+    return kept
+
+
+def test_pi_follows_a_reference_under_an_estimate(as_json, frames):  # noqa: F811
+    found = as_json("play", "--policy", "PI".lower(), "--steps", 12, "--filter", "EKF", "--out", "x.gif")
+    assert found == {"steps": 12, "total_reward": found["total_reward"], "seconds": 0.12, "video": "x.gif"}
+    ((path, pictures, rate),) = frames
+    assert path.name == "x.gif" and rate == 25 and len(pictures) == 4 and pictures[0].shape[2] == 3
+
+
+def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
+    alone = as_json("play", "--steps", 8, "--out", "x.gif")
+    assert alone == as_json("play", "--policy", "pi", "--steps", 8, "--out", "x.gif") and alone["steps"] == 8
+
+
+@pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
+def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
+    seen = []
+    monkeypatch.setattr(episodes, "_played", spy(episodes._played, seen))
+    found = as_json("play", *option, "--steps", 8, "--preset", "t200", "--seed", 3, "--out", "x.gif")
+    assert found["steps"] == 8
+    env = seen[0]
+    assert env.unwrapped.plant.parameters.gear_ratio == 1.0  # a T200
+    assert env.unwrapped.moment_of([0.0] * 40).reference is None
+
+
+def test_a_picture_has_the_size_that_is_asked_for(thruster, as_json, frames):  # noqa: F811
+    as_json("play", "--steps", 4, "--size", "160X90", "--out", "x.mp4")
+    thruster("simulate", "--out", "run.csv", "--steps", 3)
+    as_json("play", "--log", "run.csv", "--size", "99x81", "--out", "x.gif")
+    assert [pictures[0].shape for _, pictures, _ in frames] == [(90, 160, 3), (81, 99, 3)]
+
+
+def spy(function, seen):
+    def called(env, *arguments):
+        seen.append(env)
+        return function(env, *arguments)
+
+    return called
+
+
+def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatch):  # noqa: F811
+    thruster("simulate", "--out", "run.csv", "--steps", 30, "--voltage", 9)
+    shown = []
+    monkeypatch.setattr(
+        "thruster_env.thruster.rendering.renderer.Renderer.add", lambda self, *both: shown.append(both)
+    )
+    monkeypatch.setattr("thruster_env.thruster.rendering.renderer.Renderer.draw", lambda self: np.zeros((2, 2, 3)))
+    assert as_json("play", "--log", "run.csv", "--out", "x.gif")["steps"] == 30
+    table = np.genfromtxt("run.csv", delimiter=",", names=True)
+    moment, overlay = shown[20]
+    assert moment == pytest.approx(
+        Moment(0.2, *(table[name][20] for name in table.dtype.names[2:6]), None, 9.0), nan_ok=True
+    )
+    assert isinstance(overlay, Overlay) and abs(overlay.omega_m - moment.omega_m) < 5 * overlay.omega_m_std
+    assert overlay.thrust == pytest.approx(
+        thruster_model(preset="tunnel").output("T", np.array([[overlay.omega_m, overlay.U_a]]))[0], rel=1e-9
+    )
+
+
+def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp_path):  # noqa: F811
+    times = 0.01 * np.arange(40)
+    rows = [f"{t:.2f},9,{10 * (1 - np.exp(-20 * t)):.4f}" for t in times]
+    (tmp_path / "bare.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    done = thruster("play", "--log", "bare.csv", "--out", "bare.gif")
+    assert done.returncode == 0 and "Video: bare.gif" in done.stdout
+    with Image.open("bare.gif") as picture:
+        assert picture.n_frames == 10
+        first = np.asarray(picture.convert("RGB"), dtype=int)
+        picture.seek(9)
+        assert np.abs(np.asarray(picture.convert("RGB"), dtype=int) - first).sum() > 1e5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--policy", "pi", "--voltage", 3), "but got --policy and --voltage"),
+        (("--policy", "ip"), "policy must be one of pi, but got 'ip'"),
+        (("--excitation", "stebs"), "but got 'stebs'; did you mean 'steps'?"),
+        (("--voltage", 99), "voltage must be within plus and minus 24, but got 99.0"),
+        (("--voltage", 3, "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
+        (("--voltage", 3, "--steps", 0), "steps must be a whole number of at least 1"),
+        (("--policy", "pi", "--column", "thrust=x"), "--column must come with --log, but got it with --policy"),
+        (("--size", "640"), "--size must be WIDTHxHEIGHT in pixels, as 640x400, but got '640'"),
+        (("--size", "640x10"), "the height of --size must be a whole number of at least 64, but got 10"),
+        (("--size", "9000x400"), "the width of --size must be at most 4096, but got 9000"),
+        (("--size", "640x401"), "the height of --size must be even for an .mp4, but got 401"),
+        (("some/folder", "--filter", "ekf"), "--filter must come with --policy or --voltage or"),
+        (("--voltage", 3, "--filter", "ekf", "--tuned", "t.json"), "but got both, t.json and ekf"),
+    ],
+)
+def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F811
+    done = thruster("play", *arguments)
+    assert done.returncode == 2 and line in done.stderr and not list(tmp_path.glob("*.gif"))
+
+
+def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
+    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="drawing needs pygame, which is not installed"):
+        video.check_drawing(None)
+
+
+def test_torch_is_not_imported():
+    code = "import sys, tuning.cli.play, tuning.cli.episodes; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr

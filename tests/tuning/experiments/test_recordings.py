@@ -1,0 +1,191 @@
+"""The recorded ROV thruster: on runs of our own and, where there are any, on the recorded ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.core.streams import episode_keys
+from thruster_env.model.simulate import simulate
+from tuning.experiments.recordings.clock import clock_offset
+from tuning.experiments.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_of
+from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
+from tuning.experiments.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
+from tuning.experiments.recordings.model import DT, model, to_identify
+from tuning.experiments.recordings.regime import after_reversal, regimes
+from tuning.experiments.recordings.results import identify_all, tasks_of
+from tuning.experiments.recordings.runs import read_recordings
+from tuning.experiments.recordings.tables import ladder_rows, number_rows
+from tuning.identification.values import valued
+
+RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
+TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}
+OFFSET = 0.05
+SERIES = "times", "command", "flow", "tachometer", "load", "own", "desired"
+HEADER = (
+    "t_s,Td_N,n_desired_rad_s,u_cmd_V,y_tach_abs_rad_s,y_flow_m_s,loadcell_thrust_N,loadcell_torque_Nm,"
+    "loadcell_tach_abs_rad_s,authors_nhat_rad_s,authors_vhat_axial_m_s,authors_vahat_ambient_m_s"
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two runs of our own in the recorder's form, the load cell's clock ahead by 0.05 s."""
+    folder = tmp_path_factory.mktemp("recorded")
+    times = DT * np.arange(251)
+    commands = [2.5 * np.sin(2 * np.pi * times / 10), np.where(times < 5, -2.5, 2.0)]
+    made = valued(to_identify(), TRUTH)
+    runs = simulate(made, episode_keys([1, 2]), np.stack(commands)[:, :-1, None])
+    for place, name in enumerate(("Ramp", "CLLookupStep")):
+        tachometer, load = runs.measurements[place].T
+        shifted = [np.interp(times - OFFSET, times, one) for one in (load, tachometer)]
+        own = np.full_like(times, np.nan) if place else 1.1 * runs.states[place, :, 0]
+        zero = np.zeros_like(times)
+        columns = (
+            times,
+            load + 1.0,
+            zero,
+            commands[place],
+            tachometer,
+            zero,
+            shifted[0],
+            zero,
+            shifted[1],
+            own,
+            zero,
+            zero,
+        )
+        text = [",".join(f"{value:.8g}" for value in row) for row in np.stack(columns, axis=1)]
+        (folder / f"{name}.csv").write_text("\n".join([HEADER, *text]), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(folder):
+    return read_recordings(folder)
+
+
+def test_the_clock_offset_is_read_off_the_two_tachometers(runs):
+    times = DT * np.arange(300)
+    here = np.sin(times) + np.sin(3.1 * times)
+    assert clock_offset(times, here, np.sin(times - 0.033) + np.sin(3.1 * (times - 0.033))) == pytest.approx(
+        0.033, abs=2e-3
+    )
+    assert runs[1].offset == pytest.approx(OFFSET, abs=1e-2)
+    assert runs[0].name == "CLLookupStep" and runs[0].own_is_desired and not runs[1].own_is_desired
+    np.testing.assert_array_equal(runs[0].own, runs[0].desired)
+
+
+def test_a_run_is_a_log_on_the_recorders_clock(runs):
+    log = runs[1].log()
+    assert log.dt == DT and log.inputs.shape == (250, 1) and np.isnan(log.measurements[0, 0])
+    there = ~np.isnan(log.measurements[:, 1])
+    shifted = np.interp(runs[1].times[there] + runs[1].offset, runs[1].times, runs[1].load)
+    np.testing.assert_allclose(log.measurements[there, 1], shifted, atol=1e-9)
+    assert runs[1].log(ambient=True).inputs.shape == (250, 2)
+
+
+def test_errors_are_averaged_and_shifted(runs):
+    assert averaged(np.array([0.0, 3.0, 0.0, 0.0]), 3).tolist() == [1.5, 1.0, 1.0, 0.0]
+    run = runs[1]
+    exact = np.interp(run.times + run.offset, run.times, run.load)
+    middle = slice(5, -5)
+    assert abs(error(exact, run, run.offset)[middle]).max() < 0.1 * abs(error(exact, run, 0.1)[middle]).max()
+    assert best_rmse(exact, run) <= rmse(exact, run, 0.0)
+    assert rmse(run.own, run) > settled_rmse(exact, run)
+    assert ratios(run.own, run) == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.slow
+def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs):
+    few = tuple(one for one in STRUCTURES[CHOSEN].free if one.name in ("thrust_factor", "dead_band_high", "R22"))
+    fixed = {name: value for name, value in TRUTH.items() if name not in ("thrust_factor", "dead_band_high")}
+    structure = Structure("few", few, fixed)
+    found = identified(structure, runs)
+    assert found.values["thrust_factor"] == pytest.approx(TRUTH["thrust_factor"], rel=0.05)
+    assert found.values["dead_band_high"] == pytest.approx(TRUTH["dead_band_high"], abs=0.05)
+    better = thrusts(structure.model(**found.values), runs)
+    worse = thrusts(structure.model(thrust_factor=2e-3), runs)
+    for one, other, run in zip(better, worse, runs, strict=True):
+        assert len(one) == len(run.times) and settled_rmse(one, run) < 0.5 * settled_rmse(other, run)
+
+
+@pytest.mark.slow
+def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
+    assert (
+        after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0])).tolist()
+        == [True] * 11 + [False] * 4 + [True] * 2
+    )
+    short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
+    (one,) = regimes(valued(to_identify(), TRUTH), short, [1.0])
+    ours = thrusts(valued(to_identify(), TRUTH), short)[0]
+    assert one.ratio == pytest.approx(ratios(ours, short[0]).averaged, rel=1e-6)
+    (more,) = regimes(valued(to_identify(), TRUTH), short, [16.0])
+    assert more.nis < one.nis
+
+
+@pytest.mark.slow
+def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
+    class Learnt:
+        interrupted, log_likelihood, agreement, optima = False, -1.0, 1, (1,)
+
+        def __init__(self, structure):
+            self.values = {one.name: one.start for one in structure.free}
+            self.standard_errors = dict.fromkeys(self.values, 0.1)
+            self.determined = dict.fromkeys(self.values, True)
+
+        def sentences(self):
+            return []
+
+    asked = []
+    monkeypatch.setattr(
+        "tuning.experiments.recordings.results.identified",
+        lambda structure, *_: asked.append(structure) or Learnt(structure),
+    )
+    file, told = tmp_path / "results.json", []
+    tasks = identify_all(runs, file, progress=lambda *one: told.append(one))
+    assert len(asked) == len(tasks) == len(tasks_of(runs)) == 3 * len(STRUCTURES)
+    assert told[0] == (CHOSEN, 0, len(tasks)) and told[1][0] == f"{CHOSEN}, without CLLookupStep"
+    identify_all(runs, file)
+    assert len(asked) == len(tasks)
+    assert len(number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
+    assert len(estimates_of(runs, tasks)[OURS]) == 2
+    few = {name: one for name, one in STRUCTURES.items() if name in (CHOSEN, "ambient")}
+    monkeypatch.setattr("tuning.experiments.recordings.tables.STRUCTURES", few)
+    assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
+
+
+@pytest.mark.slow
+def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):  # noqa: F811
+    found = as_json("study", "recordings", "--data", folder)
+    assert [row["run"] for row in found["ratios"]] == ["CLLookupStep", "Ramp", "mean"]
+    assert {OURS, OWN, STATIC, LOOKUP} <= set(found["estimators"][0])
+    assert float(found["clocks"][1]["offset, s"]) == pytest.approx(OFFSET, abs=1e-2)
+
+
+def test_a_folder_without_recordings_is_refused(thruster, tmp_path):  # noqa: F811
+    refused = thruster("study", "recordings", "--data", tmp_path)
+    assert refused.returncode == 2 and "recordings must be .csv files in" in refused.stderr
+    (tmp_path / "x.csv").write_text("t_s,u_cmd_V\n0,1\n1,2\n", encoding="utf-8")
+    refused = thruster("study", "recordings", "--data", tmp_path)
+    assert refused.returncode == 2 and "a recording must have the column y_flow_m_s" in refused.stderr
+
+
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="the recordings are no part of this project")
+def test_goals_on_the_recorded_runs():
+    recorded = read_recordings(RECORDED)
+    found = np.array([ratios(one, run) for one, run in zip(thrusts(model(), recorded), recorded, strict=True)])
+    averages, best, raw = found.T
+    steps = np.array(["Step" in run.name for run in recorded])
+    assert averages.max() <= 0.6 and averages.mean() <= 0.4 and best.max() <= 0.8
+    assert raw[~steps].max() <= 0.65 and raw[steps].max() <= 0.7
+    assert rmse(recorded[0].own, recorded[0], 0.0, window=1) == pytest.approx(1.99, abs=5e-3)  # as filed
+
+
+def test_the_own_estimate_of_another_estimator_is_not_made_up(folder, tmp_path):
+    """Coefficients of runs named CL1state are not known: these are compared with the desired thrust."""
+    (tmp_path / "CL1stateKFRamp.csv").write_text((folder / "Ramp.csv").read_text())
+    (run,) = read_recordings(tmp_path)
+    assert run.own_is_desired
+    np.testing.assert_array_equal(run.own, run.desired)

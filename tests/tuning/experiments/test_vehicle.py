@@ -1,0 +1,251 @@
+import json
+
+import numpy as np
+import pytest
+
+from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, affine_model, run
+from tests.slow import slow_but
+from tests.tuning.experiments.test_studies import command_line
+from tuning.cli import output
+from tuning.experiments import VEHICLE_STUDIES, ngatini2017, ngatini2019
+from tuning.experiments.vehicle import estimators
+from tuning.experiments.vehicle.estimators import kalman, measured
+from tuning.experiments.vehicle.experiment import (
+    Task,
+    along_path,
+    keys_of,
+    measured_velocities,
+    noise_free,
+    run_tasks,
+    scores_of,
+    true_runs,
+)
+from tuning.experiments.vehicle.findings import why_different
+from tuning.experiments.vehicle.mean_propagation import MeanPropagatingEnKF
+from tuning.experiments.vehicle.models import papers_model
+from tuning.experiments.vehicle.paths import PATHS, find_path
+from tuning.experiments.vehicle.pose import full_pose, planar_pose, pose_errors, reckoned_attitude
+from tuning.experiments.vehicle.printed import DT, NOISE, PrintedRow
+from tuning.experiments.vehicle.statements import GOLDEN, MEAN_ONLY, unstable_corners
+from tuning.experiments.vehicle.tasks import PAPERS
+from tuning.experiments.vehicle.wording import digits
+
+ENDS = {  # (north, east, down) [m], of a prototype with other code
+    "I": (-2.415, 3.789, 0.114),
+    "II": (20.752, 0.022, 3.770),
+    "III": (21.143, 0.000, 0.063),
+    "IV": (10.0, 18.0, 6.0),
+    "dynamic": (19.01, -4.69, 0.02),
+}
+GAPS = {  # x, y, z, psi: RMSE of the transformation by yaw alone on noise-free velocities, of the prototype
+    "I": (0.002, 0.001, 0.061, 0.0005),
+    "II": (0.164, 0.011, 2.28, 0.001),
+    "III": (0.0005, 0.0004, 0.050, 0.0001),
+    "IV": (0.497, 0.168, 3.73, 0.046),
+    "dynamic": (0.102, 0.024, 0.360, 0.008),
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_paths_end_where_they_should_and_yaw_alone_leads_elsewhere(name):
+    states = noise_free("vehicle", PATHS[name].inputs())
+    np.testing.assert_allclose(states[-1, 9:], ENDS[name], atol=6e-3)
+    pose = states[:, [9, 10, 11, 8]]
+    gap = np.sqrt(np.square(planar_pose(states[None, :, :6], DT)[0] - pose).mean(axis=0))
+    np.testing.assert_allclose(gap, GAPS[name], rtol=0.02, atol=6e-4)
+    # The full transformation of exact velocities is the exact pose, with roll and pitch told or reckoned.
+    for attitude in (states[None, :, 6:8], None):
+        np.testing.assert_allclose(full_pose(states[None, :, :6], attitude, DT)[0], pose, atol=2e-5)
+    np.testing.assert_allclose(reckoned_attitude(states[None, :, :6], DT)[0], states[:, 6:8], atol=1e-6)
+
+
+def test_inputs_of_the_dynamic_path_change_sign_as_the_sines_do():
+    inputs, time = PATHS["dynamic"].inputs(), DT * np.arange(25000)
+    np.testing.assert_array_equal(inputs[:, 2] > 0, (time % 14.0) < 7.0)
+    np.testing.assert_array_equal(inputs[:, 3] > 0, (time % 10.0) < 5.0)
+    np.testing.assert_allclose(np.unique(inputs[:, 0]), 2.84531 * np.array([0.6, 1.4]))
+    np.testing.assert_allclose(inputs[:, 1], -0.006 * inputs[:, 0])
+    with pytest.raises(ValueError, match="path must be one of I, II, III, IV, dynamic, but got 'V'"):
+        find_path("V")
+
+
+def test_measurements_alone_are_what_the_sensors_say():
+    truth = true_runs("vehicle", keys_of("III", 2, 0), PATHS["III"].inputs(400))
+    velocities = measured_velocities(truth)
+    np.testing.assert_array_equal(velocities[..., [0, 1, 2, 5]], truth.measurements)
+    assert not velocities[..., 3:5].any()
+    errors = (velocities - truth.states[..., :6])[..., [0, 1, 2, 5]]
+    np.testing.assert_allclose(errors.std(axis=(0, 1)), 1e-3, rtol=0.1)
+    scores = scores_of(measured(), truth, keys_of("III", 2, 0), PATHS["III"].inputs(400))
+    assert np.isnan(scores.full).all() and np.isnan(scores.nees).all() and np.isfinite(scores.planar).all()
+
+
+def test_bound_of_measured_velocities_is_the_golden_ratio(as_python):
+    _, _, outside, bound = along_path("vehicle", PATHS["IV"].inputs(60))
+    np.testing.assert_allclose(bound.velocities[[0, 1, 2, 5]], GOLDEN, rtol=1e-3)
+    assert (bound.velocities[3:5] > 2 * GOLDEN).all() and outside[-1] >= outside[:-1].max()
+
+
+def test_a_forecast_from_the_mean_forgets_the_members(as_python):
+    wide = papers_model("motion", integration="euler").replace(prior_cov=(1e-4,) * 8)
+    u = PATHS["I"].inputs(1)[0]
+    spread = {}
+    for kind in (MeanPropagatingEnKF, EnsembleKalmanFilter):
+        filter_ = kind(model=wide, ensemble_size=400)
+        first = filter_.init((3, 4))
+        then = filter_.predict(first, u)
+        spread[kind] = np.diag(then.cov)
+        noise = np.sqrt(np.diag(wide.process_noise_cov))
+        moved = np.array(wide.transition(tuple(first.mean), tuple(u), wide.constants))
+        if kind is MeanPropagatingEnKF:
+            assert (np.abs(then.mean - moved) < 4 * noise / 20).all()
+    sampled = 1 + 4 * np.sqrt(2 / 400)
+    np.testing.assert_array_less(spread[MeanPropagatingEnKF], sampled * np.diag(wide.process_noise_cov))
+    assert (spread[EnsembleKalmanFilter] > 50 * spread[MeanPropagatingEnKF]).all()
+
+
+def test_mean_propagating_filter_has_a_gain_of_one_half(as_python):
+    one = {"a": [[1.0]], "b": [[0.0]], "c": [[1.0]], "process_noise_cov": [1.0], "measurement_noise_cov": [1.0]}
+    model = affine_model(**one, prior_mean=[0.0], prior_cov=[1.0])
+    gains = {}
+    for kind in (MeanPropagatingEnKF, EnsembleKalmanFilter):
+        z = 1e4 * 2.0 ** np.arange(9).reshape(1, 9, 1)  # innovations so large that perturbations do not matter
+        found = run(kind(model=model, ensemble_size=1000), np.zeros((1, 2)), np.zeros((1, 8, 1)), z)
+        moved = found.means[0, -1, 0] - found.means[0, -2, 0]
+        gains[kind] = moved / found.innovations[0, -1, 0]
+    assert gains[MeanPropagatingEnKF] == pytest.approx(0.5, abs=0.05)
+    assert gains[EnsembleKalmanFilter] == pytest.approx((5**0.5 - 1) / 2, abs=0.05)
+    # The error of such a filter: e' = (1 - K)(e + w) - K v.
+    k = 0.5
+    assert MEAN_ONLY**2 / NOISE == pytest.approx(((1 - k) ** 2 + k**2) / (1 - (1 - k) ** 2))
+
+
+def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
+    own = kalman()[3].filter
+    inputs, keys = np.zeros((2, 40, 6)), keys_of("dynamic", 2, 0)
+    inputs[..., :4] = PATHS["dynamic"].inputs(40)
+    z = true_runs("vehicle", keys, inputs[0, :, :4]).measurements
+    means = run(own, keys, inputs, z).means
+    told = inputs.copy()
+    told[..., 4:] = reckoned_attitude(means, DT)[:, :-1]
+    assert np.abs(told[:, -1, 4:]).min() > 1e-6
+    plain = run(ExtendedKalmanFilter(model=own.model), keys, told, z).means
+    np.testing.assert_allclose(means, plain, atol=1e-13)
+    inputs[..., 4:] = 0.3  # what is given as roll and pitch does not matter
+    np.testing.assert_array_equal(run(own, keys, inputs, z).means, means)
+
+
+@pytest.mark.slow
+def test_filters_on_the_same_runs(as_python):
+    ekf8, _, level, own = kalman()
+    tasks = [Task("dynamic", "vehicle", [measured(), ekf8, level, own])]
+    (result,) = run_tasks(tasks, runs=2, steps=80)
+    assert [len(one.nees) for one in result.scores.values()] == [2] * 4 and result.steps == 80
+    for label in ("EKF8", "EKF6 level", "EKF6 own attitude"):
+        one = result.scores[label]
+        np.testing.assert_allclose(one.rmse("velocities")[[0, 1, 2, 5]], GOLDEN, rtol=0.25)
+        np.testing.assert_allclose(one.rmse("planar"), result.scores["EKF8"].rmse("planar"), rtol=0.1)
+        assert (one.rmse("full")[:3] < 1e-3).all() and not one.divergences.any()
+    assert 4 < result.scores["EKF8"].nees.mean() < 14
+    again = run_tasks([Task("dynamic", "vehicle", [ekf8])], runs=2, steps=80)[0].scores["EKF8"]
+    np.testing.assert_array_equal(again.velocities, result.scores["EKF8"].velocities)
+
+
+def test_corners_of_the_bounds_are_unstable():
+    count, growth = unstable_corners()
+    assert count == 23 and growth == pytest.approx(1.77, abs=0.01)
+
+
+def test_printed_tables_are_whole():
+    assert set(PAPERS) == set(VEHICLE_STUDIES)
+    assert set(ngatini2017.PATHS) == set(PATHS) and list(ngatini2019.TABLE_III) == [50, 100, 200, 300]
+    assert [len(row.rmse) for row in ngatini2019.TABLE_III.values()] == [4] * 4
+    fourth = ngatini2017.PATHS["IV"].enkf.rmse
+    for name, value in ngatini2019.TABLE_III[50].rmse.items():
+        assert fourth[name] == pytest.approx(value, abs=5e-4)  # one run of the two papers is the same
+    for path in ngatini2017.PATHS.values():
+        assert set(path.enkf.rmse) == set(path.fkf.rmse) and set(path.enkf.final_percent) == set(
+            path.fkf.final_percent
+        )
+    dynamic = ngatini2017.PATHS["dynamic"]
+    assert dynamic.enkf.final_percent == dynamic.enkf.rmse and dynamic.remark
+
+
+def test_why_differences_are_told_by_size(as_python):
+    (result,) = run_tasks([Task("III", "vehicle", [measured(), kalman()[0]])], runs=2, steps=60)
+    scores = result.scores["EKF8"]
+    pose = dict(zip(("x", "y", "psi"), scores.rmse("full")[[0, 1, 3]], strict=True))
+    full = why_different(PrintedRow(pose, 1.0), scores, result)
+    assert full == "similar to ours by the full transformation"
+    tiny = why_different(PrintedRow({"psi": 1e-3 * result.bound.pose[3]}, 1.0), scores, result)
+    assert "psi below the limit" in tiny
+    huge = why_different(PrintedRow({"x": 1e3, "psi": pose["psi"]}, 1.0), scores, result)
+    assert "x unlike any of ours" in huge and "psi similar to" in huge
+    assert "no one transformation gives the row" in huge and "transformation gives" not in full + tiny
+
+
+def test_digits_stand_apart_by_thousands():
+    assert [digits(one) for one in (0.78612, 12.34, 8.0, 45421.0, float("nan"))] == [
+        "0.786",
+        "12.3",
+        "8",
+        "45 400",
+        "",
+    ]
+
+
+@pytest.fixture
+def quick(monkeypatch, as_python):
+    """Four members in every ensemble and two rules in every fuzzy filter, as Python."""
+    for name in ("EnsembleKalmanFilter", "MeanPropagatingEnKF"):
+        kind = getattr(estimators, name)
+        monkeypatch.setattr(estimators, name, lambda kind=kind, **given: kind(**given | {"ensemble_size": 4}))
+    fuzzy = estimators.FuzzyKalmanFilter
+    monkeypatch.setattr(estimators, "FuzzyKalmanFilter", lambda **given: fuzzy(premises=(0,), **given))
+
+
+@pytest.mark.parametrize("paper", slow_but(VEHICLE_STUDIES, [*VEHICLE_STUDIES][1:]))
+def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, tmp_path, paper):
+    monkeypatch.setattr(output.console, "width", 100)
+    table, picture = tmp_path / "table.json", tmp_path / "paths.png"
+    options = ["--runs", "2", "--steps", "2", "--json", str(table), "--series", str(picture)]
+    assert command_line(monkeypatch, paper, *options) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown and max(map(len, shown.splitlines())) <= 100
+    words = " ".join(shown.split())
+    for said in ("0.082", "EnKF8", "Conclusions from the runs", "useless here", "H P H' + R", "Picture:"):
+        assert said in words, said
+    found = json.loads(table.read_text())
+    assert found["settings"] == {"runs": 2, "seed": 0, "steps": 2} and picture.stat().st_size > 10_000
+    by_path = {(one["path"], one["world"]): one["filters"] for one in found["results"]}
+    if paper == "ngatini2019":
+        assert [one["path"] for one in found["series"]] == ["IV"] and "0.4674" in words
+        sizes = [by_path["IV", "vehicle"][f"EnKF8 N={count}"] for count in (50, 100, 200, 300)]
+        assert [one["published"]["seconds"] for one in sizes] == [2.819, 5.692, 11.56, 18.15]
+    else:
+        assert set(by_path) == {(path, "vehicle") for path in PATHS} | {("dynamic", "no restoring moments")}
+        assert by_path["III", "vehicle"]["fuzzy 0..1"]["published"]["rmse"]["psi"] == 1e-5
+        assert "23 of the 64" in words and "4.834" in words
+    assert all(one["why"] for filters in by_path.values() for one in filters.values() if one["published"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rule"),
+    [
+        (("ngatini2019", "--members", "5"), "--members must come with a paper on the thruster"),
+        (("nurhadi2022", "--steps", "5"), "--steps must come with a paper on the vehicle"),
+        (("lorenz63", "--series", "a.png"), "--series must come with a paper, but got 'lorenz63'"),
+        (("ngatini2017", "--runs", "1"), "runs must be a whole number of at least 2"),
+        (("ngatini2017", "--steps", "1"), "steps must be a whole number of at least 2"),
+        (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(monkeypatch, capsys, arguments, rule):
+    assert command_line(monkeypatch, *arguments) == 2
+    said = capsys.readouterr()
+    assert rule in " ".join(said.err.split()) and not said.out
+
+
+def test_errors_of_yaw_are_the_short_way_round():
+    true, found = np.array([[1.0, 2.0, 3.0, 6.2]]), np.array([[1.5, 2.0, 2.0, 0.1]])
+    np.testing.assert_allclose(pose_errors(found, true), [[0.5, 0.0, -1.0, 2 * np.pi - 6.1]], atol=1e-12)

@@ -1,0 +1,131 @@
+"""The study of ways of tuning: statistics against closed forms, resuming, and the command in its quick form."""
+
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp, ttest_rel
+
+from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tuning.experiments.ways import runs as study_runs
+from tuning.experiments.ways.entries import Result, Scored, data_set, reference, run_way, start_of
+from tuning.experiments.ways.predictions import PREDICTIONS
+from tuning.experiments.ways.problems import CASES, GROUPS, QUICK, ring
+from tuning.experiments.ways.protocol import ENTRIES, FAST, REFERENCE, Protocol
+from tuning.experiments.ways.runs import file_of, jobs_of, run_protocol
+from tuning.experiments.ways.statistics import chance, regrets, student
+from tuning.experiments.ways.tables import percent, tables
+
+WALK = QUICK[0]
+
+
+def result(way, place, score, error="", log_score=-1.0):
+    scored = Scored(score, 1.0, 1.0, -10.0, log_score)
+    return Result(WALK.name, way, place, {"1000": scored}, {"1": scored}, scored, 100.0, 0.1, {}, error)
+
+
+def test_intervals_and_chances_are_students():
+    values = np.random.default_rng(0).normal(0.1, 0.05, 8)
+    found = student(values)
+    low, high = ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert (found.value, found.low, found.high) == pytest.approx((values.mean(), low, high))
+    one, best = dict(enumerate(values)), dict(enumerate(values - np.linspace(0.0, 0.03, 8)))
+    expected = ttest_rel(list(one.values()), list(best.values()), alternative="greater").pvalue
+    assert chance(one, best) == pytest.approx(expected)
+    assert chance(best, best) == 1.0
+
+
+def test_regrets_are_ratios_to_the_reference_and_the_best_comes_first():
+    rng = np.random.default_rng(1)
+    good, bad = 1.0 + rng.uniform(0.0, 0.004, 6), 1.2 + rng.uniform(0.0, 0.01, 6)
+    results = [result(REFERENCE, 0, 0.8, log_score=-0.9)]
+    results += [result("likelihood", k, 0.8 * one) for k, one in enumerate(good)]
+    results += [result("random", k, 0.8 * one, "broke" if k == 2 else "") for k, one in enumerate(bad)]
+    first, second = regrets(results, WALK)
+    assert (first.way, second.way) == ("likelihood", "random")
+    assert first.ratio.value == pytest.approx(math.exp(np.log(good).mean()))
+    assert first.equal and not first.worse and second.worse and not second.equal
+    assert second.failures == 1 and second.sets == 6 and second.worst == pytest.approx(bad.max())
+    assert first.log_score == pytest.approx(0.1)
+    assert [percent(one) for one in (1.012, 0.999, 3.0)] == ["+1.2 %", "-0.1 %", "x 3"]
+
+
+def test_all_ways_have_equal_data_and_starts_and_held_out_runs_are_others():
+    first, again, other = (data_set(WALK, place) for place in (0, 0, 1))
+    np.testing.assert_array_equal(first.measurements, again.measurements)
+    assert len(first.seeds) == WALK.runs and not set(first.seeds) & set(other.seeds)
+    held_out = WALK.make().held_out_seeds(0, 200)
+    assert not set(held_out) & {seed for place in range(20) for seed in WALK.make().training_seeds(place, 32)}
+    assert data_set(QUICK[1], 0).states is None
+    q = [start_of(WALK, place).model["process_noise_cov"][0] for place in range(4)]
+    assert np.divide(q, q[0]).tolist() == pytest.approx([1.0, 100.0, 0.01, 1.0])
+    assert start_of(WALK, 2).model["measurement_noise_cov"] == pytest.approx(400.0)
+
+
+def test_a_way_that_lacks_something_is_no_failure_and_one_that_breaks_is():
+    blind = run_way(QUICK[1], "noise-estimation", 0, FAST)
+    assert blind.last is None and "needs true states" in blind.error
+    studied = run_way(WALK, "study", 0, FAST)
+    assert studied.last is None  # it would draw runs of its own
+    em = run_way(WALK, "em", 0, FAST)
+    assert em.error == "" and em.by_seconds.keys() == {"1"} and em.taken_runs <= FAST.runs + WALK.runs
+    best = reference(WALK, FAST).last
+    assert best.score < em.last.score * 1.01
+
+
+def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
+    few = FAST._replace(ways=("likelihood", "noise-estimation"), sets=2)
+    first = run_protocol(few, tmp_path)
+    assert len(first) == len(list(jobs_of(few))) == 1 + 2 * 2 * 2
+    monkeypatch.setattr(study_runs, "run_way", None)
+    again = run_protocol(few, tmp_path)
+    assert json.dumps([one._asdict() for one in again]) == json.dumps([one._asdict() for one in first])
+    name = file_of(tmp_path, WALK, "likelihood", 1, few)
+    assert name.is_file() and file_of(tmp_path, WALK, "likelihood", 1, few._replace(runs=999)) != name
+    made = tables(again, few)
+    assert "noise-estimation" in made["what to use"]() and "`walk`" in made["group A"]()
+
+
+def test_the_protocol_names_all_groups_and_was_predicted():
+    assert {case.group for case in CASES} == set(GROUPS)
+    assert len({case.name for case in CASES}) == len(CASES) and Protocol().ways == ENTRIES
+    assert pickle.loads(pickle.dumps(CASES)) is not None  # --jobs sends them to processes
+    assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
+
+
+@pytest.mark.slow
+def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
+    case = next(case for case in CASES if case.name == "targets")._replace(runs=4)
+    q = case.make().true["process_noise_cov"]
+    blocks = np.array(q).reshape(2, 4, 2, 4)
+    assert np.count_nonzero(blocks[0, :, 0]) == np.count_nonzero(blocks[1, :, 1]) == 16
+    assert not blocks[0, :, 1].any() and np.linalg.eigvalsh(np.array(q))[0] > 0.0
+    # Van Loan's integral of a velocity that wanders, by small steps.
+    steps = np.linspace(0.0, 1.0, 2001)
+    moved = np.array(
+        [[np.trapezoid(a * b, steps) for b in (steps, 1.0 + 0.0 * steps)] for a in (steps, 1.0 + 0.0 * steps)]
+    )
+    np.testing.assert_allclose(blocks[0, :, 0], np.kron(moved, blocks[0, 2:, 0, 2:]), rtol=1e-6)
+    found, start, oracle = (run_way(case, way, 0, FAST).last for way in ("noise-estimation", "start", "oracle"))
+    assert found.score < 1.01 * oracle.score < 0.9 * start.score
+
+
+@pytest.mark.slow
+def test_a_ring_is_tuned_by_its_inflation_alone():
+    case = next(case for case in CASES if case.make is ring)._replace(make=lambda: ring(100), runs=2)
+    starts = [start_of(case, place) for place in range(3)]
+    assert starts[0] == starts[1] == starts[2] and starts[0].numbers["ensemble_size"] == 20
+    assert set(starts[0].model["measurement_noise_cov"]) == {1.0}
+    found = run_way(case, "anderson", 0, FAST)
+    assert found.error == "" and 1.005 < found.choice["numbers"]["inflation"] < 1.05
+    assert run_way(case, "likelihood", 0, FAST).last is None
+
+
+def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811
+    page = tmp_path / "ways.md"
+    page.write_text("# Ways\n\n<!-- table group A -->\n<!-- end -->\n", encoding="utf-8")
+    told = as_json("study", "ways", "--quick", "--way", "likelihood", "--way", "start", "--page", page)
+    assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "ways_groups.png").is_file()
+    assert {one["way"] for one in told["results"]} == {"likelihood", "start", "reference"}

@@ -1,0 +1,280 @@
+"""The vehicle as a `StateSpaceModel` that a filter assumes, with six to fourteen states."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from thruster_env.auv import dynamics
+from thruster_env.auv.channels import CHANNELS, MEASURED, channels_of, suite
+from thruster_env.auv.kinematics import angle_rates, attitude_of, in_earth_axes
+from thruster_env.auv.measured_attitude import derivative_by_attitude, split_channels
+from thruster_env.auv.operating import cruise_thrust, operating_range
+from thruster_env.auv.parameters import VehicleParameters, checked
+from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
+from thruster_env.auv.quantities import ATTITUDE_INPUTS, CURRENT_STATES, STATES, SYMBOLS
+from thruster_env.core.checks import covariance, one_of, positive
+from thruster_env.core.compiled import inlined
+from thruster_env.core.factors import scaled
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.env.channels import functions_of
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How many states move, by which functions of the equations of motion."""
+
+    count: int
+    methods: dict[str, tuple[Callable, Callable]]  # the step by each method of integration, and its Jacobian
+
+
+MODELS = {
+    "velocities": Steps(
+        6,
+        {
+            "runge-kutta": (dynamics.velocity_substep, dynamics.velocity_jacobian),
+            "euler": (dynamics.velocity_euler, dynamics.velocity_euler_jacobian),
+        },
+    ),
+    "motion": Steps(
+        8,
+        {
+            "runge-kutta": (dynamics.motion_substep, dynamics.motion_jacobian),
+            "euler": (dynamics.motion_euler, dynamics.motion_euler_jacobian),
+        },
+    ),
+    "navigation": Steps(
+        12,
+        {
+            "runge-kutta": (dynamics.navigation_substep, dynamics.navigation_jacobian),
+            "euler": (dynamics.navigation_euler, dynamics.navigation_euler_jacobian),
+        },
+    ),
+    "current": Steps(
+        14,
+        {
+            "runge-kutta": (dynamics.drifting_substep, dynamics.drifting_jacobian),
+            "euler": (dynamics.drifting_euler, dynamics.drifting_euler_jacobian),
+        },
+    ),
+}
+"""Models by name: the papers' six velocities; with roll and pitch; with yaw and position; with the current."""
+
+CURRENT_STD, CURRENT_TIME = 0.2, 60.0  # m/s, s; assumed, of tides and wind about a coast
+METHODS = ("runge-kutta", "euler")
+ATTITUDES = ("input", "measured", "level")
+
+
+@makes_functions
+def transition_of(states: str, method: str, torque_is_input: bool, attitude: str) -> tuple[Callable, Callable]:
+    """One step of a model, and its Jacobian, as functions of the model's own inputs."""
+    step, jacobian = MODELS[states].methods[method]
+    source = f"move(x, {tuple_of(forces_of(states, torque_is_input, attitude != 'level'))}, c)"
+    return (
+        written_out("transition", "x, u, c", source, move=step),
+        written_out("transition_jacobian", "x, u, c", source, _loops=True, move=jacobian),
+    )
+
+
+def forces_of(states: str, torque_is_input: bool, attitude_is_input: bool) -> list[str]:
+    """The inputs of the equations of motion as sources, of the model's own inputs u and constants c."""
+    if torque_is_input:
+        inputs = ["u[0]", "u[1]", "u[2]", "u[3]"]
+    else:
+        inputs = ["u[0]", "c.propeller_torque * u[0]", "u[1]", "u[2]"]
+    if states == "velocities":
+        first = 4 if torque_is_input else 3
+        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude_is_input else ["0.0", "0.0"]
+    return inputs
+
+
+@inlined
+def no_outputs(x, c):
+    """Nothing: the measurements of a vehicle are its states."""
+    return ()
+
+
+@makes_functions
+def observation_of(channels: tuple[str, ...], count: int) -> tuple[Callable, Callable]:
+    """`observe` and its Jacobian for some measured quantities of the first `count` states."""
+    return functions_of(channels_of(channels, count), no_outputs, no_outputs, count)
+
+
+def speed_of(x, c):
+    """Speed [m/s] over ground at components x of the state, floats or arrays."""
+    return (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) ** 0.5
+
+
+def sinking_of(x, c):
+    """Rate of depth [m/s]."""
+    return in_earth_axes(attitude_of(x[6], x[7]), 0.0, x[0], x[1], x[2])[2]
+
+
+def turning_of(x, c):
+    """Rate of yaw [rad/s]."""
+    return angle_rates(attitude_of(x[6], x[7]), x[3], x[4], x[5])[2]
+
+
+OUTPUTS = {
+    "U": (Quantity("speed", "U", "m/s"), speed_of),
+    "z_dot": (Quantity("sinking speed", "z_dot", "m/s"), sinking_of),
+    "psi_dot": (Quantity("rate of yaw", "psi_dot", "rad/s"), turning_of),
+}
+"""What follows from a state; but the speed, from one with roll and pitch."""
+
+
+def auv_model(
+    *,
+    states: str | None = None,
+    sensors=None,
+    integration: str = "runge-kutta",
+    attitude: str = "input",
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_speed: float = CRUISE_SPEED,
+    current_std: float = CURRENT_STD,
+    current_time: float = CURRENT_TIME,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
+    **plant_arguments,
+) -> StateSpaceModel:
+    """The model of a vehicle that a filter assumes, from plain arguments that JSON can hold.
+
+        x_{k+1} = F(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
+
+    F integrates the equations of `thruster_env.auv.dynamics` over one sample time. Covariances are per step and do
+    not scale with dt: another dt needs another Q.
+
+    Args:
+        states: "velocities" for (u, v, w, p, q, r), "motion" for these with (phi, theta), "navigation" for those
+            with (psi, x, y, z), "current" for those with the current (c_x, c_y) to the north and east; None for
+            "motion", or "navigation" if a sensor asks for it.
+        sensors: as `thruster_env.auv.plant.make_plant` takes them; None for those of the suite "default" that the
+            states predict.
+        integration: "runge-kutta", or "euler" as in the papers.
+        attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
+            the sensors measure them, see `thruster_env.auv.measured_attitude`, "level" for zeros.
+        parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
+        operating_speed: speed straight ahead about which a Kalman filter linearises the model [m/s].
+        current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
+        current_time: of "current" alone: time constant of the current [s]. It is a random walk whose variance
+            grows by 2 current_std^2 t/current_time in a time t, as that of a Gauss-Markov process does at first.
+        process_noise_cov: Q of the model's n states, (n, n) or n variances; the plant's if None.
+        measurement_noise_cov: R, (m, m) or m variances; the plant's if None.
+        prior_cov_factor: P_0, the covariance of the filter's prior, divided by that of the plant's initial state.
+        **plant_arguments: others of `thruster_env.auv.plant.make_plant`.
+
+    Raises:
+        ValueError: if an argument is wrong; the message states the rule and the value.
+    """
+    if sensors is None:
+        states = "motion" if states is None else one_of("states", states, tuple(MODELS))
+        known = SYMBOLS[: max(MODELS[states].count, 8 if attitude == "measured" else 0)]
+        sensors = [channel for channel in suite("default") if MEASURED[channel] in known]
+    return model_of_plant(
+        make_plant(sensors=sensors, **plant_arguments),
+        states=states,
+        integration=integration,
+        attitude=attitude,
+        parameter_factors=parameter_factors,
+        operating_speed=operating_speed,
+        current_std=current_std,
+        current_time=current_time,
+        process_noise_cov=process_noise_cov,
+        measurement_noise_cov=measurement_noise_cov,
+        prior_cov_factor=prior_cov_factor,
+    )
+
+
+def model_of_plant(
+    plant: Plant,
+    *,
+    states: str | None = None,
+    integration: str = "runge-kutta",
+    attitude: str = "input",
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_speed: float = CRUISE_SPEED,
+    current_std: float = CURRENT_STD,
+    current_time: float = CURRENT_TIME,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
+) -> StateSpaceModel:
+    """The model of a plant, exact unless changed; see `auv_model` for the arguments."""
+    states = _smallest(plant.channels) if states is None else one_of("states", states, tuple(MODELS))
+    method = one_of("integration", integration, METHODS)
+    attitude = one_of("attitude", attitude, ATTITUDES)
+    n, torque_is_input = MODELS[states].count, plant.propeller_torque is None
+    told, seen = split_channels(plant.channels, states, attitude)
+    observe, observe_jacobian = observation_of(tuple(plant.channels[i] for i in seen), n)
+    if parameter_factors is not None:
+        changed = scaled(plant.parameters, parameter_factors, VehicleParameters._fields)
+        plant = plant._replace(parameters=checked(changed))
+    move, move_jacobian = transition_of(states, method, torque_is_input, attitude)
+    inputs = plant.inputs + (ATTITUDE_INPUTS if states == "velocities" and attitude != "level" else ())
+    speed = positive("operating_speed", operating_speed)
+    thrust = cruise_thrust(plant.parameters, speed)
+    torque = plant.propeller_torque or 0.0
+    at_cruise = {"X_prop": thrust, "K_prop": torque * thrust}
+    std, wandering = positive("current_std", current_std), positive("current_time", current_time)
+    high = state_range(plant, n, std)
+    prior_factor = positive("prior_cov_factor", prior_cov_factor)
+    cruise, held = speed * np.eye(n)[0], [at_cruise.get(quantity.symbol, 0.0) for quantity in inputs]
+    q = _block(plant.process_noise_cov, n, 2.0 * std**2 * plant.dt / wandering)
+    r = plant.measurement_noise_cov[np.ix_(seen, seen)]
+    if told:
+        slopes = derivative_by_attitude(move, cruise, held, plant)
+        q = q + slopes @ plant.measurement_noise_cov[np.ix_(told, told)] @ slopes.T
+    if process_noise_cov is not None:
+        q = covariance("process_noise_cov", process_noise_cov, n)
+    if measurement_noise_cov is not None:
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(seen))
+    return StateSpaceModel(
+        transition=move,
+        observe=observe,
+        transition_jacobian=move_jacobian,
+        observe_jacobian=observe_jacobian,
+        process_noise_cov=q,
+        measurement_noise_cov=r,
+        prior_mean=np.append(plant.initial_mean, np.zeros(2))[:n],
+        prior_cov=prior_factor * _block(plant.initial_cov, n, std**2),
+        inputs=len(inputs),
+        constants=plant.constants,
+        substeps=plant.substeps,
+        operating_state=cruise,
+        operating_input=held,
+        state_low=np.where(np.arange(n) == 0, 0.0, -high),
+        state_high=high,
+        states=(*STATES, *CURRENT_STATES)[:n],
+        input_quantities=inputs,
+        measurements=[CHANNELS[plant.channels[i]].quantity for i in seen],
+        outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
+    )
+
+
+def state_range(plant: Plant, n: int, current_std: float = CURRENT_STD) -> np.ndarray:
+    """Largest state (n,) of normal operation of n states; a current's is three standard deviations."""
+    own = operating_range(plant.parameters, plant.max_thrust)
+    return np.append(own, [3.0 * current_std] * len(CURRENT_STATES))[:n]
+
+
+MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
+
+
+def _smallest(channels: tuple[str, ...]) -> str:
+    """The smaller of the two closed models that predicts all channels."""
+    within = SYMBOLS[: MODELS["motion"].count]
+    return "motion" if all(MEASURED[channel] in within for channel in channels) else "navigation"
+
+
+def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
+    """The covariance of the first n states, those of the vehicle and then those of the current."""
+    whole = np.diag(np.append(np.zeros(len(cov)), [of_current] * len(CURRENT_STATES)))
+    whole[: len(cov), : len(cov)] = cov
+    return whole[:n, :n]

@@ -1,0 +1,101 @@
+"""Paths to follow: straight pieces between points, and how far a position is from the nearest one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.auv.manoeuvres import MANOEUVRES, run
+from thruster_env.core.checks import as_floats, one_of, short_repr
+
+SPACING = 0.2  # [m] between points of a manoeuvre's path: 2 mm from the arc where it turns most tightly
+STRAIGHT_AHEAD = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+MOST_POINTS = 10_000
+PIECE = 7  # numbers of a piece: where it begins (3), its direction (3), its length
+
+
+class Errors(NamedTuple):
+    """How a pose differs from the path, (...) each."""
+
+    cross_track: np.ndarray  # to starboard of the path [m]
+    vertical: np.ndarray  # below it [m]
+    course: np.ndarray  # yaw less the path's course, within half a turn [rad]
+
+
+class Path(NamedTuple):
+    """A path of straight pieces, by arc length; beyond its ends it continues straight."""
+
+    starts: np.ndarray  # (K, 3) where each piece begins: north, east, down [m]
+    directions: np.ndarray  # (K, 3), of length one
+    lengths: np.ndarray  # (K,) [m]
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The pieces, PIECE numbers each, as compiled code reads them."""
+        return np.hstack([self.starts, self.directions, self.lengths[:, None]]).ravel()
+
+    @property
+    def points(self) -> np.ndarray:
+        """The points (K + 1, 3) that the path joins [m]."""
+        return np.vstack([self.starts, self.starts[-1] + self.lengths[-1] * self.directions[-1]])
+
+    def piece(self, position: np.ndarray, piece: np.ndarray) -> np.ndarray:
+        """The piece (...) that positions (..., 3) have got to, from the one (...) that they were at.
+
+        It is the first whose end is not behind the position; progress is never lost, and no corner is cut.
+        """
+        piece = np.array(piece, dtype=np.int64)
+        while True:
+            along = np.sum((position - self.starts[piece]) * self.directions[piece], axis=-1)
+            ahead = (along > self.lengths[piece]) & (piece < len(self.lengths) - 1)
+            if not ahead.any():
+                return piece
+            piece = piece + ahead
+
+    def errors(self, position: np.ndarray, yaw: np.ndarray, piece: np.ndarray) -> Errors:
+        """Errors of poses, positions (..., 3) [m] and yaw (...) [rad], that are at pieces (...)."""
+        tangent = self.directions[piece]
+        off = position - self.starts[piece]
+        off = off - np.sum(off * tangent, axis=-1)[..., None] * tangent
+        level = np.hypot(tangent[..., 0], tangent[..., 1])
+        cosine, sine = tangent[..., 0] / level, tangent[..., 1] / level
+        course = yaw - np.arctan2(sine, cosine)
+        return Errors(
+            off[..., 1] * cosine - off[..., 0] * sine, off[..., 2], np.arctan2(np.sin(course), np.cos(course))
+        )
+
+
+def make_path(given, depth: float = 0.0) -> Path:
+    """A path from a manoeuvre's name or from two or more points (north, east, down) [m], so much [m] deeper.
+
+    Raises ValueError if an argument is wrong; the message states the rule and the value.
+    """
+    if isinstance(given, str):
+        points = by_arc_length(run(one_of("path", given, tuple(MANOEUVRES)))[:, 9:], SPACING)
+    else:
+        rule = "path must be a manoeuvre's name or two or more points of three finite numbers [m]"
+        try:
+            points = as_floats(given)
+        except ValueError:
+            points = np.empty(0)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
+        if len(points) > MOST_POINTS or np.abs(points).max() > 1e6:
+            raise ValueError(
+                f"path must have at most {MOST_POINTS} points within 1e6 m, but got {short_repr(given)}"
+            )
+    pieces = np.diff(points, axis=0)
+    lengths = np.linalg.norm(pieces, axis=1)
+    if (np.hypot(pieces[:, 0], pieces[:, 1]) < 1e-6 * (1.0 + lengths)).any():
+        raise ValueError(
+            f"each piece of path must lead somewhere else than up or down, but got {short_repr(given)}"
+        )
+    return Path(points[:-1] + [0.0, 0.0, depth], pieces / lengths[:, None], lengths)
+
+
+def by_arc_length(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Points of a polyline (K, 3) at equal distances along it, near to `spacing`, both ends included."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    places = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))
+    return np.stack([np.interp(places, along, column) for column in points.T], axis=-1)

@@ -1,0 +1,226 @@
+"""The noisy vehicle from plain arguments: its parameters, noise, sensors, limits and initial state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.auv.channels import CHANNELS, MAX_CHANNELS, Instrument, default_instrument, suite
+from thruster_env.auv.effects.current import Current, make_current
+from thruster_env.auv.effects.sensors import VEHICLE_SENSOR_EFFECTS, NearSurface
+from thruster_env.auv.forces import Constants
+from thruster_env.auv.operating import required_substeps
+from thruster_env.auv.parameters import VehicleParameters, derive_constants
+from thruster_env.auv.presets import preset_parameters
+from thruster_env.auv.quantities import COMMANDS, INPUTS, STATES
+from thruster_env.core.checks import (
+    at_least,
+    between,
+    covariance,
+    finite,
+    one_of,
+    positive,
+    short_repr,
+    vector,
+)
+from thruster_env.effects.effects import Effect, dropping_channels
+from thruster_env.effects.missing import SampleEvery
+from thruster_env.model.quantities import Quantity
+
+DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
+DEFAULT_MAX_THRUST = 4.0  # [N], for 1.19 m/s; with it 14 deg of stern plane, if held, pitch by 80 deg
+DEFAULT_MAX_PLANE = math.radians(15.0)  # [rad]
+DEFAULT_PROPELLER_TORQUE = -0.006  # K_prop over X_prop [m], assumed: K_Q/K_T D = 0.03/0.2 x 0.04 m
+CRUISE_SPEED = 1.0  # [m/s], as printed for Segorogeni
+# A step: diffusion of 1e-4 (m/s)^2/s in the velocities at 0.05 s, 1e-4 rad and 1e-4 m besides.
+DEFAULT_PROCESS_NOISE = (5e-6,) * 6 + (1e-8,) * 6
+DEFAULT_INITIAL_VARIANCES = (0.05**2,) + (0.02**2,) * 5 + (0.01**2,) * 6  # about cruise
+SAMPLE_TIMES = (1e-9, 10.0)  # [s]
+THRUSTS = (1e-6, 1e6)  # [N]
+PLANES = (0.0, math.radians(90.0))  # [rad]
+LARGEST_STATE = 1e50  # its square of a variance
+STATES_COUNT = len(STATES)
+
+
+class Plant(NamedTuple):
+    """A vehicle with its noise, sampled every dt seconds; `make_plant` makes one from plain arguments."""
+
+    parameters: VehicleParameters
+    dt: float  # [s]
+    max_thrust: float  # [N]
+    max_plane: float  # [rad]
+    propeller_torque: float | None  # K_prop over X_prop [m]; None where K_prop is an input of its own
+    substeps: int  # Runge-Kutta steps a sample time
+    process_noise_cov: np.ndarray  # (12, 12), a step
+    measurement_noise_cov: np.ndarray  # (m, m)
+    initial_mean: np.ndarray  # (12,)
+    initial_cov: np.ndarray  # (12, 12)
+    sensors: dict[str, tuple[Effect, ...]]  # effects by channel; the m channels in their order
+    instruments: dict[str, Instrument]  # by channel
+    current: Current = {}  # signals by direction
+    propeller_lag: float = 0.0  # time constant from the commanded thrust to the propeller's [s]
+    plane_lag: float = 0.0  # and of both planes [s]
+
+    @property
+    def constants(self) -> Constants:
+        """Constants of the equations of motion, for one Runge-Kutta step."""
+        return derive_constants(self.parameters, self.dt / self.substeps, self.propeller_torque or 0.0)
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Thrust, the propeller's torque where it is an input, stern plane and rudder."""
+        return INPUTS if self.propeller_torque is None else COMMANDS
+
+    @property
+    def max_torque(self) -> float:
+        """Torques are clipped to plus and minus this, where they are an input [N m]."""
+        return abs(DEFAULT_PROPELLER_TORQUE) * self.max_thrust
+
+    @property
+    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest inputs (p,), in their order, at which inputs are clipped."""
+        torque = [] if self.propeller_torque is not None else [self.max_torque]
+        high = np.array([self.max_thrust, *torque, self.max_plane, self.max_plane])
+        return np.concatenate([[0.0], -high[1:]]), high
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the measured quantities, in order."""
+        return tuple(self.sensors)
+
+    @property
+    def dropping_channels(self) -> tuple[int, ...]:
+        """Numbers of the channels whose measurements may be missing."""
+        return dropping_channels(self.sensors)
+
+
+def make_plant(
+    preset: str | Mapping | VehicleParameters = "segorogeni",
+    dt: float = DEFAULT_DT,
+    max_thrust: float = DEFAULT_MAX_THRUST,
+    max_plane: float = DEFAULT_MAX_PLANE,
+    propeller_torque: float | None = DEFAULT_PROPELLER_TORQUE,
+    process_noise_cov=DEFAULT_PROCESS_NOISE,
+    measurement_noise_cov=None,
+    initial_state=None,
+    sensors=None,
+    current=None,
+    propeller_lag: float = 0.0,
+    plane_lag: float = 0.0,
+    substeps: int | None = None,
+) -> Plant:
+    """Make a plant from plain arguments, the same ones that the env takes.
+
+    Args:
+        preset: a preset's name, a mapping of the fields of `VehicleParameters`, or one of these.
+        dt: sample time [s]. Covariances are per step and do not scale with dt.
+        max_thrust: thrusts are clipped to 0 and this [N].
+        max_plane: angles of both planes are clipped to plus and minus this [rad].
+        propeller_torque: the propeller's torque over its thrust [m]; None makes the torque an input.
+        process_noise_cov: Q, covariance (12, 12) or twelve variances per step; zero allowed.
+        measurement_noise_cov: R, covariance (m, m) or m variances; zero allowed. None for those of the sensors.
+        initial_state: None for about a cruise at 1 m/s, a fixed state (12,), or a mapping: {"speed": U} for a
+            fixed speed straight ahead from the origin, 0 for rest, or {"mean": [..], "cov": [..]}.
+        sensors: None for the suite "default", the name of a suite of `channels.SUITES`, a list of channels of
+            `channels.CHANNELS`, or a mapping from channels to lists of effects. Suites and lists come at the rates
+            of their instruments, satellites near the surface; in a mapping, effects "sample-every" and
+            "near-surface" say so.
+        current: three velocities (north, east, down) [m/s], or signals by direction; see `effects.current`.
+        propeller_lag: time constant with which the thrust follows the command [s]; 0 for at once. (A small
+            propeller's is some 1 s.)
+        plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters model neither lag.
+        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `operating.ONE_STEP_ACCURACY`.
+
+    Raises:
+        ValueError: if an argument is wrong; the message states the rule and the value.
+    """
+    parameters = preset_parameters(preset)
+    dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
+    max_thrust = between("max_thrust", positive("max_thrust", max_thrust), *THRUSTS, "N")
+    max_plane = between("max_plane", max_plane, *PLANES, "rad")
+    if propeller_torque is not None:
+        propeller_torque = finite("propeller_torque", propeller_torque)
+    mean, cov = _initial_distribution(initial_state)
+    effects, instruments = _sensors(sensors, dt)
+    if measurement_noise_cov is None:
+        measurement_noise_cov = [instrument.deviation**2 for instrument in instruments.values()]
+    if substeps is None:
+        substeps = required_substeps(parameters, dt, max_thrust, max_plane)
+    return Plant(
+        parameters,
+        dt,
+        max_thrust,
+        max_plane,
+        propeller_torque,
+        at_least("substeps", substeps, 1, 10_000),
+        covariance("process_noise_cov", process_noise_cov, STATES_COUNT, largest=LARGEST_STATE**2),
+        covariance("measurement_noise_cov", measurement_noise_cov, len(effects), largest=LARGEST_STATE**2),
+        mean,
+        cov,
+        effects,
+        instruments,
+        make_current(current),
+        positive("propeller_lag", propeller_lag, zero_allowed=True),
+        positive("plane_lag", plane_lag, zero_allowed=True),
+    )
+
+
+def _sensors(given, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
+    """Effects and instrument of each channel."""
+    if given is None or isinstance(given, str):
+        instruments = suite("default" if given is None else given)
+        return {channel: _timing(one, dt) for channel, one in instruments.items()}, instruments
+    if not isinstance(given, Mapping):
+        if not hasattr(given, "__iter__"):
+            rule = "sensors must be a suite's name, a list of channels or a mapping from them"
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
+        names = list(given)
+        known = [one_of("a channel of sensors", name, tuple(CHANNELS)) for name in names]
+        given = {name: _timing(default_instrument(name), dt) for name in known}
+        if len(given) != len(names):
+            raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
+    if not given:
+        raise ValueError("sensors must name at least one channel, but got none")
+    if len(given) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
+    effects = {
+        one_of("a channel of sensors", channel, tuple(CHANNELS)): VEHICLE_SENSOR_EFFECTS.make(effects)
+        for channel, effects in given.items()
+    }
+    return effects, {channel: default_instrument(channel) for channel in effects}
+
+
+def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
+    """Effects for the rate of an instrument, as the nearest number of steps, and for where it works."""
+    steps = 1 if instrument.rate is None else max(1, round(1.0 / (instrument.rate * dt)))
+    return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
+
+
+def _initial_distribution(given) -> tuple[np.ndarray, np.ndarray]:
+    at_speed = np.eye(STATES_COUNT)[0]
+    fixed = np.zeros((STATES_COUNT, STATES_COUNT))
+    if given is None:
+        return CRUISE_SPEED * at_speed, np.diag(DEFAULT_INITIAL_VARIANCES)
+    if not isinstance(given, Mapping):
+        return state("initial_state", given), fixed
+    if set(given) == {"speed"}:
+        return positive("the speed of initial_state", given["speed"], zero_allowed=True) * at_speed, fixed
+    if set(given) == {"mean", "cov"}:
+        mean = state("the mean of initial_state", given["mean"])
+        largest = LARGEST_STATE**2
+        return mean, covariance("the cov of initial_state", given["cov"], STATES_COUNT, largest=largest)
+    raise ValueError(
+        "initial_state must be None, twelve numbers, {'speed': U} or {'mean': [..], 'cov': [..]}, "
+        f"but got {short_repr(given)}"
+    )
+
+
+def state(name: str, value) -> np.ndarray:
+    """Return a state (12,); raise ValueError unless it is twelve numbers from which finite ones can follow."""
+    given = vector(name, value, STATES_COUNT)
+    if np.abs(given).max() > LARGEST_STATE:
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
+    return given

@@ -1,0 +1,86 @@
+"""The renderer: remembers an episode and draws it; the package says the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thruster_env.auv.rendering.history import Moment, Overlay
+from thruster_env.core.checks import positive
+from thruster_env.render.renderer import MODES, PlantRenderer
+
+__all__ = ["MODES", "Renderer"]
+PANEL = 230  # where the lower part of the picture begins [px]
+
+
+class Renderer(PlantRenderer):
+    """Draws an episode: `begin` it, `add` every moment from the reset's on, `draw` where a frame is wanted."""
+
+    caption = "Underwater vehicle"
+
+    def __init__(
+        self,
+        mode: str,
+        *,
+        path: np.ndarray,
+        max_thrust: float,
+        max_plane: float,
+        dt: float,
+        frames_per_second: float,
+        size: tuple[int, int] | None = None,
+    ):
+        """Load pygame and draw what never moves.
+
+        Args:
+            mode: "human" (a window) or "rgb_array" (arrays).
+            path: points (K, 3) of the path to follow: north, east, down [m].
+            max_thrust: full scale of the thrust's gauge [N].
+            max_plane: full scale of the planes' gauges [rad].
+            dt: sample time [s].
+            frames_per_second: how many calls of `draw` a second a window keeps to [1/s].
+            size: of the picture [px]; 640 x 400 if None.
+
+        Raises:
+            ValueError: for a mode that is not one of the two, or a number that is not positive.
+            DependencyNotInstalled: if pygame is missing.
+        """
+        positive("dt", dt)
+        positive("max_thrust", max_thrust)
+        arguments = {
+            "mode": mode,
+            "path": path,
+            "max_thrust": max_thrust,
+            "max_plane": max_plane,
+            "dt": dt,
+            "frames_per_second": frames_per_second,
+            "size": size,
+        }
+        self._set_up(arguments, Moment._fields, Overlay._fields[1:])
+
+    def _make_pictures(self) -> None:
+        from thruster_env.auv.rendering.gauges import Dials, Gauges
+        from thruster_env.auv.rendering.view import View
+        from thruster_env.render.charts import Charts, Strip
+
+        given = self._made_with
+        strips = (
+            Strip("depth", "depth [m]", 2, 254, 54, 100.0, *_named("depth"), says_numbers=False, downward=True),
+            Strip("u", "speed ahead [m/s]", 2, 330, 52, 1.0, *_named("u")),
+        )
+        self._view = View(self._canvas, given["path"])
+        self._dials = Dials(self._canvas, PANEL)
+        self._charts = Charts(self._canvas, strips, top=PANEL, dt=given["dt"])
+        self._gauges = Gauges(self._canvas, given["max_thrust"], given["max_plane"])
+        self._path = given["path"]
+
+    def _draw(self, columns: dict[str, np.ndarray], count: int, label: str) -> None:
+        moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        offset = moment.reference_depth - float(self._path[0, 2]) if len(self._path) == 2 else 0.0
+        self._view.draw(columns, moment, offset)
+        self._dials.draw(columns, moment)
+        self._charts.draw(columns, count - 1, label)
+        self._gauges.draw(moment)
+
+
+def _named(name: str) -> tuple[str, str]:
+    """Columns of what is measured of a quantity, and of its reference."""
+    return f"measured_{name}", f"reference_{name}"

@@ -1,0 +1,195 @@
+"""The path in three dimensions: one looks north-east and down, at a box of water with a grid on its bottom.
+
+North runs to the upper right, east to the lower right. The grid lies below everything shown; a plumb line and
+shadows on it show the depth. The box grows by round steps as the vehicle leaves it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from thruster_env.auv.rendering.history import Moment
+from thruster_env.render.axis import ROUND
+from thruster_env.render.canvas import (
+    BAND,
+    ESTIMATE,
+    INK,
+    REFERENCE,
+    SIGMAS,
+    SOFT_INK,
+    WHITE,
+    Canvas,
+    number,
+)
+from thruster_env.render.history import newest
+
+WIDTH, HEIGHT = 498, 230  # [px]
+MARGIN = 30  # [px]
+AZIMUTH, ELEVATION = math.radians(40.0), math.radians(28.0)
+LEAST_SIZE = 6.0  # of what is shown [m]
+LENGTH = 34.0  # of the vehicle in the picture [px]; it is not to scale
+WATER, BOTTOM, GRID = (226, 239, 246), (204, 224, 235), (176, 203, 218)
+SHADOW, HULL, FIN = (150, 182, 200), (250, 180, 40), (120, 70, 20)
+DASH = 4  # points of the path to follow in a dash
+# The hull, nose first: places along it and radii, in lengths.
+OUTLINE = np.array(
+    [(0.5, 0.0), (0.47, 0.05), (0.4, 0.085), (0.2, 0.1), (-0.15, 0.1), (-0.38, 0.06), (-0.5, 0.012)]
+)
+FIN_PLACE, FIN_SPAN = -0.42, 0.17
+
+_RIGHT = np.array([math.sin(AZIMUTH), math.cos(AZIMUTH), 0.0])
+_DOWN = np.array(
+    [-math.cos(AZIMUTH) * math.sin(ELEVATION), math.sin(AZIMUTH) * math.sin(ELEVATION), math.cos(ELEVATION)]
+)
+PROJECTION = np.stack([_RIGHT, _DOWN], axis=-1)  # (3, 2): from north, east, down to right and down
+
+
+class View:
+    """Path, vehicle and belief."""
+
+    def __init__(self, canvas: Canvas, path: np.ndarray):
+        """Take the points (K, 3) of the path to follow [m]."""
+        self._canvas, self._path = canvas, path
+        canvas.box(0, 0, WIDTH, HEIGHT, WATER)
+
+    def draw(self, columns: dict[str, np.ndarray], moment: Moment, offset: float) -> None:
+        """Draw the newest moment; the path to follow is `offset` [m] deeper than its points."""
+        trail = _points(columns, "")
+        seen = trail[np.isfinite(trail).all(axis=1)]
+        place = seen[-1] if len(seen) else np.zeros(3)
+        path = _part_in_view(self._path, seen) + [0.0, 0.0, offset]
+        shown = np.concatenate([seen, path, [place]])
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        floor = high[2] + 0.12 * max(LEAST_SIZE, float((high - low).max()))
+        self._fit(np.concatenate([shown, shown * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]]))
+        canvas = self._canvas
+        canvas.clip(0, 0, WIDTH, HEIGHT)
+        self._draw_grid(low, high, floor)
+        for run in _runs(trail):
+            canvas.lines(self._on_bottom(run, floor), SHADOW, 1.5)
+        for k in range(0, len(path) - 1, 2 * DASH):
+            canvas.lines(self._at(path[k : k + DASH + 1]), REFERENCE, 1.5)
+        self._draw_band(columns, place)
+        for run in _runs(_points(columns, "estimated_")):
+            canvas.lines(self._at(run), ESTIMATE, 3)
+        for run in _runs(trail):
+            canvas.lines(self._at(run), INK, 1.25)
+        canvas.lines([self._at(place), self._on_bottom(place, floor)], SOFT_INK, 0.75)
+        canvas.dots([self._on_bottom(place, floor)], 2.0, SHADOW)
+        self._draw_vehicle(place, moment)
+        canvas.clip()
+        self._write(moment)
+
+    def _fit(self, points: np.ndarray) -> None:
+        """Choose scale and middle so that all points are in the picture."""
+        flat = points @ PROJECTION
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
+        size = float(np.max((high - low) * room[0] / room))
+        self._scale = room[0] / _rounded(max(size, LEAST_SIZE))
+        self._middle = np.array([WIDTH, HEIGHT]) / 2 - self._scale * (low + high) / 2
+
+    def _at(self, points: np.ndarray) -> np.ndarray:
+        """Where points (..., 3) are in the picture, (..., 2) [px]."""
+        return np.asarray(points) @ PROJECTION * self._scale + self._middle
+
+    def _on_bottom(self, points: np.ndarray, floor: float) -> np.ndarray:
+        return self._at(np.asarray(points) * [1.0, 1.0, 0.0] + [0.0, 0.0, floor])
+
+    def _draw_grid(self, low: np.ndarray, high: np.ndarray, floor: float) -> None:
+        canvas, step = self._canvas, _rounded(60.0 / self._scale)
+        first, last = np.floor(low[:2] / step) * step - step, np.ceil(high[:2] / step) * step + step
+        corners = [(first[0], first[1]), (last[0], first[1]), (last[0], last[1]), (first[0], last[1])]
+        canvas.polygon(self._at(np.array([(*corner, floor) for corner in corners])), BOTTOM)
+        for north in np.arange(first[0], last[0] + step / 2, step):
+            canvas.lines(self._at(np.array([(north, first[1], floor), (north, last[1], floor)])), GRID, 0.75)
+        for east in np.arange(first[1], last[1] + step / 2, step):
+            canvas.lines(self._at(np.array([(first[0], east, floor), (last[0], east, floor)])), GRID, 0.75)
+        canvas.text(f"grid {number(step, 0 if step >= 1 else 1)} m", (WIDTH - 8, HEIGHT - 10), 10, SOFT_INK, 1.0)
+
+    def _draw_band(self, columns: dict[str, np.ndarray], place: np.ndarray) -> None:
+        """The ellipse of two standard deviations of the position, taken as independent of one another."""
+        mean = np.array([newest(columns, f"estimated_{name}") for name in ("x", "y", "depth")])
+        std = np.array([newest(columns, f"estimated_{name}_std") for name in ("x", "y", "depth")])
+        if not np.isfinite(mean + std).all():
+            return
+        spread = PROJECTION.T @ np.diag(std**2) @ PROJECTION
+        variances, axes = np.linalg.eigh(spread)
+        angles = np.linspace(0.0, 2.0 * math.pi, 48)
+        circle = np.stack([np.cos(angles), np.sin(angles)])
+        radii = np.maximum(SIGMAS * self._scale * np.sqrt(np.maximum(variances, 0.0)), 3.0)
+        self._canvas.polygon(self._at(mean) + (axes @ (radii[:, None] * circle)).T, BAND)
+
+    def _draw_vehicle(self, place: np.ndarray, moment: Moment) -> None:
+        axes = attitude(moment.phi, moment.theta, moment.psi)
+        if not np.isfinite(axes).all():
+            return
+        canvas, flat = self._canvas, axes @ PROJECTION * LENGTH  # body axes in the picture, (3, 2)
+        middle = self._at(place)
+        for side in (flat[1], flat[2]):
+            ends = [middle + FIN_PLACE * flat[0] + sign * FIN_SPAN * side for sign in (-1.0, 1.0)]
+            canvas.lines(ends, FIN, 2.5)
+        across = np.array([-flat[0][1], flat[0][0]])
+        across = across / max(float(np.hypot(*across)), 1e-6) * LENGTH
+        along, radius = OUTLINE[:, 0], np.maximum(OUTLINE[:, 1], 0.0)
+        # Seen end on the hull is a disc, whose radius is that amidships.
+        canvas.dots([middle], 0.1 * LENGTH, HULL)
+        one = middle + along[:, None] * flat[0] + radius[:, None] * across
+        other = middle + along[:, None] * flat[0] - radius[:, None] * across
+        outline = np.concatenate([one, other[::-1]])
+        canvas.polygon(outline, HULL)
+        canvas.lines(np.concatenate([outline, outline[:1]]), FIN, 1.0)
+
+    def _write(self, moment: Moment) -> None:
+        write = self._canvas.text
+        write(f"{number(moment.time, 2)} s", (12, 14), 13, INK)
+        where = ", ".join(number(value, 1) for value in (moment.x, moment.y, moment.depth))
+        write(f"north, east, down: {where} m", (84, 14), 11, SOFT_INK)
+        self._draw_compass()
+
+    def _draw_compass(self) -> None:
+        """Arrows to the north, to the east and down."""
+        origin = np.array([26.0, HEIGHT - 40.0])
+        for axis, name in enumerate("NED"):
+            tip = origin + 26.0 * PROJECTION[axis]
+            self._canvas.arrow(origin, tip, 2.5, SOFT_INK)
+            outside = origin + 36.0 * PROJECTION[axis]
+            self._canvas.text(name, outside, 10, SOFT_INK, 0.5)
+        self._canvas.disc(origin, 2.0, WHITE)
+
+
+def attitude(phi: float, theta: float, psi: float) -> np.ndarray:
+    """The body's axes ahead, to starboard and down, (3, 3) by rows, in north, east, down."""
+    from thruster_env.auv.kinematics import attitude_of, in_earth_axes
+
+    angles = attitude_of(phi, theta)
+    return np.array([in_earth_axes(angles, psi, *unit) for unit in np.eye(3).tolist()])
+
+
+def _points(columns: dict[str, np.ndarray], prefix: str) -> np.ndarray:
+    return np.stack([columns[f"{prefix}{name}"] for name in ("x", "y", "depth")], axis=-1)
+
+
+def _part_in_view(path: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """A path's points; of a single straight line those from where the vehicle was to some way ahead of it."""
+    if len(path) > 2:
+        return path
+    piece = path[1] - path[0]
+    along = (seen - path[0]) @ piece / (piece @ piece) if len(seen) else np.zeros(1)
+    places = np.linspace(along.min(), along.max() + 2.0 / np.linalg.norm(piece), 100)
+    return path[0] + places[:, None] * piece
+
+
+def _runs(points: np.ndarray) -> list[np.ndarray]:
+    """Stretches of points (K, 3) that are all numbers."""
+    there = np.isfinite(points).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(((False,), there, (False,)))))
+    return [points[start:stop] for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _rounded(value: float) -> float:
+    """The next round number."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next((step * power for step in ROUND if step * power >= value), 10.0 * power)

@@ -1,0 +1,1 @@
+"""What all packages use: compilation, random streams, threads, checks, files, plots."""

@@ -1,0 +1,404 @@
+"""Compilation: plain Python functions in, cached machine code out, one source for both.
+
+Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`.
+numba is imported at the first compilation only, which keeps imports light. With the
+environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dis
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import threading
+import types
+import warnings
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thruster_env.core.code_cache import keep_code
+from thruster_env.core.code_text import code_text
+from thruster_env.core.optimising import Which, optimise_once
+from thruster_env.core.user_functions import OURS, needs_python, stand_in
+
+# No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
+FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
+
+JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divide divmod".split())
+
+MOST_WAITING = 10_000  # functions, above which those that nobody has any more are forgotten
+_packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
+
+# Weak references: a model's functions live as long as somebody has them.
+_waiting: list[Callable[[], Callable | None]] = []
+_marked: weakref.WeakSet[Callable] = weakref.WeakSet()
+_called: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions that are called and not inlined
+_apart: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions of which there is one copy
+_narrow: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions whose vectors are as wide as LLVM prefers
+_asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
+_only_python: weakref.WeakKeyDictionary[Callable, str] = (
+    weakref.WeakKeyDictionary()
+)  # why functions are not compiled
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
+_untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
+_interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
+
+
+def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
+    """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
+
+    So are functions that it calls by name. A loop over members or copies is vectorised only if it contains no
+    call. With into_callers=False the function is called instead of inlined, and so are the functions that call it:
+    loops over large arrays gain nothing from inlining, and would be optimised again in each caller.
+    """
+    if function not in _marked:
+        _marked.add(function)
+        callees = _callees(function)
+        for callee in callees:  # a user's model may call helpers of its own
+            inlined(callee)
+        if not into_callers or any(callee in _called for callee in callees):
+            _called.add(function)
+        _waiting.append(weakref.ref(function))
+        if len(_waiting) > MOST_WAITING:  # nothing may ever be compiled
+            _waiting[:] = [one for one in _waiting if one() is not None]
+    return function
+
+
+def not_inlined(function: Callable) -> Callable:
+    """Mark a plain function that is never inlined: there is one copy of it, however many functions call it.
+
+    It is meant for long loops, where the cost of a call does not matter. LLVM may still inline other functions.
+    """
+    _apart.add(function)
+    return inlined(function, into_callers=False)
+
+
+def narrow(function: Callable) -> Callable:
+    """Mark a function whose loops keep the vectors that LLVM prefers: wide ones were measured to take longer."""
+    _narrow.add(function)
+    return function
+
+
+def _which() -> Which:
+    return Which(
+        asked=_asked.__contains__,
+        marked=_marked.__contains__,
+        called=_called.__contains__,
+        apart=_apart.__contains__,
+        narrow=_narrow.__contains__,
+    )
+
+
+def overloaded(function: Callable, teach: Callable[[Callable], None] | None = None) -> Callable:
+    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`.
+
+    `teach(function)`, if there is one, says which; it is called before the next compilation, unless nobody has the
+    function any more.
+    """
+    _marked.add(function)
+    if teach is not None:
+        _untaught[function] = teach
+    return function
+
+
+def compiled_in_place_of(function: Callable, other: Callable) -> Callable:
+    """Mark a function in whose place compiled functions have another one; those that need Python run as it."""
+    _marked.add(function)
+    if other in _called:
+        _called.add(function)
+    reason = needs_python(other)
+    if not isinstance(other, types.FunctionType) and not hasattr(other, "py_func"):
+        reason = f"numba compiles plain functions, and no {type(other).__name__}"
+    if reason:
+        _only_python[function] = reason
+    _untaught[function] = lambda function: _teach_other(function, other)
+    return stand_in(function, other)
+
+
+def _teach_other(function: Callable, other: Callable) -> None:
+    from numba.extending import overload
+
+    plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
+    options: Any = {
+        "forceinline": function not in _called,
+        "no_cfunc_wrapper": True,
+        "fastmath": fastmath_of(other),
+    }
+    overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
+
+
+def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
+    """Mark a function that registers something with numba; it is called once, before the first compilation."""
+    _lessons.append(teach)
+    return teach
+
+
+def _callees(function: Callable) -> list[Callable]:
+    """Plain functions that a function has in its closure or calls by a global name."""
+    return [part for part in _values_in(function) if isinstance(part, types.FunctionType)]
+
+
+def _values_in(function: Callable) -> list:
+    """What a function has in its closure or reads by a global name."""
+    if not isinstance(function, types.FunctionType):
+        return []
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    return [*cells, *(function.__globals__.get(name) for name in function.__code__.co_names)]
+
+
+def _with_callees(functions: Iterable[Callable]) -> Iterator[Callable]:
+    """Functions and all plain functions that they call, each once."""
+    seen: set[Callable] = set()
+    waiting = list(functions)
+    while waiting:
+        function = waiting.pop()
+        if function not in seen:
+            seen.add(function)
+            yield function
+            waiting += _callees(function)
+
+
+@contextlib.contextmanager
+def interpreted():
+    """Within this context nothing is compiled: the same sources run as Python, for tests and debugging."""
+    global _interpreting
+    before, _interpreting = _interpreting, True
+    try:
+        yield
+    finally:
+        _interpreting = before
+
+
+def is_interpreting() -> bool:
+    """Whether `compiled` leaves functions as they are."""
+    return _interpreting
+
+
+def compiled(function: Callable) -> Callable:
+    """Compile a function with numba, cached on disk, releasing the interpreter lock while it runs."""
+    if _interpreting:
+        return function
+    import numba
+    from numba.extending import register_jitable
+
+    while _lessons or _untaught:  # a lesson may bring others
+        if _lessons:
+            _lessons.pop()()
+            continue
+        with contextlib.suppress(KeyError):  # the last one has just gone
+            untaught, teach = _untaught.popitem()
+            teach(untaught)
+    while _waiting:
+        inner = _waiting.pop()()
+        if inner is None:
+            continue
+        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True, fastmath=fastmath_of(inner))(
+            inner
+        )  # by itself LLVM inlines small ones only
+    _asked.add(function)
+    return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
+
+
+def fastmath_of(function: Callable) -> set[str]:
+    """What LLVM may do with the arithmetic of a function.
+
+    A user's division is one: 49/49 is 1, and 49 * (1/49) is less. Where a function rounds, an ulp may decide, so
+    that it computes as it is written.
+    """
+    if (function.__module__ or "").partition(".")[0] in OURS:
+        return set(FASTMATH)
+    code = getattr(function, "__code__", None)  # an object that is called has none
+    return {"nsz"} if code is not None and rounds(code) else set(FASTMATH - {"arcp"})
+
+
+def rounds(code: types.CodeType) -> bool:
+    """Whether a function rounds numbers, or takes rests."""
+    signs = {"%", "//", "%=", "//="}
+    return (
+        not JUMPS.isdisjoint(code.co_names)
+        or any(one.opname == "BINARY_OP" and one.argrepr in signs for one in dis.get_instructions(code))
+        or any(rounds(one) for one in code.co_consts if isinstance(one, types.CodeType))
+    )
+
+
+def tell_when_compiling(tell: Callable[[], None]) -> None:
+    """Call `tell` once, at the first real compilation; loading from the cache does not count."""
+    from numba.core import event
+
+    class Once(event.Listener):
+        waiting = True
+
+        def on_start(self, event):
+            if self.waiting:
+                self.waiting = False
+                tell()
+
+        def on_end(self, event):
+            pass
+
+    event.register("numba:compile", Once())
+
+
+def may_be_inlined(package: str, *below: str) -> None:
+    """Declare, in a package's `__init__`, that its functions inline one another and those of packages below it.
+
+    Cached machine code of such a function is valid as long as no source file of these packages changes. For other
+    packages, only the files of the functions that are called by name are compared.
+    """
+    _packages[package] = below
+
+
+@functools.cache
+def _package_hash(package: str) -> str:
+    digest = hashlib.sha256(package.encode())
+    for below in _packages.get(package, ()):
+        digest.update(_package_hash(below).encode())
+    spec = importlib.util.find_spec(package)
+    for folder in (spec.submodule_search_locations or []) if spec else []:
+        for path in sorted(Path(folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def function_fingerprint(*functions: Callable | None, within: str) -> str:
+    """Hash of what a compiled function inlines; numba's cache itself looks at the outermost function only.
+
+    It covers the byte code of `functions` and of all that they call by name, the values that these read by name
+    (from other files, too), and the source files of their packages, of this package, and of the package of the
+    module `within` which the compiled function is written.
+    """
+    digest = hashlib.sha256()
+    packages = {package_of(__name__), package_of(within)}
+    for function in _with_callees(function for function in functions if function is not None):
+        digest.update(code_text(function).encode())
+        package = package_of(function.__module__ or "")
+        if package in _packages:
+            packages.add(package)
+            continue
+        try:
+            digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
+        except (OSError, TypeError):
+            pass  # from a notebook or a prompt: the byte code tells changes apart
+    for package in sorted(packages):
+        digest.update(_package_hash(package).encode())
+    return digest.hexdigest()
+
+
+def package_of(module: str) -> str:
+    """The package that a module belongs to: the first part of its name, or one of thruster_env's packages."""
+    return ".".join(module.split(".")[: 2 if module.startswith("thruster_env.") else 1])
+
+
+class CompiledOrPython:
+    """A function compiled at its first call, or run as Python, with one warning, if numba refuses it."""
+
+    def __init__(self, function: Callable):
+        """Take a plain function; nothing is compiled yet."""
+        self._python, self._run = function, compiled(function)
+        self._proven = self._run is function
+        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
+
+    def __call__(self, *arguments):
+        """Call the function."""
+        if not self._proven:
+            with self._first:
+                return self._call_first(*arguments)
+        if self._run is self._python:
+            with np.errstate(all="ignore"):  # compiled code does not warn of overflow either
+                return self._run(*arguments)
+        return self._run(*arguments)
+
+    @property
+    def in_python(self) -> bool:
+        """Whether calls run as Python, as far as is known before the first."""
+        return self._run is self._python
+
+    @property
+    def folder(self) -> str | None:
+        """Where its machine code is kept; None where none is."""
+        return getattr(getattr(self._run, "_cache", None), "cache_path", None)
+
+    @property
+    def direct(self) -> Callable:
+        """The compiled function itself once it has run, so that calls avoid this object; else this object."""
+        return self._run if self._proven and self._run is not self._python else self
+
+    def _call_first(self, *arguments):
+        if not self._proven:
+            reasons = [_only_python[one] for one in _with_callees([self._python]) if one in _only_python]
+            if reasons:
+                warnings.warn(f"the model runs as Python, slowly, because {reasons[0]}", stacklevel=3)
+                self._run, self._proven = self._python, True
+                return self(*arguments)
+            try:
+                return self._run(*arguments)
+            except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
+                warnings.warn(_refusal(self._python, error), stacklevel=3)
+                self._run = self._python
+            finally:
+                self._proven = True
+        return self(*arguments)
+
+
+def _refusal(function: Callable, error: Exception) -> str:
+    """That a function runs as Python, and why: the user's model, this package, or the machine."""
+    text, ours = str(error), []
+    if isinstance(error, (OSError, MemoryError)):
+        return f"the model runs as Python, slowly, because machine code of it could not be made: {text}"
+    for one in _with_callees([function]):
+        where = text.find(hex(id(one)))
+        if (one.__module__ or "").partition(".")[0] in OURS:
+            ours.append((where, one))
+            if any(name in text for name in _objects_called(one)):
+                break
+        elif where >= 0 or getattr(getattr(one, "__code__", None), "co_filename", text) in text:
+            break
+    else:
+        _, broken = max(ours, key=lambda pair: pair[0], default=(0, function))  # the innermost comes last
+        return (
+            f"the model runs as Python, slowly, because numba refuses {_described(broken)}: {_reason(error)}; "
+            "this is a fault of the package and not of the model: please report it"
+        )
+    return f"the model runs as Python, slowly, because numba refuses it: {_reason(error)}"
+
+
+def _objects_called(function: Callable) -> list[str]:
+    """How numba calls the types of a function's callables that are no functions: a user's objects."""
+    kinds = {type(one) for one in _values_in(function) if callable(one)} - {types.FunctionType}
+    return [f"{one.__module__}.{one.__qualname__}" for one in kinds]
+
+
+def _described(function: Callable) -> str:
+    """A function's name and module, or by whom it was written out."""
+    file = function.__code__.co_filename
+    return file.strip("<>") if file.startswith("<") else f"{function.__name__} of {function.__module__}"
+
+
+def _reason(error: Exception) -> str:
+    # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
+    frames = (
+        "Failed in",
+        "TypingError",
+        "During",
+        "There are",
+        "- Of which",
+        "Overload",
+        "With argument",
+        "Rejected",
+    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    telling = [
+        line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
+    ]
+    reason = telling[0] if telling else type(error).__name__
+    calls = [line.removeprefix(">>>").strip() for line in lines if line.startswith(">>>")]
+    unmatched = reason.lower().startswith(("no match", "raised from"))  # where only the call itself is telling
+    return f"it has no {calls[0]}" if unmatched and calls else reason

@@ -1,0 +1,94 @@
+"""Generators of foreign code: the global ones of Python, NumPy and torch, and those that objects hold."""
+
+from __future__ import annotations
+
+import copy
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from thruster_env.core.streams import HELD_GENERATORS, derived_seed
+
+HELD = (np.random.Generator, np.random.RandomState, random.Random)
+
+
+class GlobalGenerators:
+    """The global generators as one owner meets them: what others draw in between changes nothing for it.
+
+    Before `seed`, `used` leaves them alone. torch is seeded where it has been imported by then, on the CPU.
+    """
+
+    def __init__(self):
+        """Without a seed; see the class."""
+        self._states: tuple | None = None
+        self._within = False
+
+    def seed(self, seed: int) -> None:
+        """Begin at a seed below 2^32, and let the others' generators be as they are."""
+        before = _states()
+        random.seed(seed)
+        np.random.seed(seed)
+        torch = _torch()
+        if torch is not None:
+            torch.default_generator.manual_seed(seed)
+        self._states = _states()
+        if not self._within:
+            _set(before)
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """Within this context the global generators are the owner's; afterwards they are as before."""
+        if self._within or self._states is None:
+            yield
+            return
+        before, self._within = _states(), True
+        _set(self._states)
+        try:
+            yield
+        finally:
+            self._states, self._within = _states(), False
+            _set(before)
+
+    def __deepcopy__(self, memo) -> GlobalGenerators:
+        """A copy that goes on by itself; states are never written into."""
+        other = GlobalGenerators()
+        other._states = self._states
+        return other
+
+
+def _torch() -> Any:
+    found: Any = sys.modules.get("torch")
+    return found if hasattr(found, "default_generator") else None
+
+
+def _states() -> tuple:
+    torch = _torch()
+    return random.getstate(), np.random.get_state(), None if torch is None else torch.get_rng_state()
+
+
+def _set(states: tuple) -> None:
+    pythons, numpys, torchs = states
+    random.setstate(pythons)
+    np.random.set_state(numpys)
+    torch = _torch()
+    if torchs is not None and torch is not None:
+        torch.set_rng_state(torchs)
+
+
+def seeded_copy(given: Any, seed: int) -> Any:
+    """A deep copy of an object; generators of Python and NumPy that it holds get seeds of their own."""
+    memo: dict = {}
+    found = copy.deepcopy(given, memo)
+    held = (one for one in memo.values() if isinstance(one, HELD))
+    for number, one in enumerate({id(one): one for one in held}.values()):
+        own = derived_seed(seed, HELD_GENERATORS, number)
+        if isinstance(one, np.random.Generator):
+            kind: Any = type(one.bit_generator)
+            one.bit_generator.state = kind(own).state
+        else:
+            one.seed(own)
+    return found

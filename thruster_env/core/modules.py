@@ -1,0 +1,147 @@
+"""Objects by "module:object": code, which only a user's own command line or call may have imported."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec, PathFinder
+from types import FrameType, ModuleType
+
+SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
+
+
+def is_code(name) -> bool:
+    """Whether a name is that of an object in a module, "module:object", which only a user may have imported."""
+    return isinstance(name, str) and ":" in name and not name.endswith(".toml")
+
+
+def object_named(name: str, what: str):
+    """The object of "module:object", whose module lies where Python looks or in the working folder.
+
+    Args:
+        name: of the object.
+        what: it is, for messages, such as "problem".
+
+    Raises:
+        ValueError: if the module cannot be imported, or lacks the object.
+    """
+    module_name, _, path = name.partition(":")
+    try:
+        found = _executed(module_name, name, what)
+        for part in path.split("."):
+            found = getattr(found, part)
+    except RuleBroken:
+        raise
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"{what} must be 'module:object' that can be imported, but {name!r} is not: {error}"
+        ) from None
+    except Exception as error:
+        article = "an" if what[0] in "aeiou" else "a"
+        raise ValueError(f"{article} {what}'s module must import, but {name!r} raised {said(error)}") from error
+    return found
+
+
+def _executed(module_name: str, name: str, what: str) -> ModuleType:
+    """The module; an error of rule and value that its lines raise needs no words about imports."""
+    try:
+        return _module(module_name)
+    except ValueError as error:
+        if not module_name:
+            raise
+        raise RuleBroken(f"{error} ({what} {name!r})") from error
+
+
+class RuleBroken(ValueError):
+    """What a module of the user's raised while it ran."""
+
+
+def said(error: BaseException) -> str:
+    """What somebody else's code raised, on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _module(name: str) -> ModuleType:
+    """A module, which may lie in the working folder, as the user's own do."""
+    with working_folder_last():
+        return importlib.import_module(name)
+
+
+@contextmanager
+def working_folder_last() -> Iterator[None]:
+    """Within this context modules are looked for in the working folder, too, where nobody else has them.
+
+    So what a user names is found, and what that imports beside it, now and when it is called; but a `struct.py`
+    beside the data takes the place of no module of Python's, of ours or of another package.
+    """
+    folder = os.getcwd()
+    if folder in sys.path or "" in sys.path:
+        yield
+        return
+    _USER_FOLDERS.folders.add(folder)
+    if _USER_FOLDERS not in sys.meta_path:
+        sys.meta_path.append(_USER_FOLDERS)  # after all others
+    _USER_FOLDERS.open.append(folder)
+    try:
+        yield
+    finally:
+        _USER_FOLDERS.open.pop()
+
+
+class _UserFolders:
+    """Finds modules in a user's folder: within `working_folder_last`, and later for modules of the same folder."""
+
+    def __init__(self):
+        self.folders: set[str] = set()
+        self.open: list[str] = []
+
+    def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
+        """The module, if it may be asked for, and lies there."""
+        if path is not None:
+            return None
+        if self.open:
+            return PathFinder.find_spec(name, self.open[-1:])
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None and frame.f_globals.get("__name__", "").startswith("importlib."):
+            frame = frame.f_back
+        folder = None if frame is None else _folder_of(frame.f_globals.get("__name__", ""))
+        return PathFinder.find_spec(name, [folder]) if folder is not None and folder in self.folders else None
+
+
+_USER_FOLDERS = _UserFolders()
+
+
+def _folder_of(name: str) -> str | None:
+    """The folder in which a module lies, or the package of which it is a part."""
+    file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
+    if not file:
+        return None
+    folder, base = os.path.split(os.path.abspath(file))
+    return os.path.dirname(folder) if base.startswith("__init__.") else folder
+
+
+@contextmanager
+def safe_paths() -> Iterator[None]:
+    """Within this context processes that are started do not look for modules in the working folder first."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+def as_module(name: str) -> list[str]:
+    """The command that runs the main program of a module of ours, which no file in the working folder can replace.
+
+    Where our packages are not installed, the folder that holds them comes last on the path.
+    """
+    home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
+    return [sys.executable, "-P", "-c", run]

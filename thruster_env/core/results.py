@@ -1,0 +1,75 @@
+"""Results of users' functions as arrays: tuples of any kind, or arrays as they are, for models that are large."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from thruster_env.core.compiled import inlined, overloaded, when_compiling
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import is_array
+from thruster_env.core.written import made_here, written_out
+
+
+@overloaded
+def fill(out, value):
+    """Copy a vector or matrix, in whatever form, into an array."""
+    out[...] = value
+
+
+@makes_functions
+def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
+    """Return a function whose result is an array where vectors or matrices of its shape are (`is_array`).
+
+    So a user's function may return tuples, or arrays, of any size.
+    """
+    return function if made_here(function) else as_array(function, arguments, *shape)
+
+
+def as_array(function: Callable, arguments: str, *shape: int) -> Callable:
+    """Return the same of a function that returns a tuple of this shape, however it was made."""
+    if not is_array(*shape):
+        return function
+    lines = f"out = np.empty({shape})", f"fill(out, function({arguments}))"
+    names = {"function": inlined(function), "fill": fill, "np": np}
+    return written_out("array_valued", arguments, *lines, "out", _loops=True, **names)
+
+
+@when_compiling
+def teach_numba() -> None:
+    """Have numba compile `fill`; what a result is decides how."""
+    from numba import types
+    from numba.extending import overload
+
+    @overload(fill, jit_options={"forceinline": False})
+    def fill_array(out, value):
+        if isinstance(value, types.Array):
+            return _copy_vector if value.ndim == 1 else _copy_matrix
+        if out.ndim == 1:
+            return _by_entries(len(value))
+        return _by_rows(len(value))
+
+
+def _copy_vector(out, value):
+    for i in range(out.shape[0]):
+        out[i] = value[i]
+
+
+def _copy_matrix(out, value):
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = value[i, j]
+
+
+def _by_entries(count: int) -> Callable:
+    """Entries of a tuple one by one, for they may differ in type."""
+    return written_out(
+        "fill_entries", "out, value", *(f"out[{i}] = value[{i}]" for i in range(count)), "None", _loops=True
+    )
+
+
+def _by_rows(count: int) -> Callable:
+    """Rows of a tuple, each of which may be a tuple or an array."""
+    lines = (f"fill(out[{i}], value[{i}])" for i in range(count))
+    return written_out("fill_rows", "out, value", *lines, "None", _loops=True, fill=fill)

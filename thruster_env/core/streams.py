@@ -1,0 +1,222 @@
+"""Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
+
+The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads,
+because a draw depends on its index only and never on what was drawn before. Every expression works on
+scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random
+numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from thruster_env.core.compiled import inlined, overloaded, when_compiling
+from thruster_env.core.trigonometry import cosine_and_sine_of_turns
+
+# Streams: what a draw is for. Two streams of one key are independent.
+PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
+DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION, FILTER_KERNEL = range(8, 14)
+ADDED_NOISE = 14  # of a problem, to measurements whose own noise an env may have drawn from the same key
+FILTER_PROPOSAL = 24  # behind the spawn keys
+
+# Spawn keys: what a generator of a seed is for. An env's own is that without one, `default_rng(seed)`, and so is
+# that of the list [seed, 0]. They go on where streams end, for the keys of filters have the number of theirs.
+RANDOM_ACTIONS, ACTION_SPACE, POLICY, GLOBAL_GENERATORS, HELD_GENERATORS = range(15, 20)
+START_POINTS, COMPARISON_STUDY, LOCAL_TRIALS, WAY_OF_TUNING = range(20, 24)
+SPAWN_KEYS = {
+    "filter": FILTER_PRIOR,
+    "random actions": RANDOM_ACTIONS,
+    "action space": ACTION_SPACE,
+    "policy": POLICY,
+    "global generators": GLOBAL_GENERATORS,
+    "held generators": HELD_GENERATORS,
+    "start points": START_POINTS,
+    "comparison study": COMPARISON_STUDY,
+    "local trials": LOCAL_TRIALS,
+    "way of tuning": WAY_OF_TUNING,
+}
+
+GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks
+AT_ONCE = 512  # blocks that Python draws in one pass
+
+_MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+_LOW, _SHIFT, _NONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(0)
+_SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
+_LN_2, _TWO_TO_MINUS_32 = float(np.log(2.0)), 2.0**-32
+
+
+@inlined
+def _round(counter, key):
+    # Of each word the low 32 bits count. What lies above them is taken off where it would matter, before a
+    # product: there it costs nothing, for vector code multiplies the lower halves of 64 bits anyway.
+    c0, c1, c2, c3 = counter
+    product_0 = _MULTIPLIER_0 * (c0 & _LOW)
+    product_1 = _MULTIPLIER_1 * (c2 & _LOW)
+    return (product_1 >> _SHIFT) ^ c1 ^ key[0], product_1, (product_0 >> _SHIFT) ^ c3 ^ key[1], product_0
+
+
+@inlined
+def _bump(key):
+    return (key[0] + _WEYL_0) & _LOW, (key[1] + _WEYL_1) & _LOW
+
+
+@inlined
+def philox(counter, key):
+    """Four 32-bit words, held in uint64, from a counter of four words and a key of two.
+
+    Ten rounds, written out: a loop here would keep the compiler from vectorising the caller's loop.
+    """
+    key_1 = _bump(key)
+    key_2 = _bump(key_1)
+    key_3 = _bump(key_2)
+    key_4 = _bump(key_3)
+    counter = _round(_round(_round(_round(_round(counter, key), key_1), key_2), key_3), key_4)
+    key_5 = _bump(key_4)
+    key_6 = _bump(key_5)
+    key_7 = _bump(key_6)
+    key_8 = _bump(key_7)
+    w0, w1, w2, w3 = _round(_round(_round(_round(_round(counter, key_5), key_6), key_7), key_8), _bump(key_8))
+    return w0 & _LOW, w1 & _LOW, w2 & _LOW, w3 & _LOW
+
+
+@inlined
+def uniform_block(block, step, stream, key_0, key_1):
+    """Four uniform numbers in (0, 1), multiples of 2^-32 plus 2^-33, for one block of one step."""
+    counter = (np.uint64(block), np.uint64(step), np.uint64(stream), _NONE)
+    w0, w1, w2, w3 = philox(counter, (np.uint64(key_0), np.uint64(key_1)))
+    return (
+        (np.float64(np.int64(w0)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w1)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w2)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w3)) + 0.5) * _TWO_TO_MINUS_32,
+    )
+
+
+@inlined
+def logarithm(x):
+    """Natural logarithm of a positive, normal float64 to 1e-15, without a branch or a library call.
+
+    x = 2^e m with m in [sqrt(1/2), sqrt(2)); log m = 2 artanh((m - 1)/(m + 1)) by its series.
+    """
+    bits = np.float64(x).view(np.int64)
+    exponent = (bits - _SQRT_HALF_BITS) >> 52
+    m = np.int64(bits - (exponent << 52)).view(np.float64)
+    s = (m - 1.0) / (m + 1.0)
+    t = s * s
+    series = 1.0 / 21.0
+    series = series * t + 1.0 / 19.0
+    series = series * t + 1.0 / 17.0
+    series = series * t + 1.0 / 15.0
+    series = series * t + 1.0 / 13.0
+    series = series * t + 1.0 / 11.0
+    series = series * t + 1.0 / 9.0
+    series = series * t + 1.0 / 7.0
+    series = series * t + 1.0 / 5.0
+    series = series * t + 1.0 / 3.0
+    series = series * t + 1.0
+    return np.float64(exponent) * _LN_2 + 2.0 * s * series
+
+
+@inlined
+def normal_block(block, step, stream, key_0, key_1):
+    """Four independent standard normals (|value| < 6.8) for one block of one step of one stream."""
+    u0, u1, u2, u3 = uniform_block(block, step, stream, key_0, key_1)
+    radius_0 = (-2.0 * logarithm(u0)) ** 0.5
+    radius_1 = (-2.0 * logarithm(u2)) ** 0.5
+    cosine_0, sine_0 = cosine_and_sine_of_turns(u1 - 0.5)
+    cosine_1, sine_1 = cosine_and_sine_of_turns(u3 - 0.5)
+    return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
+
+
+@overloaded
+def fill_normals(out, count, step, stream, key_0, key_1):
+    """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
+
+    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them. As
+    Python it draws those of several steps at once, which takes about as long as those of one.
+    """
+    if out.dtype != np.float64:  # numbers that count what is done to them
+        return _fill_in_loop(out, count, step, stream, key_0, key_1)
+    blocks = (count + GROUP - 1) // GROUP * (GROUP // 4)
+    together = max(AT_ONCE // max(blocks, 1), 1)
+    rows = _normals_of_steps(blocks, step // together, together, stream, key_0, key_1)
+    out[: 4 * blocks] = rows[int(step % together)]
+
+
+@lru_cache(maxsize=32)
+def _normals_of_steps(blocks, begin, together, stream, key_0, key_1):
+    """Rows of normals, (together, 4 blocks), of the steps from begin * together on."""
+    steps = begin * together + np.arange(together)[:, None]
+    return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(together, -1)
+
+
+def _fill_in_loop(out, count, step, stream, key_0, key_1):
+    for block in range((count + GROUP - 1) // GROUP * (GROUP // 4)):
+        z0, z1, z2, z3 = normal_block(block, step, stream, key_0, key_1)
+        out[4 * block] = z0
+        out[4 * block + 1] = z1
+        out[4 * block + 2] = z2
+        out[4 * block + 3] = z3
+
+
+@when_compiling
+def _teach_fill_normals():
+    from numba.extending import overload
+
+    options: Any = {"forceinline": True, "no_cfunc_wrapper": True}  # those of `inlined`
+
+    @overload(fill_normals, jit_options=options, strict=False)
+    def _of_arrays(out, count, step, stream, key_0, key_1):
+        return overloaded(_fill_in_loop)
+
+
+def draw_key(generator: np.random.Generator) -> np.ndarray:
+    """Draw an episode's key from a NumPy generator: two 32-bit words as float64, shape (2,)."""
+    return generator.integers(0, 2**32, size=2).astype(np.float64)
+
+
+def draw_keys(generator: np.random.Generator, count: int) -> np.ndarray:
+    """Draw keys (count, 2): those that `count` calls of `draw_key` would give."""
+    return generator.integers(0, 2**32, size=(count, 2)).astype(np.float64)
+
+
+def episode_keys(seeds) -> np.ndarray:
+    """Keys, shape (len(seeds), 2), that envs draw at their first `reset(seed=s)` for s in seeds."""
+    from gymnasium.utils.seeding import np_random
+
+    return np.array([draw_key(np_random(int(seed))[0]) for seed in seeds])
+
+
+def derived_sequence(seed: int | None, purpose: int, *numbers: int) -> np.random.SeedSequence:
+    """The seed sequence of one purpose: independent of the env's own, and of that of every other purpose.
+
+    Args:
+        seed: of the env, the problem or the study.
+        purpose: one of SPAWN_KEYS.
+        *numbers: which of several it is, such as the number of a case.
+    """
+    return np.random.SeedSequence(seed, spawn_key=(purpose, *numbers))
+
+
+def derived_generator(seed: int | None, purpose: int, *numbers: int) -> np.random.Generator:
+    """A generator of one purpose; see `derived_sequence`."""
+    return np.random.default_rng(derived_sequence(seed, purpose, *numbers))
+
+
+def derived_seed(seed: int | None, purpose: int, *numbers: int) -> int:
+    """A whole number below 2^32 for what takes no generator; see `derived_sequence`."""
+    return int(derived_sequence(seed, purpose, *numbers).generate_state(1)[0])
+
+
+def filter_generator(seed: int | None) -> np.random.Generator:
+    """Generator of the keys that a filter wrapper draws, one an episode, after `reset(seed=seed)`."""
+    return derived_generator(seed, FILTER_PRIOR)
+
+
+def filter_keys(seeds) -> np.ndarray:
+    """Keys, shape (len(seeds), 2), of a filter wrapper's first episode after `reset(seed=s)` for s in seeds."""
+    return np.array([draw_key(filter_generator(int(seed))) for seed in seeds])

@@ -1,0 +1,105 @@
+"""Tables of text: for the terminal, and as plain text."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Sequence
+from io import StringIO
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from thruster_env.core.characters import showable
+
+BEST = "bold green"  # style of rows that win
+
+console = Console(markup=False, highlight=False)
+
+
+class WholeTable(Table):
+    """A table whose title and caption are as wide as the terminal, and not broken where the table ends."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The title, the table, the caption."""
+        title, caption = self.title, self.caption
+        self.title = self.caption = None
+        try:
+            yield from [Text(str(title), style="table.title")] if title else []
+            yield from super().__rich_console__(console, options)
+            yield from [Text(str(caption), style="table.caption")] if caption else []
+        finally:
+            self.title, self.caption = title, caption
+
+
+def table(
+    title: str | None,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    *,
+    caption: str | None = None,
+    words: bool = False,
+    best: Container[int | None] = (),
+) -> Table:
+    """A table for the terminal; where it is narrow, cells fold and no column is lost.
+
+    Args:
+        title: above it, if there is one.
+        columns: their headers; the first one is left-aligned.
+        rows: cells.
+        caption: below it.
+        words: whether the other columns hold words, and are left-aligned, too.
+        best: places of rows that win, which stand out on a terminal; None is no row's place.
+    """
+    title, caption = (part and showable(part, console.encoding) for part in (title, caption))
+    out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
+    out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
+    for index, column in enumerate(columns):
+        justify: JustifyMethod = "left" if index == 0 or words else "right"
+        out.add_column(Text(showable(column, console.encoding), overflow="fold"), justify=justify, overflow="fold")
+    for place, row in enumerate(rows):  # Text: units in brackets are no markup
+        cells = [cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
+        out.add_row(*cells, style=BEST if place in best else None)
+    _keep_words_whole(out)
+    return out
+
+
+def _keep_words_whole(out: Table) -> None:
+    """Let cells fold between words only, if there is room for the longest one of each column.
+
+    The rest of the line goes to the columns in proportion to what they lack: rich itself would make a table with
+    minimal widths wider than the terminal, and cut it.
+    """
+    columns = [[column.header, *column.cells] for column in out.columns]
+    longest = [max((len(word) for cell in cells for word in str(cell).split()), default=1) for cells in columns]
+    taken = 2 * len(longest)  # by padding, frame and gaps
+    if sum(longest) + taken > console.width:
+        out.padding, taken = 0, len(longest) + 1
+    lines = [max((len(line) for cell in cells for line in str(cell).split("\n")), default=1) for cells in columns]
+    spare = console.width - sum(longest) - taken
+    if spare < 0:
+        return
+    lacking = [line - word for line, word in zip(lines, longest, strict=True)]
+    if sum(lacking) > spare:
+        for column, word, lack in zip(out.columns, longest, lacking, strict=True):
+            column.width = word + spare * lack // sum(lacking)
+        return
+    for column, width in zip(out.columns, longest, strict=True):
+        column.min_width = width
+
+
+def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str:
+    """What the terminal would show of tables and lines, without colours; also one of another width."""
+    stream = StringIO()
+    plain = Console(
+        file=stream,
+        width=width or console.width,
+        color_system=None,
+        force_jupyter=False,
+        markup=False,
+        highlight=False,
+    )
+    for part in parts:
+        plain.print(part)
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).strip("\n")

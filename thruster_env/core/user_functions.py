@@ -1,0 +1,226 @@
+"""A user's functions: which ones a function calls, what their code says, and copies that find other names.
+
+Code is read where a call would not tell: whether a function catches exceptions, which machine code does not raise,
+or asks whether a comparison `is True`, which holds for Python's truth values alone.
+"""
+
+from __future__ import annotations
+
+import builtins
+import dis
+import functools
+import inspect
+import math
+import sys
+import types
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from thruster_env.core.code_text import names_read
+
+LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "numba", "torch"} - {"__main__"}  # not a user's functions
+NO_FUNCTIONS = bool | int | float | complex | str | bytes | np.ndarray | np.generic | None
+OURS = "thruster_env", "filters", "tuning"  # packages whose functions do not change
+WRITTEN_OUT = "thruster_env.core.written"  # the module of functions that are made of text
+MODULES = math, np, np.linalg  # of whose functions copies find others
+CALL = ("__call__",)  # what is read of a value that is called
+CATCHING = {"CHECK_EXC_MATCH", "CHECK_EG_MATCH"}  # instructions of `except Kind:`
+
+
+def functions_in(*values: Any) -> Iterator[types.FunctionType]:
+    """A user's functions among some values, and all that these may call: by name, in closures, of objects."""
+    waiting: list[tuple[Any, tuple[str, ...]]] = [
+        (value, CALL) for value in values
+    ]  # and names that are read of it
+    seen: dict[int, Any] = {}  # the objects, too, so that no new one gets an id
+    while waiting:
+        value, names = waiting.pop()
+        value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
+        if (id(value), names) in seen or _top(value) in LIBRARIES:
+            continue
+        seen[id(value), names] = value  # type: ignore[index]
+        if isinstance(value, types.FunctionType):
+            ours = _top(value) in OURS
+            if not ours:
+                yield value
+            read = (*names_read(value.__code__), *CALL)
+            parts = [cell.cell_contents for cell in value.__closure__ or () if not _is_empty(cell)]
+            if (
+                not ours or value.__module__ == WRITTEN_OUT
+            ):  # others of ours have a user's functions in closures alone
+                parts += [value.__globals__[name] for name in read if name in value.__globals__]
+            waiting += [(part, read) for part in (*parts, *(value.__defaults__ or ()))]
+        elif isinstance(value, types.MethodType):
+            code = getattr(value.__func__, "__code__", None)
+            waiting += [(value.__func__, CALL), (value.__self__, tuple(names_read(code)) if code else ())]
+        elif isinstance(value, functools.partial):
+            waiting += [(part, names) for part in (value.func, *value.args, *value.keywords.values())]
+        elif type(value) in (tuple, list, dict):
+            waiting += [(part, names) for part in (value.values() if isinstance(value, dict) else value)]
+        elif isinstance(value, staticmethod | classmethod):
+            waiting.append((value.__func__, names))
+        elif isinstance(value, property):
+            waiting.append((value.fget, names))
+        elif not isinstance(value, NO_FUNCTIONS):
+            held = (inspect.getattr_static(value, name, None) for name in names)
+            waiting += [(one, names) for one in held if one is not None]
+
+
+def _top(value: Any) -> str:
+    """The package of a function, class, module or object."""
+    if isinstance(value, types.ModuleType):
+        return value.__name__.partition(".")[0]
+    if isinstance(value, tuple | list | dict | types.MethodType | functools.partial | staticmethod | classmethod):
+        return ""
+    module = getattr(value, "__module__", None) or type(value).__module__
+    return module.partition(".")[0] if type(module) is str and module != "builtins" else ""
+
+
+def _is_empty(cell: types.CellType) -> bool:
+    try:
+        return cell.cell_contents is cell
+    except ValueError:
+        return True
+
+
+@functools.lru_cache(maxsize=256)
+def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
+    """Parts (first, end) of some code whose exceptions an `except` catches; what cleans up alone does not."""
+    listed = dis.Bytecode(code)
+    instructions = list(listed)
+    place = {one.offset: i for i, one in enumerate(instructions)}
+
+    def catches(target: int) -> bool:
+        for one, after in zip(instructions[place[target] :], instructions[place[target] + 1 :], strict=False):
+            if one.opname in CATCHING or (one.opname, after.opname) == ("PUSH_EXC_INFO", "POP_TOP"):
+                return True
+            if one.opname == "WITH_EXCEPT_START":
+                return "suppress" in code.co_names  # of contextlib
+            if one.opname == "RERAISE":
+                return False
+        return False
+
+    entries = listed.exception_entries  # type: ignore[attr-defined]
+    return tuple((one.start, one.end) for one in entries if catches(one.target))
+
+
+def catches_exceptions(code: types.CodeType) -> bool:
+    """Whether some code, or that of a function within it, catches exceptions."""
+    return bool(caught(code)) or any(map(catches_exceptions, _codes_within(code)))
+
+
+def _asks_for_truth(code: types.CodeType) -> bool:
+    """Whether some code asks if a value `is True`, as `match x > 0: case True` does."""
+    pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
+    return any(
+        after.opname == "IS_OP" and one.opname == "LOAD_CONST" and type(one.argval) is bool for one, after in pairs
+    ) or any(map(_asks_for_truth, _codes_within(code)))
+
+
+def inverts(code: types.CodeType) -> bool:
+    """Whether some code has a `~`, which means "not" to NumPy's truth values and machine code alone."""
+    names = (one.opname for one in dis.get_instructions(code))
+    return "UNARY_INVERT" in names or any(map(inverts, _codes_within(code)))
+
+
+def takes_roots(code: types.CodeType) -> bool:
+    """Whether some code has powers other than those of whole numbers, which Python's floats may have complex."""
+    pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
+    powers = (type(one.argval) is not int for one, after in pairs if after.argrepr in ("**", "**="))
+    return any(powers) or "pow" in code.co_names or any(map(takes_roots, _codes_within(code)))
+
+
+def _codes_within(code: types.CodeType) -> list[types.CodeType]:
+    return [one for one in code.co_consts if isinstance(one, types.CodeType)]
+
+
+def needs_python(*functions: Any) -> str | None:
+    """Why only Python can say what functions compute, as they catch exceptions; else None."""
+    for one in functions_in(*functions):
+        if catches_exceptions(one.__code__):
+            return f"{one.__name__} catches exceptions, and arithmetic raises some in Python alone"
+    return None
+
+
+def needs_floats(*functions: Any) -> str | None:
+    """Why functions need Python's floats or machine code, and cannot be traced or take tensors; else None."""
+    for one in functions_in(*functions):
+        if _asks_for_truth(one.__code__):
+            return f"{one.__name__} asks whether a comparison `is` True or False: == or an if would do"
+    return needs_python(*functions)
+
+
+class Module:
+    """A module of which a function's copy finds other functions under some names."""
+
+    def __init__(self, module: types.ModuleType, in_place_of: Callable[[types.ModuleType, str], Any]):
+        """Take the module, and what is found in it under a name."""
+        self._module, self._in_place_of = module, in_place_of
+
+    def __getattr__(self, name: str):
+        return self._in_place_of(self._module, name)
+
+
+class Copies:
+    """Copies of functions and of all plain functions that they call, which find others under some names."""
+
+    def __init__(self, in_place_of: Callable[[types.ModuleType, str], Any], names: Mapping[str, Any]):
+        """Take what copies find in MODULES, by module and name, and in place of Python's functions."""
+        self._in_place_of, self._names = in_place_of, names
+        self._copies: dict[int, types.FunctionType] = {}
+
+    def of(self, value: Any) -> Any:
+        """The copy of a function; of another value what a copy shall find in its place."""
+        value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
+        if isinstance(value, types.ModuleType) and value in MODULES:
+            return Module(value, self._in_place_of)
+        name = getattr(value, "__name__", "")
+        for module in MODULES:
+            if callable(value) and value is getattr(module, name, None):
+                return self._in_place_of(module, name)
+        if isinstance(value, types.MethodType) and isinstance(value.__func__, types.FunctionType):
+            return types.MethodType(self.of(value.__func__), value.__self__)
+        if isinstance(value, functools.partial):
+            return functools.partial(self.of(value.func), *value.args, **value.keywords)
+        return self._of_function(value) if isinstance(value, types.FunctionType) else value
+
+    def called(self, value: Any) -> Callable:
+        """The copy of a function, or of what an object does when it is called."""
+        value = stands_for(value)
+        by_class = inspect.getattr_static(type(value), "__call__", None)
+        is_object = isinstance(by_class, types.FunctionType) and _top(value) not in LIBRARIES.union(OURS)
+        return self.of(types.MethodType(by_class, value) if is_object else value)
+
+    def _of_function(self, function: types.FunctionType) -> types.FunctionType:
+        if id(function) not in self._copies:
+            cells = tuple(types.CellType() for _ in function.__closure__ or ())
+            names = vars(builtins) | dict(self._names)
+            names["__builtins__"] = builtins  # which what NumPy imports late asks for
+            copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
+            copy.__kwdefaults__ = function.__kwdefaults__
+            self._copies[id(function)] = copy
+            read = [one for one in names_read(function.__code__) if one in function.__globals__]
+            names |= {one: self.of(function.__globals__[one]) for one in read}
+            for cell, old in zip(cells, function.__closure__ or (), strict=True):
+                cell.cell_contents = self.of(old.cell_contents)
+        return self._copies[id(function)]
+
+
+_stand_ins: weakref.WeakKeyDictionary[Callable, Callable] = weakref.WeakKeyDictionary()
+
+
+def stand_in(other: Callable, function: Callable) -> Callable:
+    """Have one function stand for another, in whose place a filter calls it; return it."""
+    _stand_ins[other] = function
+    return other
+
+
+def stands_for(value: Any) -> Any:
+    """The function that a function stands for; other values as they are."""
+    try:
+        return _stand_ins.get(value, value)
+    except TypeError:  # nothing that a weak reference or a hash can be had of
+        return value

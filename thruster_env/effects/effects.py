@@ -1,0 +1,185 @@
+"""Effects that disturb a plant: immutable values, registered by name, that JSON can hold.
+
+An effect is a frozen dataclass of plain numbers with the function that acts on a block of copies,
+
+    act(memory, b, target, rows, number, numbers, at, begin)
+
+where `memory[b, target, j]` is the value that it changes for copy j, `memory[b, rows + i, j]` are its own states,
+`numbers[at + i]` its parameters, `number` distinguishes its random draws from those of other effects, and `begin`
+is true at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may
+register further effects before the first env is made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from thruster_env.core.checks import short_repr
+from thruster_env.core.compiled import inlined
+from thruster_env.core.memory import KEY_0, KEY_1, STEP
+from thruster_env.core.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
+
+# An effect in a row of numbers: its length, kind, row that it acts on, first row of its own, number, parameters.
+EFFECT_KIND, EFFECT_TARGET, EFFECT_ROWS, EFFECT_NUMBER, EFFECT_PARAMETERS = range(1, 6)
+MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
+LONGEST = 1e9  # [s], and in steps: what an effect may hold
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """The context from which an effect computes its parameters; a plant may extend it in a subclass."""
+
+    dt: float  # sample time [s]
+    valid_offset: int  # from the row of a measured channel to the one that says whether it is valid
+
+
+class Effect:
+    """Base of all effects; fields of the dataclass are the arguments.
+
+    The `context` of its methods is the plant's: a `Context`, or a class of the plant's own that adds to it.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]  # every effect is a dataclass
+    act: ClassVar[Callable]  # the function above, a staticmethod
+    name: ClassVar[str]
+    loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
+
+    def parameters(self, context: Any) -> list[float]:
+        """Parameters that `act` reads from `numbers[at]` on: the fields in order, unless overridden."""
+        return [float(value) for value in dataclasses.astuple(self)]
+
+    def rows(self, context: Any) -> int:
+        """Number of states that a copy keeps for this effect."""
+        return 0
+
+    def largest(self) -> float:
+        """Largest magnitude of a signal, at four standard deviations of its random part."""
+        return 0.0
+
+    def as_mapping(self) -> dict:
+        """The effect as JSON can hold it: its name and its arguments."""
+        return {"name": self.name, **dataclasses.asdict(self)}
+
+
+def dropping_channels(sensors: Mapping[str, tuple[Effect, ...]]) -> tuple[int, ...]:
+    """Numbers of the channels whose measurements may be missing, of effects by channel."""
+    return tuple(i for i, chain in enumerate(sensors.values()) if any(effect.loses for effect in chain))
+
+
+Kind = TypeVar("Kind", bound=Effect)
+
+
+class Registry:
+    """Effects of one kind by name, and how to make them from mappings."""
+
+    def __init__(self, argument: str):
+        """Name the env's argument for which this registry makes effects."""
+        self.argument = argument
+        self.effects: dict[str, type[Effect]] = {}
+
+    def register(self, name: str) -> Callable[[type[Kind]], type[Kind]]:
+        """Return a class decorator that makes a frozen dataclass an effect of this name."""
+
+        def decorate(cls: type[Kind]) -> type[Kind]:
+            cls.name = name
+            self.effects[name] = cls
+            return cls
+
+        return decorate
+
+    def make(self, given) -> tuple[Effect, ...]:
+        """Effects from None, one effect or a sequence of them, each an object or a mapping with its `name`.
+
+        Raises ValueError if an argument is wrong; the message states the rule and the value.
+        """
+        if given is None:
+            return ()
+        if isinstance(given, (Mapping, Effect)):
+            given = [given]
+        if isinstance(given, str) or not hasattr(given, "__iter__"):
+            raise ValueError(
+                f"{self.argument} must be a list of mappings with a name, but got {short_repr(given)}"
+            )
+        return tuple(self._make_one(one) for one in given)
+
+    def _make_one(self, given) -> Effect:
+        known: tuple[type[Effect], ...] = tuple(self.effects.values())
+        if isinstance(given, known):
+            return given
+        names = ", ".join(self.effects)
+        if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
+            rule = f"each entry of {self.argument} must be a mapping whose name is one of {names}"
+            raise ValueError(f"{rule}, but got {short_repr(given)}")
+        cls = self.effects[given["name"]]
+        arguments = {key: value for key, value in given.items() if key != "name"}
+        fields = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(arguments) - set(fields), key=str)
+        if unknown:
+            rule = f"arguments of {given['name']!r} must be among {', '.join(fields)}"
+            raise ValueError(f"{rule}, but got {unknown}")
+        try:
+            return cls(**arguments)
+        except TypeError:  # a field without a default is missing
+            rule = f"{given['name']!r} must be given {', '.join(fields)}"
+            raise ValueError(f"{rule}, but got {short_repr(arguments)}") from None
+
+
+@inlined
+def normals(memory, b, j, number):
+    """Four standard normals of one effect, copy and step."""
+    return normal_block(number, memory[b, STEP, j], DISTURBANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+
+
+@inlined
+def uniforms(memory, b, j, number):
+    """Four uniform numbers in (0, 1) of one effect, copy and step."""
+    return uniform_block(number, memory[b, STEP, j], CHANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+
+
+def encoded(
+    effects,
+    kinds: tuple[type[Effect], ...],
+    target: int,
+    first_row: int,
+    first_number: int,
+    context: Context,
+    lost_with: int | None = None,
+):
+    """Numbers of some effects on one target row, and the number of rows that they take.
+
+    With `lost_with`, the first number of another channel's effects, measurements are lost when that channel's are.
+    """
+    numbers: list[float] = []
+    rows = 0
+    for place, effect in enumerate(effects):
+        parameters = _representable(effect, effect.parameters(context))
+        number = place + (lost_with if effect.loses and lost_with is not None else first_number)
+        header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
+        numbers += [*header, *parameters]
+        rows += effect.rows(context)
+    return numbers, rows
+
+
+def _representable(effect: Effect, parameters: list[float]) -> list[float]:
+    """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
+    smallest, largest = MAGNITUDES
+    parts: list[Any] = [*_numbers(dataclasses.astuple(effect)), 0.0]
+    given = [abs(value) for value in np.hstack(parts) if value]
+    if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
+        rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
+        raise ValueError(f"{rule}, and so must what follows from them, but got {short_repr(effect)}")
+    return [float(value) for value in parameters]
+
+
+def _numbers(values: tuple) -> list:
+    """Those that are numbers, or tuples of numbers."""
+    return [value for value in values if isinstance(value, (int, float, tuple)) and value]
+
+
+def set_field(effect: object, name: str, value) -> None:
+    """Set a checked value on a frozen effect, from its __post_init__."""
+    object.__setattr__(effect, name, value)

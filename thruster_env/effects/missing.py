@@ -1,0 +1,126 @@
+"""Measurements that are missing: lost at random, or not taken at every step.
+
+A missing measurement repeats the last one that was there (0 before the first) and is marked as not valid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from thruster_env.core.checks import at_least, finite, within
+from thruster_env.core.compiled import inlined
+from thruster_env.core.memory import STEP
+from thruster_env.effects.effects import Context, Effect, set_field, uniforms
+
+LONGEST_INTERVAL = 1_000_000  # steps between two samples
+
+
+@inlined
+def hold_missing(memory, b, j, target, held, valid, missing, begin):
+    """Where copy j's measurement is missing repeat the last one, kept in row `held`, and mark it as not valid."""
+    if begin:
+        memory[b, held, j] = 0.0
+    if missing:
+        memory[b, target, j] = memory[b, held, j]
+        memory[b, valid, j] = 0.0
+    memory[b, held, j] = memory[b, target, j]
+
+
+@inlined
+def dropout(memory, b, target, rows, number, numbers, at, begin):
+    """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
+    begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
+    held, lost = rows, rows + 1
+    for j in range(memory.shape[2]):
+        u, _, _, _ = uniforms(memory, b, j, number)
+        if begin:
+            memory[b, lost, j] = 0.0
+        if memory[b, lost, j] > 0.0:
+            memory[b, lost, j] = 0.0 if u < ends else 1.0
+        else:
+            memory[b, lost, j] = 1.0 if u < begins else 0.0
+        hold_missing(memory, b, j, target, held, valid, memory[b, lost, j] > 0.0, begin)
+
+
+@inlined
+def sample_every(memory, b, target, rows, number, numbers, at, begin):
+    """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
+    steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
+    for j in range(memory.shape[2]):
+        between = (int(memory[b, STEP, j]) - first) % steps != 0
+        hold_missing(memory, b, j, target, rows, valid, between, begin)
+
+
+@dataclass(frozen=True)
+class Dropout(Effect):
+    """Missing measurements, in runs of random length.
+
+    The observation then repeats the last valid value (0 at first), a validity flag of the channel is appended to
+    it, and `info["measurement_valid"]` holds the same flag.
+
+    Args:
+        probability: fraction of the measurements that are missing in the long run.
+        mean_length: mean number of missing measurements in a row; 1/(1 - probability) is independent dropout.
+    """
+
+    probability: float = 0.1
+    mean_length: float | None = None
+    act = staticmethod(dropout)
+    loses = True
+
+    def __post_init__(self):
+        """Check the arguments."""
+        share = probability("probability", self.probability)
+        if share == 1.0:
+            raise ValueError("probability must be less than 1, but got 1.0")
+        shortest = max(1.0, share / (1.0 - share))  # else a run would have to begin with a probability above 1
+        length = 1.0 / (1.0 - share) if self.mean_length is None else finite("mean_length", self.mean_length)
+        if length < shortest:
+            raise ValueError(f"mean_length must be at least {shortest:g}, but got {self.mean_length!r}")
+        set_field(self, "probability", share)
+        set_field(self, "mean_length", length)
+
+    def parameters(self, context: Context) -> list[float]:
+        """Probabilities that a run of missing measurements begins, and that it ends; where validity stands."""
+        assert self.mean_length is not None  # it is set when the effect is made
+        begins = self.probability / (1.0 - self.probability) / self.mean_length
+        return [begins, 1.0 / self.mean_length, context.valid_offset]
+
+    def rows(self, context: Context) -> int:
+        """The last valid measurement, and whether one is missing."""
+        return 2
+
+
+@dataclass(frozen=True)
+class SampleEvery(Effect):
+    """A sensor slower than the plant: a sample every `steps` steps, from step number `first` on.
+
+    Between two samples the measurement is missing, as with `Dropout`. A sensor of 5 Hz on a plant with a step of
+    0.05 s has a sample every 4 steps.
+    """
+
+    steps: int
+    first: int = 0
+    act = staticmethod(sample_every)
+    loses = True
+
+    def __post_init__(self):
+        """Check the arguments."""
+        steps = at_least("steps", self.steps, 1, LONGEST_INTERVAL)
+        set_field(self, "steps", steps)
+        set_field(self, "first", at_least("first", self.first, 0, LONGEST_INTERVAL) % steps)
+
+    def parameters(self, context: Context) -> list[float]:
+        """Steps between two samples, the first one's number, and where validity stands."""
+        return [self.steps, self.first, context.valid_offset]
+
+    def rows(self, context: Context) -> int:
+        """The last sample."""
+        return 1
+
+
+def probability(name: str, value) -> float:
+    """Return value as a float; raise ValueError unless it lies within 0 and 1."""
+    if within(name, value, 1.0) < 0:
+        raise ValueError(f"{name} must be at least 0 and at most 1, but got {value!r}")
+    return float(value)

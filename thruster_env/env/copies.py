@@ -1,0 +1,138 @@
+"""Many copies of a plant, stepped in place in one call of compiled code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+
+from thruster_env.core.compiled import (
+    CompiledOrPython,
+    compiled,
+    function_fingerprint,
+    inlined,
+    is_interpreting,
+)
+from thruster_env.core.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
+from thruster_env.core.threads import in_parts, worker_threads
+
+THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
+
+
+class PlantCopies:
+    """N copies of a plant, each with its own key; a report of them is an array (reported, N).
+
+    A plant's class defines the rows of commands and reports, packs its parameters and finds its compiled step,
+    `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin` it starts an
+    episode of every copy from the keys in its memory and takes the first measurement; otherwise it applies the
+    commands for one sample time. It writes its report to out (reported, blocks, width).
+
+    Attributes:
+        commands: rows of the memory that hold the inputs of the next step.
+        reported: the row after the last one that a step reports.
+    """
+
+    commands: tuple[int, ...]
+    reported: ClassVar[int]
+    advance: Callable
+
+    def __init__(self, count: int, numbers: np.ndarray, rows: int):
+        """Allocate the memory of `count` copies, each of `rows` rows; call `begin` next.
+
+        Args:
+            count: number of copies.
+            numbers: packed parameters of the plant, which the compiled step reads.
+            rows: of the memory, those in front (`thruster_env.core.memory.FRONT`) included.
+        """
+        self.count, self.numbers = count, numbers
+        self.memory = new_memory(count, rows)
+        self._find_machine_code()
+
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
+        """The compiled step, and the same for several threads, from `machine_code_of`."""
+        raise NotImplementedError
+
+    def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
+        """Numbers for `begin` with the initial state that a reset's options fix, or None.
+
+        Raises ValueError for options that are not such.
+        """
+        raise NotImplementedError
+
+    def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
+        """Write further initial values of episodes with keys (count, 2), such as random parameters."""
+
+    def _find_machine_code(self) -> None:
+        self.advance, self._advance_in_parts = self.machine_code()
+
+    def __getstate__(self) -> dict:
+        """All but the machine code, which pickle cannot hold and every process finds for itself."""
+        return {key: value for key, value in vars(self).items() if key not in ("advance", "_advance_in_parts")}
+
+    def __setstate__(self, state: dict) -> None:
+        """Find the machine code for the memory that was kept."""
+        vars(self).update(state)
+        self._find_machine_code()
+
+    @property
+    def bytes_per_copy(self) -> int:
+        """Memory per copy."""
+        return self.memory.nbytes // (self.memory.shape[0] * self.memory.shape[2])
+
+    def begin(self, keys: np.ndarray, which: np.ndarray | None = None, numbers=None) -> np.ndarray:
+        """Start episodes with keys (count, 2) for all copies, or for those named by `which`; return their report.
+
+        `numbers` may replace the plant's own, with another initial state.
+        """
+        numbers = self.numbers if numbers is None else numbers
+        memory = self.memory if which is None else gathered(self.memory, which)
+        set_row(memory, KEY_0, keys[:, 0])
+        set_row(memory, KEY_1, keys[:, 1])
+        self.prepare(memory, keys)
+        out = self._run(memory, numbers, True)
+        if which is not None:
+            scatter(memory, self.memory, which)
+        return out[:, : len(keys)]
+
+    def step(self, commands: np.ndarray) -> np.ndarray:
+        """Apply commands (N,) of one input, or (N, p), for one sample time; return the report."""
+        if commands.ndim == 1:
+            set_row(self.memory, self.commands[0], commands)
+        else:
+            for row, values in zip(self.commands, commands.T, strict=True):
+                set_row(self.memory, row, values)
+        return self._run(self.memory, self.numbers, False)[:, : self.count]
+
+    def report(self) -> np.ndarray:
+        """The report of the last step, without a step."""
+        reported = self.memory[:, : self.reported].transpose(1, 0, 2)
+        return reported.reshape(self.reported, -1)[:, : self.count].copy()
+
+    def _run(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> np.ndarray:
+        blocks, _, width = memory.shape
+        # A block more than there are: rows that lie a power of two apart would drive one another out of the cache.
+        out = np.empty((self.reported, blocks + 1, width))
+        if blocks < THREADED_BLOCKS:
+            self.advance(0, blocks, memory, numbers, out, begin)
+        else:
+            worker_threads().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
+        return out.reshape(self.reported, -1)
+
+
+def machine_code_of(step: Callable) -> tuple[Callable, CompiledOrPython]:
+    """The step of a plant's class for `PlantCopies.machine_code`, from a plain function."""
+    return _machine_code_of(step, is_interpreting())
+
+
+@cache
+def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, CompiledOrPython]:
+    inlined(step)
+    fingerprint = function_fingerprint(step, within=step.__module__)
+
+    def advance(first, last, memory, numbers, out, begin):
+        fingerprint  # noqa: B018 - part of the cache's key
+        step(first, last, memory, numbers, out, begin)
+
+    return compiled(advance), in_parts(step)

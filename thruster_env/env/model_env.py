@@ -1,0 +1,127 @@
+"""`ModelEnv`: a Gymnasium env whose plant is a state-space model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import gymnasium as gym
+import numpy as np
+
+from thruster_env.core.checks import positive, short_repr
+from thruster_env.core.checks import seed as checked_seed
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.core.streams import GROUP, draw_key
+from thruster_env.env.commands import some_numbers
+from thruster_env.model.layout import padded
+from thruster_env.model.simulate import truth_steps_of
+from thruster_env.model.state_space import StateSpaceModel
+
+
+class ModelEnv(gym.Env):
+    """A state-space model as an env: the action is its input, the observation its measurement.
+
+        x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
+
+    The first episode after `reset(seed=s)` is the trajectory that `thruster_env.model.simulate.simulate` draws
+    for the key of seed s under the same inputs, and the data of seed s in a tuning problem of the same model.
+    `info` holds "state" (n,) and "measurement" (m,) in float64. The reward is 0 and episodes do not end; use
+    `gymnasium.wrappers.TimeLimit` to end them.
+
+    Args:
+        truth: the model that generates states and measurements.
+        assumed: the model that filters assume, returned by `state_space_model`: a model, or a function that makes
+            one from changes by name; the truth if None.
+        low: smallest input, one number or p, in the units of the inputs.
+        high: largest input, one number or p.
+        dt: sample time [s], compared with that of tuned files; None if unknown. It has no other effect:
+            covariances are per step and do not scale with dt.
+
+    Raises:
+        ValueError: if the truth is not a model, or bounds or dt are wrong.
+    """
+
+    metadata = {"render_modes": []}
+    action_space: gym.spaces.Box
+
+    def __init__(
+        self,
+        truth: StateSpaceModel,
+        assumed: StateSpaceModel | Callable[..., StateSpaceModel] | None = None,
+        *,
+        low=-np.inf,
+        high=np.inf,
+        dt: float | None = None,
+    ):
+        """Make spaces and memory; see the class for the arguments."""
+        if not isinstance(truth, StateSpaceModel):
+            raise ValueError(f"the truth of an env must be a StateSpaceModel, but it is {short_repr(truth)}")
+        self.truth, self.dt = truth, None if dt is None else positive("dt", dt)
+        assumed = truth if assumed is None else assumed
+        self.state_space_model = partial(with_noise, assumed) if isinstance(assumed, StateSpaceModel) else assumed
+        self.action_space = gym.spaces.Box(*_bounds(low, high, truth.inputs), dtype=np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (truth.m,), np.float64)
+        self._numbers, self._key, self._step = truth.numbers, np.zeros(2), 0
+        self._x, self._z, self._u = np.zeros(truth.n), np.zeros(truth.m), np.zeros(truth.inputs)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Draw a key from the env's generator, and by it an initial state and a first measurement."""
+        super().reset(seed=checked_seed(seed))
+        self._key, self._step = draw_key(self.np_random), 0
+        return self._moved()
+
+    def step(self, action):
+        """Apply an input (p,), clipped to its bounds, for one step; ValueError for one that is not p numbers."""
+        given = some_numbers(action, self.truth.input_quantities)
+        self._u[:] = np.clip(given, self.action_space.low, self.action_space.high)
+        self._step += 1
+        observation, info = self._moved()
+        return observation, 0.0, False, False, info
+
+    def _moved(self) -> tuple[np.ndarray, dict]:
+        move = _mover(*truth_steps_of(self.truth), max(self.truth.n, self.truth.m), is_interpreting())
+        move(self._x, self._z, self._u, self._step, self._key, self._numbers)
+        return self._z.copy(), {"state": self._x.copy(), "measurement": self._z.copy()}
+
+
+def with_noise(
+    model: StateSpaceModel,
+    *,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float | None = None,
+) -> StateSpaceModel:
+    """A model with another Q or R, and with P_0 multiplied by a factor, if given."""
+    changes = {"process_noise_cov": process_noise_cov, "measurement_noise_cov": measurement_noise_cov}
+    if prior_cov_factor is not None:
+        changes["prior_cov"] = positive("prior_cov_factor", prior_cov_factor) * model.prior_cov
+    return model.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        low, high = (np.array(np.broadcast_to(np.asarray(one, dtype=np.float64), count)) for one in (low, high))
+    except (TypeError, ValueError):
+        low, high = np.full(1, np.nan), np.zeros(1)
+    if not (low <= high).all():
+        raise ValueError(f"low and high must be one number or {count}, low at most high, but they are not")
+    return low, high
+
+
+@lru_cache(maxsize=64)
+def _mover(
+    begin: Callable, advance: Callable, measure: Callable, largest: int, interpreting: bool
+) -> CompiledOrPython:
+    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
+    room = padded(largest, GROUP)
+
+    def move(x, z, u, step, key, numbers):
+        fingerprint  # noqa: B018 - part of the cache's key
+        draws = np.zeros(room)
+        if step == 0:
+            begin(x, draws, key[0], key[1], numbers)
+        else:
+            advance(x, u, draws, step, key[0], key[1], numbers)
+        measure(z, x, draws, step, key[0], key[1], numbers)
+
+    return CompiledOrPython(move)

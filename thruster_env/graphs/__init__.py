@@ -1,0 +1,11 @@
+"""What a plain function of floats computes, as a graph of numbers, and programs made of such graphs.
+
+graphs, folding, tracing          the graph of a function
+branches                          the same of a function that decides: a choice between what it does on each side
+slopes                            derivatives of a graph
+magnitudes                        what is known of a number's size
+precision                         constants in single precision
+programs, instructions            a graph as machine code, for some runs side by side
+loops, loop_instructions          the same for the members of an ensemble, cut into loops
+c_source                          the same as C99
+"""

@@ -1,0 +1,170 @@
+"""A program as statements of C99, which read arrays, work out numbers, and store them.
+
+    const double t0 = x[0];
+    const double t1 = 0.5 * t0;
+    x[0] = t1;
+
+Constants stand where they are used, with as many digits as tell them from their neighbours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, Number
+from thruster_env.graphs.loops import Cut
+from thruster_env.graphs.precision import as_single
+from thruster_env.graphs.programs import CALLED_IN_ROUNDS, Place, Program
+
+OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}
+OTHER_NAMES = {"abs": "fabs"} | {f"arc{name}": f"a{name}" for name in ("tan", "tan2", "sinh", "cosh", "tanh")}
+"""Functions of math.h that have other names in NumPy."""
+
+
+def statements_of(program: Program, single: bool = False) -> list[str]:
+    """Statements that run a program; the arrays' names in its places are expressions of C.
+
+    Args:
+        program: reads come first, stores last, so results may lie where arguments do.
+        single: whether all numbers are floats, not doubles.
+    """
+    writer = _Writer(single, {})
+    writer.write(program.reads, program.works, program.stores)
+    return writer.lines
+
+
+def statements_of_members(parts: Cut, size: int, rows: Mapping[str, tuple[str, int]], single: bool) -> list[str]:
+    """Statements that run a program of an ensemble, with loops over its members.
+
+    Args:
+        parts: the program, cut into loops.
+        size: how many members there are.
+        rows: names of the table and the draws in C, and how long their rows are.
+        single: whether all numbers are floats, not doubles.
+    """
+    once = _Writer(single, {})
+    once.write(parts.reads, [], [])
+    for turn in parts.turns:
+        once.write([], turn.works, [])
+        for body in turn.bodies:
+            sums = [once.named(one) for one in body.sums]
+            once.lines += [f"{once.kind} {name} = {literal(0.0, single)};" for name in sums]
+            each = _Writer(single, rows, once)
+            each.write(body.reads, body.works, body.stores)
+            totals = zip(sums, body.sums, strict=True)
+            each.lines += [f"{name} += {each.names[one.of[0].place]};" for name, one in totals]
+            inside = [f"    {line}" for line in each.lines]
+            once.lines += [f"for (int j = 0; j < {size}; j++) {{", *inside, "}"]
+    once.write([], [], parts.stores)
+    return once.lines
+
+
+class _Writer:
+    """Writes statements.
+
+    Attributes:
+        lines: the statements.
+        names: of numbers, by their places in the graph.
+        kind: of the numbers.
+    """
+
+    def __init__(self, single: bool, rows: Mapping[str, tuple[str, int]], around: _Writer | None = None):
+        """Begin; within a loop `around` has written what stands before it."""
+        self._single, self._rows = single, rows
+        self.lines: list[str] = []
+        self.names: dict[int, str] = {} if around is None else dict(around.names)
+        self.kind, self._letter = "float" if single else "double", "t" if around is None else "m"
+        self._count = 0
+
+    def named(self, one: Number) -> str:
+        """A new name for a number."""
+        name = self.names[one.place] = f"{self._letter}{self._count}"
+        self._count += 1
+        return name
+
+    def write(
+        self,
+        reads: Iterable[tuple[Place, Number]],
+        works: Iterable[Number],
+        stores: Iterable[tuple[Place, Number]],
+    ) -> None:
+        """Read numbers, work some out, and store some."""
+        for place, one in reads:
+            self.lines.append(f"const {self.kind} {self.named(one)} = {self._lies(place)};")
+        for one in (one for one in works if one.place not in self.names):  # sums are known
+            if one.value is not None:
+                self.names[one.place] = literal(one.value, self._single)
+            elif one.operation == "call":
+                self._call(one)
+            else:
+                whose = "int" if one.operation in CONDITIONS else self.kind
+                value = _expression(one, self.names, self._single)
+                self.lines.append(f"const {whose} {self.named(one)} = {value};")
+        self.lines += [f"{self._lies(place)} = {self.names[one.place]};" for place, one in stores]
+
+    def _call(self, one: Number) -> None:
+        name, count, *_ = one.arguments
+        given, found = ", ".join(self.names[a.place] for a in one.of), self.named(one)
+        self.lines.append(f"const {self.kind} of_{found}[{len(one.of)}] = {{{given}}};")
+        self.lines += [f"{self.kind} {found}[{count}];", f"{name}(of_{found}, {found});"]
+
+    def _lies(self, place: Place) -> str:
+        if place.array not in self._rows:
+            return str(place)
+        name, length = self._rows[place.array]
+        return f"{name}[{place.at * length} + j]" if place.at else f"{name}[j]"
+
+
+def functions_called_by(programs: Iterable[Program], single: bool) -> list[str]:
+    """The functions of C that programs call, each once: work(given, found) in rounds."""
+    calls = {one.arguments[0] for program in programs for one in program.works if one.operation == "call"}
+    return [_in_rounds(str(name), single) for name in sorted(calls)]
+
+
+def _in_rounds(name: str, single: bool) -> str:
+    first, again, last, rounds, size = CALLED_IN_ROUNDS[name]()
+    kind = "float" if single else "double"
+    texts = ["\n".join(f"        {line}" for line in statements_of(one, single)) for one in (first, again, last)]
+    return f"""\
+static void {name}(const {kind} *given, {kind} *found)
+{{
+    {kind} kept[{size}];
+
+    {{
+{texts[0]}
+    }}
+    for (int k = 0; k < {rounds}; k++) {{
+{texts[1]}
+    }}
+    {{
+{texts[2]}
+    }}
+}}
+"""
+
+
+def _expression(one: Number, names: dict[int, str], single: bool) -> str:
+    values = [names[a.place] if isinstance(a, Number) else str(int(a)) for a in one.arguments]
+    if one.operation == "==" and values[0] == values[1]:
+        return f"!isnan({values[0]})"
+    if one.operation == "entry":
+        return "{}[{}]".format(*values)
+    if one.operation in OF_TWO:
+        return f"{values[0]} {OF_TWO[one.operation]} {values[1]}"
+    if one.operation == "negative":
+        return f"-{values[0]}"
+    if one.operation == "where":
+        return f"{values[0]} ? {values[1]} : {values[2]}"
+    return f"{OTHER_NAMES.get(one.operation, one.operation)}{'f' * single}({', '.join(values)})"
+
+
+def literal(value: float, single: bool = False) -> str:
+    """A number as C writes it; negative ones in brackets."""
+    if math.isnan(value):
+        return "NAN"
+    value = as_single(value) if single else float(value)
+    text = "INFINITY" if math.isinf(value) else str(np.float32(abs(value))) + "f" if single else repr(abs(value))
+    return f"(-{text})" if value < 0 else text

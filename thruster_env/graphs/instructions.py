@@ -1,0 +1,216 @@
+"""Programs as instructions of LLVM, each for as many runs as lie side by side.
+
+numba takes a millisecond to type a line of text, and a program has hundreds. But all that numba has to know of
+a program is that it is called: its instructions are given to LLVM directly. They are instructions for vectors
+of numbers, one of each run, so that nobody has to find out whether some loop could be made of such.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types, typing
+from numba.extending import lower_builtin, type_callable
+from numba.np.arrayobj import populate_array
+
+from thruster_env.core.compiled import FASTMATH
+from thruster_env.core.exponential import ROUNDER, ROUNDER_BITS
+from thruster_env.graphs.graphs import COMPARISONS, Number
+from thruster_env.graphs.programs import BY_MEMBERS, CALLED, SIDE_BY_SIDE, Place, Program
+
+FLAGS = tuple(sorted(FASTMATH))
+EXACT = ("nsz",)  # of what is rounded as Python does: to operations without flags numba adds all
+OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
+OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "abs": "fabs", "pow": "pow"} | {
+    name: name for name in ("floor", "ceil", "rint", "copysign")
+}  # functions of vectors; others are called for each run
+IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2", "arcsinh": "asinh", "arccosh": "acosh", "arctanh": "atanh"}
+"""Other names than NumPy's in C's library."""
+DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
+
+
+def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
+    """Have numba put the instructions of a program in the place of a call of `work`."""
+
+    @type_callable(work)
+    def of_arrays(context):
+        return eval(f"lambda {', '.join(names)}: none", {"none": types.none})
+
+    @lower_builtin(work, *[types.Array] * len(names))
+    def write(context, builder, signature, arrays):
+        data = [
+            context.make_array(kind)(context, builder, a).data
+            for kind, a in zip(signature.args, arrays, strict=True)
+        ]
+        Writer(context, builder, dict(zip(names, data, strict=True)), width).write(program)
+        return context.get_dummy_value()
+
+
+class Writer:
+    """Writes instructions.
+
+    Attributes:
+        values: of numbers of a graph, by their places.
+        values_of: of operations without arguments, by their names.
+        pointer_of: where a place lies, as a pointer to vectors or numbers.
+    """
+
+    def __init__(self, context, builder: ir.IRBuilder, arrays: dict, width: int):
+        """Begin; arrays are pointers to their first numbers."""
+        self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
+        self._vector = ir.VectorType(DOUBLE, width)
+        self.values: dict[int, ir.Value] = {}
+        self.values_of: dict[str, ir.Value] = {}
+        self.pointer_of: Callable[[Place], ir.Value] = self._pointer
+
+    def write(self, program: Program) -> None:
+        """All instructions of a program."""
+        self.read(program.reads)
+        self.work(program.works)
+        self.store(program.stores)
+
+    def read(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Read numbers."""
+        for place, number in places:
+            self.values[number.place] = self._read(place)
+
+    def work(self, numbers: Sequence[Number]) -> None:
+        """Work numbers out."""
+        for number in numbers:
+            if number.place not in self.values:
+                self.values[number.place] = self._worked_out(number)
+
+    def store(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Store numbers."""
+        for place, number in places:
+            self._builder.store(self.values[number.place], self.pointer_of(place), align=8)
+
+    def same_for_all(self, value: ir.Value, number: Number) -> ir.Value:
+        """The vector of a number that is the same for all; a constant is one already."""
+        if number.operation == "constant":
+            return ir.Constant(self._vector, [number.value] * self._width)
+        return self._to_all(value, ir.Constant(value.type, ir.Undefined))
+
+    def _pointer(self, place: Place) -> ir.Value:
+        of_all = place.array in SIDE_BY_SIDE
+        at = ir.Constant(LONG, place.at * (self._width if of_all else 1))
+        pointer = self._builder.gep(self._arrays[place.array], [at], source_etype=DOUBLE)
+        return self._builder.bitcast(pointer, self._vector.as_pointer()) if of_all else pointer
+
+    def _read(self, place: Place) -> ir.Value:
+        of_all = place.array in (*SIDE_BY_SIDE, *BY_MEMBERS)
+        value = self._builder.load(self.pointer_of(place), align=8, typ=self._vector if of_all else DOUBLE)
+        if of_all:
+            return value
+        nothing = ir.Constant(self._vector, ir.Undefined)
+        return self._to_all(self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing)
+
+    def _to_all(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
+        places = ir.VectorType(ir.IntType(32), self._width)
+        return self._builder.shuffle_vector(value, nothing, ir.Constant(places, [0] * self._width))
+
+    def _worked_out(self, number: Number) -> ir.Value:
+        operation, builder = number.operation, self._builder
+        if operation == "constant":
+            return ir.Constant(self._vector, [number.value] * self._width)
+        if operation in self.values_of:
+            return self.values_of[operation]
+        values = [self.values[one.place] for one in number.of]
+        flags = EXACT if number.exact or operation == "/" and number.of[0].value != 1.0 else FLAGS
+        if operation in OF_TWO:
+            return getattr(builder, OF_TWO[operation])(*values, flags=flags)
+        if operation == "negative":
+            return builder.fneg(*values, flags=flags)
+        if operation == "where":
+            return builder.select(*values)
+        if operation == "call":
+            return self._worked_out_by(number.arguments[0], number.arguments[1], values)
+        if operation == "entry":
+            return values[0][number.arguments[1]]
+        if operation == "and":
+            return builder.and_(*values)
+        if operation == "or":
+            return builder.or_(*values)
+        if operation == "two_to":
+            return self._two_to(*values)
+        if operation == "hypot":
+            return self._length(*values)
+        if operation == "!=":
+            return builder.fcmp_unordered(operation, *values)
+        if operation in COMPARISONS:
+            return builder.fcmp_ordered(operation, *values)
+        return self._called(operation, values, flags)
+
+    def _length(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """The root of x^2 + y^2, of numbers scaled by the larger one where squares would leave float64."""
+        builder = self._builder
+
+        def times(a, b):
+            return builder.fmul(a, b, flags=FLAGS)
+
+        def root_of_squares(a, b):
+            square = builder.fadd(times(a, a), times(b, b), flags=FLAGS)
+            return square, self._called("sqrt", [square], FLAGS)
+
+        least, most, one, none, infinite = (
+            ir.Constant(self._vector, [value] * self._width) for value in (1e-280, 1e300, 1.0, 0.0, math.inf)
+        )
+        square, root = root_of_squares(x, y)
+        usual = builder.and_(builder.fcmp_ordered(">", square, least), builder.fcmp_ordered("<", square, most))
+        x_size, y_size = (self._called("abs", [value], FLAGS) for value in (x, y))
+        scale = builder.select(builder.fcmp_ordered(">", x_size, y_size), x_size, y_size)
+        divides = builder.and_(builder.fcmp_ordered(">", scale, none), builder.fcmp_ordered("<", scale, infinite))
+        scale = builder.select(divides, scale, one)
+        _, scaled = root_of_squares(*(builder.fdiv(value, scale, flags=EXACT) for value in (x, y)))
+        return builder.select(usual, root, times(scale, scaled))
+
+    def _two_to(self, whole: ir.Value) -> ir.Value:
+        """2^k of whole numbers k, whose last bits become the exponent's."""
+        builder, longs = self._builder, ir.VectorType(LONG, self._width)
+        rounder, offset = (
+            ir.Constant(kind, [value] * self._width)
+            for kind, value in ((self._vector, ROUNDER), (longs, 1023 - ROUNDER_BITS))
+        )
+        bits = builder.add(builder.bitcast(builder.fadd(whole, rounder), longs), offset)
+        return builder.bitcast(builder.shl(bits, ir.Constant(longs, [52] * self._width)), self._vector)
+
+    def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
+        """What a function of two arrays makes of numbers, run after run."""
+        builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
+        arrays = []
+        for length in (len(values), count):
+            one, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
+            data, eight = cgutils.alloca_once(builder, DOUBLE, size), ir.Constant(LONG, 8)
+            populate_array(one, data, (size,), (eight,), eight, None)
+            arrays.append(one)
+        signature, work = typing.signature(types.none, kind, kind), CALLED[name]
+        found = [ir.Constant(self._vector, ir.Undefined)] * count
+        for k in range(self._width):
+            at = ir.Constant(ir.IntType(32), k)
+            for i, value in enumerate(values):
+                pointer = builder.gep(arrays[0].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                builder.store(builder.extract_element(value, at), pointer)
+            context.compile_internal(builder, work, signature, [one._getvalue() for one in arrays])
+            for i in range(count):
+                pointer = builder.gep(arrays[1].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                found[i] = builder.insert_element(found[i], builder.load(pointer, typ=DOUBLE), at)
+        return found
+
+    def _called(self, name: str, values: list[ir.Value], flags: Sequence[str]) -> ir.Value:
+        builder, module = self._builder, self._builder.module
+        if name in OF_LLVM:
+            function = _declared(module, f"llvm.{OF_LLVM[name]}.v{self._width}f64", self._vector, len(values))
+            return builder.call(function, values, fastmath=flags)
+        function, found = _declared(module, IN_LIBRARY.get(name, name), DOUBLE, len(values)), values[0]
+        for k in range(self._width):
+            at = ir.Constant(ir.IntType(32), k)
+            one = builder.call(function, [builder.extract_element(value, at) for value in values])
+            found = builder.insert_element(found, one, at)
+        return found
+
+
+def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
+    """The function of some arguments of a kind that returns such a one, by its name."""
+    return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)

@@ -1,0 +1,233 @@
+"""A graph of numbers that reads and writes rows of memory, for some runs side by side: a program without branches.
+
+It is the same for all runs, so that one instruction works for eight of them. Compiled code has it as machine
+instructions (`instructions`). Elsewhere its text runs as Python, with NumPy's arrays in the places of registers:
+
+    t0 = +rows[0]
+    t1 = numbers[4]
+    t2 = t0 * t1
+    rows[5] = t2
+
+Which program a compiled function contains is told by a digest of that text. It is part of the key under which
+machine code is kept, and the same in each process: no order in it depends on addresses or hashes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from thruster_env.core.compiled import overloaded
+from thruster_env.graphs.graphs import Number, needed_by
+
+ARRAYS = ("rows", "change", "numbers", "move")  # arguments of programs with derivatives
+OF_STEPS = ("rows", "given", "numbers")  # arguments of programs that run a filter
+OF_MEMBERS = (
+    "rows",
+    "given",
+    "numbers",
+    "table",
+    "draws",
+    "size",
+)  # arguments of programs with loops over members
+BY_MEMBERS = ("table", "draws")  # of these, those with a row for each number and a column for each member
+SIDE_BY_SIDE = ("rows", "change", "given")  # of all, those with a number for each run at each place
+SPECIAL = {
+    "negative": "-{}",
+    "pow": "{} ** {}",
+    "and": "{} & {}",
+    "or": "{} | {}",
+    "sum": "over_members({}, size)",
+    "largest": "largest_of_members({}, size)",
+    "size": "float(size)",
+    "two_to": "exp2({})",
+}
+
+
+CALLED: dict[str, Callable] = {}
+"""Functions work(given, found) of two arrays that programs call: what would be too long if it were written out."""
+CALLED_IN_ROUNDS: dict[str, Callable[[], tuple[Program, Program, Program, int, int]]] = {}
+"""Makers of the same as programs: what is done at first, in each round and at last; how many rounds there are, and
+how many numbers are in the array `kept` from which and to which rounds lead."""
+
+
+class Place(NamedTuple):
+    """Where a number lies."""
+
+    array: str
+    at: int
+
+    def __str__(self) -> str:
+        return f"{self.array}[{self.at}]"
+
+
+class Program(NamedTuple):
+    """Numbers that are read, worked out, and stored."""
+
+    reads: list[tuple[Place, Number]]
+    works: list[Number]
+    stores: list[tuple[Place, Number]]
+
+    @property
+    def text(self) -> list[str]:
+        """A line for each number."""
+        names = {one.place: f"t{k}" for k, one in enumerate([*(one for _, one in self.reads), *self.works])}
+        copied = SIDE_BY_SIDE + BY_MEMBERS
+        lines = [f"{names[one.place]} = {'+' * (place.array in copied)}{place}" for place, one in self.reads]
+        for one in self.works:
+            values = [names[a.place] if isinstance(a, Number) else a for a in one.arguments]
+            lines.append(f"{names[one.place]} = {_expression(one.operation, values)}{'  # exact' * one.exact}")
+        return lines + [f"{place} = {names[one.place]}" for place, one in self.stores]
+
+
+def _expression(operation: str, values: list[str]) -> str:
+    if operation == "constant":
+        return f"float.fromhex({values[0]!r})"
+    if operation == "call":
+        name, count, *given = values
+        return f"called({name!r}, {count}, {', '.join(given)})"
+    if operation == "entry":
+        return "{}[{}]".format(*values)
+    if operation in SPECIAL:
+        return SPECIAL[operation].format(*values)
+    known = len(values) == 2 and not operation.isalnum()
+    return f" {operation} ".join(values) if known else f"{operation}({', '.join(values)})"
+
+
+def program_of(stores: Sequence[tuple[Place, Number]], known: Mapping[int, Place]) -> Program:
+    """The program that makes some stores, of numbers that are given by their places.
+
+    Args:
+        stores: what is to be stored, and where.
+        known: where numbers lie that another program has worked out, by their places in the graph.
+    """
+    reads, works = [], []
+    for one in needed_by([number for _, number in stores], known):
+        if one.operation == "given" or one.place in known:
+            reads.append((known.get(one.place) or one.arguments[0], one))
+        else:
+            works.append(one)
+    return Program(reads, works, list(stores))
+
+
+def values_of(numbers: Sequence[Number], given: np.ndarray) -> np.ndarray:
+    """Values of numbers at some points, (len(numbers), points), of those that are given in the array `numbers`.
+
+    Args:
+        numbers: that are wanted.
+        given: (places, points).
+    """
+    rows = np.empty((len(numbers), given.shape[1]))
+    program = program_of([(Place("rows", k), one) for k, one in enumerate(numbers)], {})
+    _in_python(program.text)(rows, rows, given, given)
+    return rows
+
+
+def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, scratch: int = 0) -> Callable:
+    """`work(*arrays)`, which does it for `width` runs, or members; compiled functions may call it, too.
+
+    Args:
+        program: what is done.
+        width: of vectors.
+        arrays: names of the arguments.
+        scratch: the first row of the table that loops over members may use for themselves.
+    """
+    lines, arguments = program.text, ", ".join(arrays)
+    digest = hashlib.sha256("\n".join([str(width), str(scratch), *lines]).encode()).hexdigest()[:24]
+    # What the cache of machine code sees is the digest alone; the text lives as long as the function.
+    names: dict = {"run": _run, "__name__": __name__, "text": _TEXTS.setdefault(digest, Text(lines))}
+    exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
+    return overloaded(names["work"], lambda work: _teach(work, program, width, arrays, scratch))
+
+
+class Text:
+    """Lines of a program, and what runs them as Python, once somebody has."""
+
+    def __init__(self, lines: list[str]):
+        """Take the lines."""
+        self._lines = lines
+        self._in_python: Callable | None = None
+
+    def in_python(self, kind: Sequence[str]) -> Callable:
+        """The function of arrays of some names."""
+        if self._in_python is None:
+            self._in_python = _in_python(self._lines, kind)
+        return self._in_python
+
+
+_TEXTS: WeakValueDictionary[str, Text] = WeakValueDictionary()
+
+
+def _run(digest: str, width: int, *arrays) -> None:
+    """Run a program as Python."""
+    kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS)}[len(arrays)]
+    work = _TEXTS[digest].in_python(kind)
+    if kind is OF_MEMBERS:
+        *others, table, draws, size = arrays
+        columns = table.shape[1]
+        work(*others, table, draws[: len(draws) // columns * columns].reshape(-1, columns), size)
+        return
+    named = zip(kind, arrays, strict=True)
+    work(*(a.reshape(-1, width) if width > 1 and name in SIDE_BY_SIDE else a for name, a in named))
+
+
+def _in_python(text: list[str], arrays: Sequence[str] = ARRAYS) -> Callable:
+    names = work_names()
+    lines = "".join(f"    {line}\n" for line in text or ["pass"])
+    exec(f"def work({', '.join(arrays)}):\n{lines}", names)
+    return names["work"]
+
+
+def work_names() -> dict:
+    """What names in a program's text mean."""
+    return {
+        **vars(np),
+        "where": _chosen,
+        "over_members": _total,
+        "largest_of_members": _largest,
+        "called": _called,
+        "erf": lambda x: _special("erf", x),
+        "erfc": lambda x: _special("erfc", x),
+    }
+
+
+def _special(name: str, x):
+    from scipy import special  # which takes long to import
+
+    return getattr(special, name)(x)
+
+
+def _chosen(condition, a, b):
+    """NumPy's `where`, in less time for numbers."""
+    return np.where(condition, a, b) if np.ndim(condition) else a if condition else b
+
+
+def _total(row, size):
+    """The sum of what the first `size` members have, which may be the same for all."""
+    return row[:size].sum() if np.ndim(row) else row * size
+
+
+def _largest(row, size):
+    """The largest that the first `size` members have; NaN is none."""
+    return np.fmax.reduce(row[:size], initial=-np.inf) if np.ndim(row) else row
+
+
+def _called(name: str, count: int, *given):
+    found = np.empty(count, dtype=np.result_type(*given))
+    CALLED[name](np.array(given), found)
+    return found
+
+
+def _teach(work: Callable, program: Program, width: int, arrays: Sequence[str], scratch: int) -> None:
+    if arrays == OF_MEMBERS:
+        from thruster_env.graphs.loop_instructions import teach_loops
+
+        teach_loops(work, program, width, scratch)
+    else:
+        from thruster_env.graphs.instructions import teach  # which imports numba
+
+        teach(work, program, width, arrays)

@@ -1,0 +1,380 @@
+"""A plain function of floats, called with Numbers: what it computes becomes a graph.
+
+A user's function knows nothing of Numbers. It says `math.sin(x)`, which wants a float, or `max(x, 0.0)`, which
+decides. So a copy of it is made that finds our own functions under these names, and so are copies of all
+functions that it calls:
+
+    traced(lambda x: max(math.sin(x[0]), 0.0))((number,))
+
+A function that decides for itself (`if x > 0.0`, `while error > 1e-9`), looks a number up in a table or hands
+it to something that wants a float raises TypeError on the way: it cannot be traced, and has to be called as it
+is, but for a few decisions, of which all sides can be traced (`branches`).
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import types
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from thruster_env.core.user_functions import Copies, Module, needs_floats
+from thruster_env.graphs.folding import worked_out
+from thruster_env.graphs.graphs import UNARY, Number, arctan2, where
+
+MOST_POINTS = 100  # of a table that is traced
+MOST_ROWS = 4  # of a matrix whose determinant is written out
+OTHER_NAMES = {
+    "atan": "arctan",
+    "atan2": "arctan2",
+    "asin": "arcsin",
+    "acos": "arccos",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
+    "fabs": "absolute",
+    "abs": "absolute",
+    "pow": "power",
+    "mod": "remainder",
+    "around": "round",
+    "rint": "round",
+    "fix": "trunc",
+    "deg2rad": "radians",
+    "rad2deg": "degrees",
+}
+"""NumPy's names of functions of `math`, and one of those that it has twice."""
+
+
+def _operation(name: str) -> Callable:
+    return lambda *numbers: worked_out(name, *_numbers(*numbers))
+
+
+def _numbers(*values) -> list[Number]:
+    """Values as Numbers of the graph of those that are."""
+    graph = next(one for one in values if isinstance(one, Number)).graph
+    return [graph.number(one) for one in values]
+
+
+def _largest(*numbers):
+    found, *others = numbers[0] if len(numbers) == 1 else numbers
+    for one in others:
+        found = where(one > found, one, found)
+    return found
+
+
+def _smallest(*numbers):
+    found, *others = numbers[0] if len(numbers) == 1 else numbers
+    for one in others:
+        found = where(one < found, one, found)
+    return found
+
+
+def _extreme(choose: Callable) -> Callable:
+    """The larger or smaller one of two as NumPy has it: NaN if one of them is."""
+
+    def function(a, b):
+        if not isinstance(a, Number) or a.value is not None:
+            a, b = b, a
+        return where(b == b, choose(a, b), b)
+
+    return function
+
+
+def _hypotenuse(x, y=0.0, *others):
+    found = worked_out("hypot", *_numbers(x, y))
+    return _hypotenuse(found, *others) if others else found
+
+
+def _clipped(x, a_min=None, a_max=None, *, min=None, max=None):
+    low, high = a_min if min is None else min, a_max if max is None else max
+    x = x if low is None else FUNCTIONS["maximum"](x, low)
+    return x if high is None else FUNCTIONS["minimum"](x, high)
+
+
+def _rounded(x, decimals=0):
+    """A number with some decimals, as NumPy rounds."""
+    unit = 10.0 ** abs(decimals)
+    if decimals > 0:
+        return round(x * unit) / unit
+    return round(x / unit) * unit if decimals < 0 else round(x)
+
+
+def _nearest_rest(x, n):
+    """The rest of x/n rounded to the nearest whole number, of two such the even one, as IEEE 754 has it."""
+    x, n = _numbers(x, n)
+    size = abs(n)
+    rest = abs(worked_out("fmod", x, 2.0 * size))
+    once = where(rest > 0.5 * size, rest - size, rest)
+    rest = where((rest > 0.5 * size) & (once >= 0.5 * size), once - size, once)
+    return where(x < 0.0, -rest, rest)
+
+
+def _step(x, at_zero):
+    return where(x > 0.0, 1.0, where(x == 0.0, at_zero, where(x < 0.0, 0.0, x)))
+
+
+def _log_of_sum(a, b):
+    """log(exp(a) + exp(b)), with the slope of the mean where both are equal."""
+    found = where(a > b, a + (b - a).exp().log1p(), b + (a - b).exp().log1p())
+    return where((a == b) & (abs(a) == math.inf), a, found)
+
+
+def _interpolated(x, xp, fp, left=None, right=None, period=None):
+    """Lines between the points of a table; at one of these, the slope of the line to its right."""
+    xp, fp = np.asarray(xp, dtype=float), np.asarray(fp, dtype=object)
+    if period is not None or not 1 < len(xp) <= MOST_POINTS or not (np.diff(xp) > 0.0).all():
+        raise TypeError(f"a traced table must have from 2 to {MOST_POINTS} increasing points and no period")
+
+    def at(x):
+        found = where(x > xp[-1], fp[-1] if right is None else right, fp[-1])
+        for j in reversed(range(len(xp) - 1)):
+            line = (fp[j + 1] - fp[j]) / (xp[j + 1] - xp[j]) * (x - xp[j]) + fp[j]
+            found = where(x < xp[j + 1], line, found)
+        return where(x == x, where(x < xp[0], fp[0] if left is None else left, found), x)
+
+    return _of_entries(at)(x)
+
+
+def _polynomial(p, x):
+    found, *others = p
+    for coefficient in others:
+        found = found * x + coefficient
+    return found
+
+
+def _variance(a, axis=None, dtype=None, out=None, ddof=0, keepdims=False):
+    a = np.asarray(a, dtype=object)
+    count = a.size if axis is None else a.shape[axis]
+    off = a - np.sum(a, axis=axis, keepdims=True) / count
+    return np.sum(off * off, axis=axis, keepdims=keepdims) / (count - ddof)
+
+
+def _selected(conditions, choices, default=0):
+    for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
+        default = _in_place_of(np, "where")(condition, choice, default)
+    return default
+
+
+def _square_matrix(a) -> np.ndarray:
+    a = np.asarray(a, dtype=object)
+    if a.ndim != 2 or a.shape[0] != a.shape[1] or not 0 < len(a) <= MOST_ROWS:
+        raise TypeError(
+            f"a traced matrix must be one of at most {MOST_ROWS} rows to have a determinant or an inverse"
+        )
+    return a
+
+
+def _determinant(a):
+    """By the first row; that of no rows is 1."""
+    a = _square_matrix(a) if len(a) else a
+    terms = [(-1.0) ** j * a[0, j] * _determinant(_without(a, 0, j)) for j in range(len(a))]
+    return sum(terms[1:], terms[0]) if terms else 1.0
+
+
+def _without(a: np.ndarray, row: int, column: int) -> np.ndarray:
+    return np.delete(np.delete(a, row, 0), column, 1)
+
+
+def _solved(a, b):
+    """X of A x = b, by the inverse's numerators and the determinant."""
+    a, b = _square_matrix(a), np.asarray(b, dtype=object)
+    places = range(len(a))
+    numerators = [[(-1.0) ** (i + j) * _determinant(_without(a, j, i)) for j in places] for i in places]
+    return np.array(numerators, dtype=object) @ b / _determinant(a)
+
+
+def _norm(x, ord=None, axis=None, keepdims=False):
+    x = np.asarray(x, dtype=object)
+    if axis is not None or keepdims or ord is not None and (ord, x.ndim) not in ((2, 1), ("fro", 2)):
+        raise TypeError("a traced norm must be that of a vector or Frobenius'")
+    return sum(one * one for one in x.ravel()).sqrt()
+
+
+def _condition(x):
+    """Whether a number is not zero."""
+    return (x if x.is_condition else x != 0.0) if isinstance(x, Number) else bool(x)
+
+
+def _filled(value: float) -> Callable:
+    """In place of NumPy's zeros and ones: an array that Numbers may be written to."""
+    return lambda shape, *_, **__: np.full(shape, value, dtype=object)
+
+
+FUNCTIONS: dict[str, Callable] = {
+    **{name: _operation(name) for name in (*UNARY, "fmod", "copysign")},
+    "absolute": abs,
+    "power": lambda x, e: x**e,
+    "square": lambda x: x * x,
+    "hypot": _hypotenuse,
+    "sign": lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, where(x == x, 0.0, math.nan))),
+    "where": where,
+    "arctan2": arctan2,
+    "arcsin": lambda x: arctan2(x, ((1.0 - x) * (1.0 + x)).sqrt()),
+    "arccos": lambda x: arctan2(((1.0 - x) * (1.0 + x)).sqrt(), x),
+    "maximum": _extreme(_largest),
+    "minimum": _extreme(_smallest),
+    "fmax": lambda a, b: where(a == a, _largest(a, b), b),
+    "fmin": lambda a, b: where(a == a, _smallest(a, b), b),
+    "clip": _clipped,
+    "remainder": operator.mod,
+    "floor_divide": operator.floordiv,
+    "trunc": lambda x: where(x < 0.0, x.ceil(), x.floor()),
+    "round": _rounded,
+    "heaviside": _step,
+    "degrees": lambda x: x * (180.0 / math.pi),
+    "radians": lambda x: x * (math.pi / 180.0),
+    "isnan": lambda x: x != x,
+    "isinf": lambda x: abs(x) == math.inf,
+    "isfinite": lambda x: abs(x) < math.inf,
+    "logaddexp": lambda a, b: _log_of_sum(*_numbers(a, b)),
+    "reciprocal": lambda x: 1.0 / x,
+    "float_power": lambda x, e: x**e,
+    "logical_and": lambda a, b: _condition(a) & _condition(b),
+    "logical_or": lambda a, b: _condition(a) | _condition(b),
+    "logical_xor": lambda a, b: _condition(a) != _condition(b),
+    "logical_not": lambda a: a == 0.0,
+    "greater": operator.gt,
+    "greater_equal": operator.ge,
+    "less": operator.lt,
+    "less_equal": operator.le,
+    "equal": operator.eq,
+    "not_equal": operator.ne,
+}
+"""In place of functions of `math` and NumPy, by NumPy's names, where they get a Number."""
+
+OF_ARRAYS: dict[str, Callable] = {
+    "interp": _interpolated,
+    "polyval": _polynomial,
+    "var": _variance,
+    "std": lambda *arguments, **named: _in_place_of(np, "sqrt")(_variance(*arguments, **named)),
+    "select": _selected,
+}
+"""In place of NumPy's functions of vectors, where there is a Number among these."""
+
+OF_MATRICES: dict[str, Callable] = {
+    "det": _determinant,
+    "solve": _solved,
+    "inv": lambda a: _solved(a, np.eye(len(a))),
+    "norm": _norm,
+}
+"""The same of `numpy.linalg`."""
+
+OF_MATH: dict[str, Callable] = {
+    "remainder": _nearest_rest,
+    "dist": lambda p, q: _hypotenuse(*(a - b for a, b in zip(p, q, strict=True))),
+    "fsum": sum,
+}
+"""In place of functions of `math` that NumPy has otherwise, or has not."""
+
+
+class _OfFloats(type):
+    def __instancecheck__(cls, value) -> bool:
+        return isinstance(value, float | Number)
+
+
+class _Float(metaclass=_OfFloats):
+    """In place of `float`: a Number stays one, and `values.astype(float)` an array of Numbers."""
+
+    def __new__(cls, value=0.0):
+        return +value if isinstance(value, Number) else float(value)
+
+
+def _array_of(make: Callable) -> Callable:
+    """In place of NumPy's array and asarray: one of floats holds Numbers, if it gets such."""
+
+    def function(value, dtype=None, **named):
+        if dtype is _Float or dtype is not None and np.dtype(dtype) == np.float64:
+            dtype = object if _has_numbers(value) else np.float64
+        return make(value, dtype=dtype, **named)
+
+    return function
+
+
+ARRAYS: dict[str, Callable] = {
+    "array": _array_of(np.array),
+    "asarray": _array_of(np.asarray),
+    "zeros": _filled(0.0),
+    "empty": _filled(0.0),
+    "ones": _filled(1.0),
+    "float64": _Float,
+}
+"""In place of functions of NumPy, whatever they get."""
+
+BUILTINS = {
+    "max": _largest,
+    "min": _smallest,
+    "float": _Float,
+    "bool": _condition,
+    "pow": pow,
+}
+
+
+def _in_place_of(module: types.ModuleType, name: str):
+    """What traced functions find under a name in `math` or NumPy."""
+    value, name = getattr(module, name), OTHER_NAMES.get(name, name)
+    if value is np.linalg:
+        return Module(np.linalg, _in_place_of)
+    of_arrays = OF_MATRICES.get(name) if module is np.linalg else OF_ARRAYS.get(name) if module is np else None
+    known = {} if module is np.linalg else (OF_MATH if module is math else ARRAYS)
+    ours = of_arrays or known.get(name) or (None if module is np.linalg else FUNCTIONS.get(name))
+    if ours is None or module is np and name in ARRAYS:
+        return ours or value
+
+    def function(*arguments, **named):
+        if not any(map(_has_numbers, (*arguments, *named.values()))):
+            return value(*arguments, **named)
+        if module is math or of_arrays:
+            return ours(*arguments, **named)
+        return _of_entries(ours)(*arguments, **named)
+
+    return function
+
+
+def _of_entries(function: Callable) -> Callable:
+    """A function of numbers as one of arrays, too."""
+
+    def of_arrays(*arguments, **named):
+        if not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
+            return function(*arguments, **named)
+        entries = np.frompyfunc(lambda *given: function(*given, **named), len(arguments), 1)
+        with np.errstate(all="ignore"):  # of NaN among constants
+            return entries(*(np.asarray(one, dtype=object) for one in arguments))
+
+    return of_arrays
+
+
+def _has_numbers(value) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype == object
+    return isinstance(value, Number) or isinstance(value, (list, tuple)) and any(map(_has_numbers, value))
+
+
+def traced(function: Callable) -> Callable:
+    """A copy of a function that takes Numbers; it raises TypeError where they do not do for floats.
+
+    Raises:
+        TypeError: for a function that needs floats: it catches exceptions, or asks whether a comparison `is` True.
+    """
+    if reason := needs_floats(function):
+        raise TypeError(reason)
+    copy = Copies(_in_place_of, BUILTINS).called(function)
+
+    def as_written(*arguments):
+        known = next(_numbers_in(arguments), None)
+        if known is None:
+            return copy(*arguments)
+        with known.graph.as_written():
+            return copy(*arguments)
+
+    return as_written
+
+
+def _numbers_in(value) -> Iterator[Number]:
+    """Numbers among arguments, of which some are tuples or arrays of such."""
+    if isinstance(value, Number):
+        yield value
+    elif isinstance(value, (tuple, list)) or isinstance(value, np.ndarray) and value.dtype == object:
+        for one in value:
+            yield from _numbers_in(one)

@@ -1,0 +1,293 @@
+"""Findings in a recorded run that affect the trust in results from it.
+
+Gaps, rows that were moved, dropped or doubled, inputs without samples, sensors that are stuck or saturated, and
+outliers; and how times were read, where the file does not say it.
+
+Stuck. Identical samples in a row are explained by quantisation where equal neighbours are common, in the channel
+or at this value: if a share p of the other neighbours is equal, so many in a row come by chance with probability
+p^(count - 1), times the number of samples. Less than LEVEL is no chance. At rest, with no input that changes, a
+quantised channel and one that reads 0 may stay where they are.
+
+Saturated. The largest or the smallest value of a channel, unless it is 0, comes in RUNS stretches or more, and
+OFTENER times as often as the value next to it.
+
+Outliers. A sample above both of its neighbours, or below both, by more than SPIKE standard deviations of the noise
+(estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours from
+each other and from those beyond: a jump or a peak of the signal is not an outlier. A normal one is one in 10^8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from thruster_env.core.angles import difference
+from thruster_env.logs.stamps import date_text, time_text
+
+if TYPE_CHECKING:
+    from thruster_env.logs.log import Log
+
+GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped", "doubled"
+STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
+DAMAGED = "damaged"  # the file: of its messages some are not read
+CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
+SPOILING = (GAP, STALE, STUCK, SATURATED, OUTLIER)  # what moves estimates
+LEVEL = 1e-4
+SHORTEST = 8  # samples: a run of equal ones that is worth a word
+COMMON = 0.1  # of neighbours that are equal: the channel is quantised
+RUNS = 3
+OFTENER = 4.0
+SPIKE, ALONE = 7.0, 2.0
+AROUND = 25  # samples before and after, whose differences tell the noise, too
+NORMAL = 1.4826  # standard deviation over the median of magnitudes
+LISTED = 3  # findings of one kind and channel that are said one by one
+
+
+class Remark(NamedTuple):
+    """A finding in a whole file."""
+
+    kind: str
+    channel: str  # such as "input:V_s"; empty for all
+    sentence: str  # in words, without a full stop
+
+
+class Recording(NamedTuple):
+    """What became of a file's rows on the grid."""
+
+    gaps: tuple[tuple[int, int], ...] = ()  # first row and number of rows that are missing, where a run is cut
+    missing: int = 0  # other rows without any sample
+    holes: int = 0  # in so many places
+    moved: int = 0  # samples whose stamps were further from the grid than a tenth of a step
+    farthest: float = 0.0  # [s], of them
+    doubled: int = 0  # rows with the stamp of the row before
+    dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
+    damage: tuple[str, ...] = ()  # what of the file is not read because it is damaged, in words
+    remarks: tuple[Remark, ...] = ()  # how the file was read
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found in a log.
+
+    Attributes:
+        kind: "damaged", "clock", "outside", "no input", "gap", "missing rows", "moved", "dropped", "doubled",
+            "stuck", "saturated" or "outlier".
+        channel: such as "measurement:thrust"; empty for all of a row.
+        first: row of the log where it begins; 0 if it is everywhere.
+        last: row where it ends, included.
+        count: rows or samples that it is about.
+        sentence: in words, without a full stop.
+    """
+
+    kind: str
+    channel: str
+    first: int
+    last: int
+    count: int
+    sentence: str
+
+
+def found_in(log: Log) -> tuple[Finding, ...]:
+    """All findings in a log, of its rows first, then channel by channel."""
+    found = [*_of_rows(log)]
+    for place, one in enumerate(log.measured):
+        found += _of_channel(log, place, f"measurement:{one.symbol}")
+    return tuple(found)
+
+
+def sentences(findings: Sequence[Finding]) -> list[str]:
+    """The findings in words; of many of one kind and channel how many there are, and the longest."""
+    said: list[str] = []
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for one in findings:
+        groups.setdefault((one.kind, one.channel), []).append(one)
+    for some in groups.values():
+        if len(some) <= LISTED:
+            said += [f"{one.sentence}." for one in some]
+            continue
+        longest = max(some, key=lambda one: one.count)
+        more = f"; so in {len(some)} places, {sum(one.count for one in some)} rows in all"
+        said.append(f"{longest.sentence}{more}.")
+    return said
+
+
+def remarks_on(logs: Sequence[Log]) -> list[str]:
+    """The findings in some logs in words; of pieces those in the whole log.
+
+    Each begins with the name of its log; what several logs have in common is one sentence, on the longest.
+    """
+    whole = {log.name: log for log in (log.whole or log for log in logs)}
+    groups: dict[tuple[str, str], dict[str, list[Finding]]] = {}
+    for name, log in whole.items():
+        for one in log.findings:
+            groups.setdefault((one.kind, one.channel), {}).setdefault(name, []).append(one)
+    said: list[str] = []
+    for of_logs in groups.values():
+        name, some = max(of_logs.items(), key=lambda item: max(one.count for one in item[1]))
+        if len(of_logs) == 1:
+            said += [f"{name}: {one}" for one in sentences(some)]
+            continue
+        longest = max(some, key=lambda one: one.count)
+        places = sum(map(len, of_logs.values()))
+        rows = sum(one.count for found in of_logs.values() for one in found)
+        said.append(f"{name}: {longest.sentence}; so in {len(of_logs)} logs, {places} places, {rows} rows in all.")
+    return said
+
+
+def has_outliers(logs: Sequence[Log]) -> bool:
+    """Whether there are outliers in any of some logs."""
+    return any(one.kind == OUTLIER for log in logs for one in (log.whole or log).findings)
+
+
+def _of_rows(log: Log) -> list[Finding]:
+    told, last = log.recording, log.steps
+    found = [Finding(DAMAGED, "", 0, last, 1, said) for said in told.damage]
+    found += [Finding(one.kind, one.channel, 0, last, last + 1, one.sentence) for one in told.remarks]
+    for first, count in told.gaps:
+        said = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
+        found.append(Finding(GAP, "", first, first + count - 1, count, said))
+    if told.missing:
+        places = f"{told.holes} place{'' if told.holes == 1 else 's'}"
+        are = "row is" if told.missing == 1 else "rows are"
+        said = f"{told.missing} of {last + 1} {are} missing, in {places}; the input is held there"
+        found.append(Finding(MISSING, "", 0, last, told.missing, said))
+    if told.doubled:
+        rows = "row has" if told.doubled == 1 else "rows have"
+        said = f"{told.doubled} {rows} the time of the row before; of two samples of a channel the last is used"
+        found.append(Finding(DOUBLED, "", 0, last, told.doubled, said))
+    if told.moved:
+        said = f"{told.moved} samples were moved to the grid of {log.dt:g} s, by up to {told.farthest:.3g} s"
+        found.append(Finding(MOVED, "", 0, last, told.moved, said))
+    for channel, count in told.dropped:
+        what = f"{count} samples of {_name(channel)}" if count > 1 else f"1 sample of {_name(channel)}"
+        said = f"{what} {('are' if count > 1 else 'is')} not used: another one is nearer to the same grid time"
+        found.append(Finding(DROPPED, channel, 0, last, count, said))
+    return found
+
+
+def _of_channel(log: Log, place: int, channel: str) -> list[Finding]:
+    values = log.measurements[:, place]
+    rows = np.flatnonzero(~np.isnan(values))
+    if len(rows) < SHORTEST:
+        return []
+    values, quantity = values[rows], log.measured[place]
+    runs = _runs_of_equals(values)
+    found, ends = _saturated(log, channel, rows, values, runs)
+    for first, count in _stuck(log, rows, values, runs):
+        if values[first] in ends:  # said already
+            continue
+        low, high = int(rows[first]), int(rows[first + count - 1])
+        said = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
+        found.append(Finding(STUCK, channel, low, high, count, said))
+    spikes = _spikes(rows, values, quantity.angle)
+    if len(spikes):
+        first, last = int(rows[spikes[0]]), int(rows[spikes[-1]])
+        one = len(spikes) == 1
+        said = (
+            f"{_name(channel)} has {'an outlier' if one else f'{len(spikes)} outliers'}{_where(log, first, last)}"
+        )
+        found.append(Finding(OUTLIER, channel, first, last, len(spikes), said))
+    return found
+
+
+def outliers(log: Log, channel: str) -> np.ndarray:
+    """Rows of the outliers of a measured channel."""
+    place = [f"measurement:{one.symbol}" for one in log.measured].index(channel)
+    values = log.measurements[:, place]
+    rows = np.flatnonzero(~np.isnan(values))
+    return rows[_spikes(rows, values[rows], log.measured[place].angle)]
+
+
+def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
+    """First sample and length of each stretch of equal samples."""
+    starts = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
+    return list(zip(starts.tolist(), np.diff(np.append(starts, len(values))).tolist(), strict=True))
+
+
+def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: int) -> bool:
+    """Whether a stretch of equal samples is explained by how common equal neighbours are otherwise.
+
+    Args:
+        values: of the channel.
+        first: place where the stretch begins.
+        count: its length.
+        equal: neighbours that are equal, without those in the stretch.
+        pairs: neighbours, without those in the stretch.
+    """
+    share = (equal + 1) / (pairs + 2)
+    here = np.flatnonzero(values[:-1] == values[first])
+    here = here[(here < first) | (here >= first + count - 1)]
+    there = (int((values[here + 1] == values[first]).sum()) + share) / (len(here) + 1)
+    return len(values) * max(share, there) ** (count - 1) >= LEVEL
+
+
+def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    equal, pairs, found = int((np.diff(values) == 0).sum()), len(values) - 1, []
+    for first, count in sorted(runs, key=lambda run: -run[1]):
+        equal, pairs = equal - (count - 1), pairs - (count - 1)  # each is held against those that are shorter
+        if count < SHORTEST or _by_chance(values, first, count, equal, pairs):
+            break
+        inputs = log.inputs[rows[first] : rows[first + count - 1]]
+        at_rest = len(inputs) == 0 or bool((np.ptp(inputs, axis=0) == 0).all())
+        quantised = equal + 1 > COMMON * (pairs + 2)
+        if not (at_rest and (quantised or values[first] == 0.0)):
+            found.append((first, count))
+    return sorted(found)
+
+
+def _saturated(
+    log: Log, channel: str, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]
+) -> tuple[list[Finding], list[float]]:
+    """Findings, and the values at which the channel ends."""
+    levels, counts = np.unique(values, return_counts=True)
+    found: list[Finding] = []
+    ends: list[float] = []
+    if len(levels) < SHORTEST:
+        return found, ends
+    for place, beside in ((0, 1), (-1, -2)):
+        level, count = levels[place], int(counts[place])
+        stretches = [run for run in runs if values[run[0]] == level]
+        if level == 0.0 or len(stretches) < RUNS or count < max(SHORTEST, OFTENER * counts[beside]):
+            continue
+        first, last = int(rows[stretches[0][0]]), int(rows[sum(stretches[-1]) - 1])
+        end = "smallest" if place == 0 else "largest"
+        said = (
+            f"{_name(channel)} is at its {end} value, {level:.6g}, in {count} samples{_where(log, first, last)}: "
+            f"it seems to be saturated"
+        )
+        found.append(Finding(SATURATED, channel, first, last, count, said))
+        ends.append(level)
+    return found, ends
+
+
+def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
+    """Places of samples that stand out from both neighbours."""
+    steps = difference(values[1:, None], values[:-1, None], (angle,))[:, 0]
+    sizes = abs(steps[steps != 0])
+    if len(sizes) < SHORTEST:
+        return np.empty(0, int)
+    noise = max(NORMAL * float(np.median(abs(steps))), float(np.median(sizes))) / np.sqrt(2.0)
+    before, after = steps[:-1], -steps[1:]  # of a sample, above its neighbours
+    height = np.where(before * after > 0, np.minimum(abs(before), abs(after)), 0.0)
+    beside = np.maximum(np.append(0.0, abs(steps[:-2])), np.append(abs(steps[2:]), 0.0))
+    across = abs(steps[:-1] + steps[1:])
+    apart = np.diff(rows)
+    near = np.maximum(apart[:-1], apart[1:]) <= np.median(apart)
+    places = np.flatnonzero(near & (height > SPIKE * noise) & (height > ALONE * np.maximum(beside, across)))
+    local = [np.median(abs(steps[max(k - AROUND, 0) : k + AROUND])) * NORMAL / np.sqrt(2.0) for k in places]
+    return places[height[places] > SPIKE * np.array(local)] + 1
+
+
+def _where(log: Log, first: int, last: int) -> str:
+    since, until = (log.start + (row * log.dt if log.stamps is None else log.stamps[row]) for row in (first, last))
+    begin, end = time_text(since, log.dt), time_text(until, log.dt)
+    if first == last:
+        return f" in row {first}, at {begin} s{date_text(since)}"
+    return f" in rows {first} to {last}, {begin} to {end} s{date_text(since)}"
+
+
+def _name(channel: str) -> str:
+    return channel.partition(":")[2]

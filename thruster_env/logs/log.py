@@ -1,0 +1,252 @@
+"""`Log`: inputs, measurements and reference channels of one recorded run, on a regular grid of times."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from thruster_env.core.checks import as_floats, finite, positive, short_repr
+from thruster_env.core.stamps import resolution_of
+from thruster_env.logs.columns import INPUT, MEASUREMENT, STATE
+from thruster_env.logs.findings import Finding, Recording, found_in
+from thruster_env.logs.grid import Series, held, sampled
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
+
+FEWEST_STEPS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One recorded run. Row k holds what was measured at time k dt, and the input that acts from then on.
+
+    A log on its own stamps has row k at `stamps[k]`, and only what goes by the clock can filter it.
+
+    `thruster simulate --out` writes rows like this, and so does a recorder that reads its sensors right after it
+    has sent a command. Channels are named as in `input:V_s`, `measurement:thrust`, `state:omega_m` and `output:T`.
+
+    Attributes:
+        name: of the run, its file if it has one.
+        dt: sample time [s].
+        inputs: (K, p), finite.
+        measurements: (K + 1, m), NaN where there is no sample.
+        references: channels that filters do not see, (K + 1,) each: true states, and outputs of the model such as
+            the thrust of a load cell; NaN where there is no sample.
+        input_quantities: names and units of the p inputs.
+        measured: names and units of the m measurements.
+        referred: name and unit of each reference, by channel.
+        start: time stamp of row 0 in the file [s].
+        source: samples of channels at their own times, before they are put on the grid; for other channels the
+            rows themselves.
+        offsets: how far the clock of a channel is ahead [s], by channel; it is subtracted from its times.
+        irregular: whether the time stamps of the file lay on no grid.
+        recording: what became of the file's rows on the grid; empty where the log is not from a file.
+        whole: the log that this one is a piece of, between gaps; None for one that is no piece.
+        stamps: times of the rows [s], (K + 1,), 0 at row 0 and increasing; None for a log on a grid.
+    """
+
+    name: str
+    dt: float
+    inputs: np.ndarray
+    measurements: np.ndarray
+    input_quantities: tuple[Quantity, ...]
+    measured: tuple[Quantity, ...]
+    references: Mapping[str, np.ndarray] = field(default_factory=dict)
+    referred: Mapping[str, Quantity] = field(default_factory=dict)
+    start: float = 0.0
+    source: Mapping[str, Series] = field(default_factory=dict)
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    irregular: bool = False
+    recording: Recording = Recording()
+    whole: Log | None = None
+    stamps: np.ndarray | None = None
+
+    def __post_init__(self):
+        """Check shapes and numbers, and make the arrays read-only."""
+        positive("dt of a log", self.dt)
+        steps = len(self.inputs)
+        wanted = {"inputs": (steps, len(self.input_quantities)), "measurements": (steps + 1, len(self.measured))}
+        parts = {"inputs": self.inputs, "measurements": self.measurements, **self.references}
+        held_parts = {}
+        for name, part in parts.items():
+            array = np.array(as_floats(part))
+            shape = wanted.get(name, (steps + 1,))
+            if array.shape != shape or np.isinf(array).any() or (name == "inputs" and np.isnan(array).any()):
+                rule = "finite" if name == "inputs" else "finite or NaN"
+                raise ValueError(
+                    f"{name} of log {self.name} must be {rule} and of shape {shape}, but got {short_repr(array)} "
+                    f"of shape {array.shape}"
+                )
+            array.setflags(write=False)
+            held_parts[name] = array
+        if steps < FEWEST_STEPS:
+            raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {self.name} has {steps + 1}")
+        if self.stamps is not None:
+            object.__setattr__(self, "stamps", _checked_stamps(self.stamps, steps, self.name))
+        object.__setattr__(self, "inputs", held_parts.pop("inputs"))
+        object.__setattr__(self, "measurements", held_parts.pop("measurements"))
+        object.__setattr__(self, "references", held_parts)
+
+    @property
+    def steps(self) -> int:
+        """Number K of steps."""
+        return len(self.inputs)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times of the rows [s], (K + 1,), 0 at row 0."""
+        return self.dt * np.arange(self.steps + 1) if self.stamps is None else self.stamps
+
+    @property
+    def resolution(self) -> float:
+        """How exact the stamps of the file are [s], as float64 has them."""
+        return resolution_of(abs(self.start) + float(self.times[-1]))
+
+    @property
+    def pieces(self) -> tuple[tuple[int, int], ...]:
+        """First row and number of rows of what lies between gaps; one piece where there is none."""
+        ends = [(first, first + count) for first, count in self.recording.gaps]
+        starts = [0, *(end for _, end in ends)]
+        lasts = [*(first for first, _ in ends), self.steps + 1]
+        return tuple((first, last - first) for first, last in zip(starts, lasts, strict=True))
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings in the log: `thruster_env.logs.findings.found_in`."""
+        return found_in(self)
+
+    @cached_property
+    def digest(self) -> str:
+        """A short hash of all numbers, dt and units; not of the name."""
+        found = hashlib.sha256(f"{self.dt!r}".encode())
+        ones = [*self.input_quantities, *self.measured, *(self.referred[key] for key in sorted(self.references))]
+        found.update("\0".join(f"{one.symbol} {one.unit}" for one in ones).encode())
+        for part in (self.inputs, self.measurements, *(self.references[key] for key in sorted(self.references))):
+            found.update(np.ascontiguousarray(part + 0.0).tobytes())
+        if self.stamps is not None:
+            found.update(self.stamps.tobytes())
+        return found.hexdigest()[:12]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels."""
+        inputs = (f"{INPUT}:{one.symbol}" for one in self.input_quantities)
+        return (*inputs, *(f"{MEASUREMENT}:{one.symbol}" for one in self.measured), *self.references)
+
+    def true_states(self, model: StateSpaceModel) -> np.ndarray | None:
+        """The states of a model, (K + 1, n), NaN in rows without one; None where no row has all."""
+        found = [self.references.get(f"{STATE}:{one.symbol}") for one in model.states]
+        there = [one for one in found if one is not None]
+        if len(there) < len(found):
+            return None
+        states = np.column_stack(there)
+        known = ~np.isnan(states).any(axis=1)
+        return np.where(known[:, None], states, np.nan) if known.any() else None
+
+    def series(self, channel: str) -> Series:
+        """Samples of a channel, at times [s] by its own clock, since row 0."""
+        if channel in self.source:
+            return self.source[channel]
+        kind, _, symbol = self._known(channel).partition(":")
+        times = self.times + self.offsets.get(channel, 0.0)
+        if channel in self.references:
+            values = self.references[channel]
+        else:
+            some, rows = (
+                (self.input_quantities, self.inputs) if kind == INPUT else (self.measured, self.measurements)
+            )
+            values = rows[:, [one.symbol for one in some].index(symbol)]
+        times, there = times[: len(values)], ~np.isnan(values)
+        return Series(times[there], values[there])
+
+    def named(self, name: str) -> Log:
+        """The same log under another name."""
+        return replace(self, name=name)
+
+    def _known(self, channel: str) -> str:
+        if channel not in self.channels:
+            raise ValueError(
+                f"a channel of log {self.name} must be one of {', '.join(self.channels)}, "
+                f"but got {short_repr(channel)}"
+            )
+        return channel
+
+
+def at_offset(log: Log, channel: str, seconds: float) -> Log:
+    """A log with another clock offset of one channel, which is put on the grid again from its own samples.
+
+    The result is continuous in the offset: see `thruster_env.logs.grid` for how samples are interpolated.
+
+    Args:
+        log: a log.
+        channel: such as "measurement:speed".
+        seconds: how far the channel's clock is ahead of the log's [s]; 0 for as it was recorded.
+
+    Raises:
+        ValueError: for an unknown channel, or an offset that is no number.
+    """
+    if log.stamps is not None:
+        raise ValueError(f"a clock offset must move samples on a grid, but log {log.name} has its own stamps")
+    seconds, series = finite(f"the clock offset of {channel}", seconds), log.series(channel)
+    changes: dict = {"offsets": {**log.offsets, channel: seconds}, "source": {**log.source, channel: series}}
+    kind, _, symbol = channel.partition(":")
+    given = series, log.dt, log.steps + 1, seconds
+    if channel in log.references:
+        changes["references"] = {**log.references, channel: sampled(*given, log.referred[channel].angle)}
+    elif kind == INPUT:
+        place = [one.symbol for one in log.input_quantities].index(symbol)
+        values = held(series, log.dt, log.steps, seconds, log.input_quantities[place].angle)
+        changes["inputs"] = _with_column(log.inputs, place, values)
+    else:
+        place = [one.symbol for one in log.measured].index(symbol)
+        values = sampled(*given, log.measured[place].angle)
+        changes["measurements"] = _with_column(log.measurements, place, values)
+    return replace(log, **changes)
+
+
+def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
+    """The pieces of a log between its gaps that have so many rows, each a log; the log itself without gaps."""
+    long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
+    return [log] if len(log.pieces) == 1 else [_piece(log, first, rows) for first, rows in long]
+
+
+def _piece(log: Log, first: int, rows: int) -> Log:
+    some, since, source = slice(first, first + rows), first * log.dt, {}
+    for channel, series in log.source.items():
+        times = series.times - since
+        own = times - log.offsets.get(channel, 0.0)
+        low = max(int(np.searchsorted(own, -0.5 * log.dt)) - 1, 0)  # what is held at the first row
+        high = int(np.searchsorted(own, (rows - 0.5) * log.dt))
+        if channel.partition(":")[0] != INPUT:
+            low = int(np.searchsorted(own, -0.5 * log.dt))
+        source[channel] = Series(times[low:high], series.values[low:high])
+    return replace(
+        log,
+        name=f"{log.name}, rows {first} to {first + rows - 1}",
+        inputs=log.inputs[first : first + rows - 1],
+        measurements=log.measurements[some],
+        references={key: values[some] for key, values in log.references.items()},
+        start=log.start + since,
+        source=source,
+        recording=Recording(),
+        whole=log,
+    )
+
+
+def _checked_stamps(given: np.ndarray, steps: int, name: str) -> np.ndarray:
+    stamps = np.array(as_floats(given))
+    if stamps.shape != (steps + 1,) or stamps[0] != 0.0 or not (np.diff(stamps) > 0.0).all():
+        rule = f"{steps + 1} increasing times from 0 on"
+        raise ValueError(f"stamps of log {name} must be {rule}, but got {short_repr(stamps)}")
+    stamps.setflags(write=False)
+    return stamps
+
+
+def _with_column(rows: np.ndarray, place: int, values: np.ndarray) -> np.ndarray:
+    rows = rows.copy()
+    rows[:, place] = values
+    return rows

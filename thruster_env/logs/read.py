@@ -1,0 +1,312 @@
+"""Logs from tables and recorders' files, and an optional TOML file beside one that describes its columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.core.checks import finite, listed, positive, short_repr
+from thruster_env.core.toml import read_toml
+from thruster_env.logs.columns import (
+    INPUT,
+    MEASUREMENT,
+    TIME,
+    Column,
+    Wanted,
+    find_columns,
+    find_wanted,
+    quantities_of,
+)
+from thruster_env.logs.findings import CLOCK, Recording, Remark
+from thruster_env.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
+from thruster_env.logs.log import FEWEST_STEPS, Log
+from thruster_env.logs.own_stamps import at_own_stamps
+from thruster_env.logs.recorders.merged import Recorded
+from thruster_env.logs.recorders.registry import check_stamps, format_of
+from thruster_env.logs.stale_inputs import stale_inputs
+from thruster_env.logs.stamps import follows, in_seconds
+from thruster_env.logs.table import Table, read_table, table_of
+from thruster_env.logs.units import converted
+from thruster_env.model.state_space import StateSpaceModel
+
+SECOND = "s"
+MOST_STEPS = 10_000_000
+MOST_DOUBLED = 0.1  # of the rows, with the time of the row before; of more the times are wrong
+
+
+class Description(NamedTuple):
+    """A description of the columns of a file, in addition to its header."""
+
+    columns: Mapping[str, str] = {}  # headers by quantity: {"thrust": "loadcell[kgf]"}
+    units: Mapping[str, str] = {}  # by header
+    clock_offset: Mapping[str, float] = {}  # by quantity [s]: how far its clock is ahead
+    dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
+    stamps: str | None = None  # of a bag: "header" or "receipt"
+
+    def updated(self, other: Description) -> Description:
+        """This one, overridden by the other."""
+        return Description(
+            columns={**self.columns, **other.columns},
+            units={**self.units, **other.units},
+            clock_offset={**self.clock_offset, **other.clock_offset},
+            dt=self.dt if other.dt is None else other.dt,
+            stamps=self.stamps if other.stamps is None else other.stamps,
+        )
+
+
+def read_log(
+    path: Any,
+    model: StateSpaceModel,
+    columns: Mapping[str, str] | None = None,
+    *,
+    clock_offset: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    grid: bool = True,
+    stamps: str | None = None,
+    name: str = "a table",
+) -> Log:
+    """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
+
+    Columns are found by their headers (`thruster_env.logs.columns.find_columns`), converted to the model's
+    units (`thruster_env.logs.units`) and put on a grid (`thruster_env.logs.grid`). Times are
+    numbers, or ISO 8601 dates, the first of which is time 0. A file beside it, run.toml for run.csv, may say
+
+        dt = 0.01
+        stamps = "receipt"
+        [columns]
+        thrust = "loadcell[kgf]"
+        [units]
+        "motor" = "rpm"
+        [clock_offset]
+        thrust = -0.06
+
+    and the arguments take precedence over it.
+
+    Args:
+        path: a file that ends in .csv, .parquet or .npz, or a recorder's
+            (`thruster_env.logs.recorders.registry`); or a table itself: a mapping from headers to arrays
+            (rows,), or a pandas.DataFrame.
+        model: its inputs and measurements must be in the file.
+        columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
+        clock_offset: how far a channel's clock is ahead [s].
+        dt: sample time [s], for files without a time column, or whose time stamps lie on no grid.
+        grid: whether samples are put on a grid; else rows are the times of samples
+            (`thruster_env.logs.own_stamps`), and `dt` is the sample time to which covariances belong.
+        stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
+            topics have stamps of one clock (`thruster_env.logs.recorders.one_clock`).
+        name: of a log that is not a file.
+
+    Raises:
+        ValueError: if a column is missing, or a value is wrong; it names file, line and column.
+    """
+    is_file = isinstance(path, (str, PathLike))
+    for what, given in (("columns", columns), ("clock offsets", clock_offset)):
+        if not isinstance(given, Mapping | None):
+            raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(given)}")
+    beside = _described(Path(path)) if is_file else Description()
+    said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt, stamps))
+    wanted = quantities_of(model)
+    form = format_of(path) if is_file else None
+    if form is not None:
+        asked = [text for text in said.columns.values() if isinstance(text, str)]
+        recorded = Recorded(path, form, asked, said.stamps)
+        table, found = recorded.table(recorded.columns(wanted, said.columns, said.units, said.dt is None))
+    else:
+        check_stamps(said.stamps, None, path if is_file else name)
+        table = read_table(path) if is_file else table_of(path, name)
+        found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
+    file = table.file
+    of_file, start, taken = _grid(table, found.get(TIME), said.dt, file, grid)
+    dt = of_file.dt
+    offsets = _offsets(said.clock_offset, wanted, found, of_file, file)
+    samples, source, parts = {}, {}, {}
+    rows, dropped = np.zeros(len(of_file.times), bool), []
+    for one in wanted:
+        if one.key not in found:
+            continue
+        series, there = _series(table, found[one.key], one, of_file)
+        samples[one.key] = series
+        rows |= there
+        if len(series.values) < len(of_file.times) or of_file.irregular or one.key in offsets:
+            source[one.key] = series  # elsewhere the rows tell the same
+        offset = offsets.get(one.key, 0.0)
+        if not grid:
+            continue
+        if one.kind == INPUT:
+            parts[one.key] = held(series, dt, of_file.rows - 1, offset, one.quantity.angle)
+        else:
+            parts[one.key] = sampled(series, dt, of_file.rows, offset, one.quantity.angle)
+            lost = len(series.values) - int((~np.isnan(sampled(series, dt, of_file.rows))).sum())
+            dropped += [(one.key, lost)] if lost else []
+    marks, last = None, of_file.rows - 1
+    if not grid:
+        driving = [one.key for one in wanted if one.kind == INPUT]
+        marks, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]), start)
+        last = len(marks) - 1
+
+    def those(kind: str, rows: int) -> np.ndarray:
+        some = [parts[one.key] for one in wanted if one.kind == kind]
+        return np.column_stack(some) if some else np.empty((rows, 0))
+
+    driven = {
+        one.key: samples[one.key]._replace(times=samples[one.key].times - offsets.get(one.key, 0.0))
+        for one in wanted
+        if one.kind == INPUT
+    }
+    end = float(of_file.times[-1]) if marks is not None else of_file.dt * (of_file.rows - 1)
+    remarks = (
+        *([Remark(CLOCK, "", taken)] if taken else []),
+        *table.remarks,
+        *stale_inputs(driven, end, dt, start),
+    )
+    referred = {
+        one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
+    }
+    recording = _recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file)
+    if last < FEWEST_STEPS:
+        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {last + 1}")
+    return Log(
+        name=file,
+        dt=dt,
+        inputs=those(INPUT, last),
+        measurements=those(MEASUREMENT, last + 1),
+        input_quantities=model.input_quantities,
+        measured=model.measurements,
+        references={key: parts[key] for key in referred},
+        referred=referred,
+        start=start,
+        source=source,
+        offsets=offsets,
+        irregular=of_file.irregular,
+        recording=recording._replace(damage=table.damage, remarks=remarks),
+        stamps=marks,
+    )
+
+
+def _as_recorded(of_file: Grid) -> Recording:
+    """What became of a file's rows without a grid: at most of two with one stamp the last one counts."""
+    return Recording(doubled=int((np.diff(of_file.times) == 0).sum()))
+
+
+def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...]) -> Recording:
+    """What became of a file's rows, of which some hold samples (rows,)."""
+    numbers = np.unique(np.floor(grid.times[rows] / grid.dt + 0.5).astype(int))
+    apart = np.diff(numbers)
+    usual = max(float(np.median(apart)), 1.0) if len(apart) else 1.0
+    is_gap = apart > (MOST_HELD + 1) * usual
+    gaps = tuple((int(numbers[i]) + 1, int(apart[i]) - 1) for i in np.flatnonzero(is_gap))
+    holes = np.maximum(np.round(apart[~is_gap] / usual).astype(int) - 1, 0)
+    moved = grid.moved[grid.moved > TOLERANCE * grid.dt]
+    farthest = float(moved.max()) if len(moved) else 0.0
+    doubled = int((np.diff(grid.times) == 0).sum())
+    return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(moved), farthest, doubled, dropped)
+
+
+def _described(path: Path) -> Description:
+    """What the TOML file beside a log says, nothing if there is none."""
+    beside = path.with_suffix(".toml")
+    if not beside.is_file():
+        return Description()
+    content = read_toml(beside, "what is said of a log")
+    unknown = sorted(set(content) - set(Description._fields))
+    if unknown:
+        raise ValueError(
+            f"keys beside a log must be among {', '.join(Description._fields)}, but {beside} has {unknown}"
+        )
+    for key, kind in (("columns", str), ("units", str), ("clock_offset", float | int)):
+        part = content.get(key, {})
+        if not isinstance(part, dict) or not all(isinstance(value, kind) for value in part.values()):
+            what = "texts" if kind is str else "seconds"
+            raise ValueError(f"{key} beside a log must map names to {what}, but {beside} has {short_repr(part)}")
+    return Description(**content)
+
+
+def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid: bool) -> tuple[Grid, float, str]:
+    """The grid of a file's rows, or its sample time with their own times; the first stamp [s]; how it was read."""
+    count = len(table.lines)
+    if dt is not None:
+        dt = positive("dt", dt)
+    apart = np.flatnonzero(np.diff(table.lines) != 1)
+    if column is None and len(apart):
+        line = table.lines[int(apart[0])] + 1
+        raise ValueError(
+            f"rows of a log without times must follow one another, but line {line} of {file} is empty"
+        )
+    if column is None:
+        if dt is None:
+            raise ValueError(
+                f"a log must have a column of times (use --column time=HEADER, in Python "
+                f"columns={{'time': 'HEADER'}}) or a sample time (--dt, dt=), but "
+                f"{file} has {listed(table.names)}"
+            )
+        return Grid(dt, count, dt * np.arange(count), False), 0.0, ""
+    stamps, taken = table.dates(column.header), ""
+    if stamps is None:
+        where = f"column {column.header!r} of {file}"
+        stamps, taken = in_seconds(table.numbers(column.header), column.unit, column.header, where)
+    if np.isnan(stamps).any():
+        row = int(np.argmax(np.isnan(stamps)))
+        raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
+    if count <= FEWEST_STEPS:
+        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
+    own = stamps if table.clock is None else stamps[table.clock]
+    steps = np.diff(own)
+    doubled = (steps == 0).sum() > MOST_DOUBLED * len(steps) or len(steps) - (steps == 0).sum() < FEWEST_STEPS
+    back = np.flatnonzero(steps <= 0 if doubled else steps < 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise ValueError(
+            f"times must increase from row to row, but {follows(own[row - 1], own[row])} in "
+            f"{table.place(row, column.header)}"
+        )
+    count = (own[-1] - own[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
+    if count > MOST_STEPS:
+        raise ValueError(
+            f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
+        )
+    found = grid_of(stamps, dt, table.clock)
+    if not grid:
+        found = Grid(found.dt, found.rows, stamps - stamps[0], True)
+    return found, float(stamps[0]), taken
+
+
+def _offsets(
+    given: Mapping[str, float], wanted: list[Wanted], found: Mapping, grid: Grid, file: str
+) -> dict[str, float]:
+    offsets, length = {}, grid.dt * (grid.rows - 1)
+    for name, seconds in given.items():
+        one = find_wanted(name, wanted)
+        if one is None or one.key not in found:
+            known = ", ".join(one.quantity.symbol for one in wanted if one.key in found)
+            raise ValueError(f"clock offsets must be of channels {known}, but got {short_repr(name)} ({file})")
+        offsets[one.key] = finite(f"the clock offset of {name}", seconds)
+        if abs(offsets[one.key]) >= length:  # nothing of the channel would be left
+            raise ValueError(
+                f"the clock offset of {name} must be shorter than the log, {length:g} s, but got {seconds:g} "
+                f"({file})"
+            )
+    return offsets
+
+
+def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> tuple[Series, np.ndarray]:
+    """The samples of a column in the model's unit, and in which rows they are.
+
+    Raises:
+        ValueError: for a late input, or a sensor that never changes.
+    """
+    where = f"column {column.header!r} of {table.file}"
+    values = converted(table.numbers(column.header), column.unit, one.quantity.unit, where)
+    there = ~np.isnan(values)
+    if not there.any() and one.kind in (INPUT, MEASUREMENT):
+        raise ValueError(f"a column must hold numbers, but {where} has none")
+    if one.kind == INPUT and not there[0]:
+        raise ValueError(
+            f"an input must be known from the first row on, but it is missing in {table.place(0, column.header)}"
+        )
+    if one.kind == MEASUREMENT and there.sum() > 1 and np.ptp(values[there]) == 0.0:
+        raise ValueError(f"a measurement must vary, but {where} is {values[there][0]:.10g} in all rows")
+    return Series(grid.times[there], values[there]), there

@@ -1,0 +1,258 @@
+"""How many messages a bag says it has, read apart from the messages: what is damaged has others."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
+
+from thruster_env.logs.recorders.topics import Refused, check_bytes
+
+ROS1, MCAP, DB3 = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
+REPAIRS = {ROS1: "rosbag reindex", MCAP: "mcap recover", DB3: "ros2 bag reindex"}  # the formats' own programs
+SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 3, 4, 5, 6, 7  # records of an MCAP file
+CHUNK_INDEX, STATISTICS, DATA_END, FOOTER = 8, 11, 15, 2
+ROS1_HEADER, ROS1_INDEX, ROS1_CHUNK, ROS1_CHUNK_INFO, ROS1_CONNECTION = 3, 4, 5, 6, 7  # those of a bag of ROS 1
+PIECE = 2**20  # bytes
+
+Counts = Mapping[int, int]  # messages by connection
+
+
+def is_ros1(path: Path) -> bool:
+    """Whether a file is a bag of ROS 1, by its first bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(ROS1)) == ROS1
+
+
+def counts_of(path: Path) -> dict[str, Counts]:
+    """The messages that a file of a bag says it has, by what says so and by connection.
+
+    Args:
+        path: of a .bag, .db3 or .mcap file.
+
+    Raises:
+        ValueError: for a file whose parts are not all there, or contradict one another.
+
+    Source: ROS, "Bag File Format 2.0"; Foxglove, "MCAP Format Specification".
+    """
+    with path.open("rb") as file:
+        first = file.read(len(DB3))
+        if first.startswith(ROS1):
+            return _of_ros1(file, path)
+        if first.startswith(MCAP):
+            return _of_mcap(file, path)
+    if first == DB3:
+        _check_whole(path)
+        return _of_database(path)
+    raise ValueError(f"it begins with {first[:8]!r}")
+
+
+def check_counts(read: Counts, topics: Mapping[int, str], stated: Mapping[str, Counts], path: Path) -> None:
+    """Raise Refused unless as many messages were read as the file says it has.
+
+    Args:
+        read: messages of those connections that were read.
+        topics: names of all connections.
+        stated: from `counts_of`.
+        path: of the file, for messages.
+    """
+    for source, counts in stated.items():
+        for connection, count in read.items():
+            if count != counts.get(connection, 0):
+                raise _lost(repr(topics[connection]), count, counts.get(connection, 0), source, path)
+        nameless = sum(count for connection, count in counts.items() if connection not in topics)
+        if nameless:
+            raise _lost("a topic without a name", 0, nameless, source, path)
+
+
+def _lost(topic: str, read: int, stated: int, source: str, path: Path) -> Refused:
+    suffix = {".bag": ROS1, ".mcap": MCAP}.get(path.suffix.lower(), DB3)
+    return Refused(
+        f"a bag must hold the messages that it says it has, but {topic} has {read} of {stated} by its {source} "
+        f"({path}): it is damaged; repair it, as with {REPAIRS[suffix]}"
+    )
+
+
+def check_topics(read: Counts | Mapping[str, int], stated: Mapping[str, int], known: set[str], path: Path) -> None:
+    """Raise Refused unless the files of a bag hold as many messages of each topic as its metadata.yaml says.
+
+    Args:
+        read: messages by topic, of those that were read.
+        stated: messages by topic, by the metadata.
+        known: topics that the files have.
+        path: of the bag, for messages.
+    """
+    for topic, count in stated.items():
+        own = read.get(topic, 0)  # type: ignore[call-overload]
+        if own != count and (topic in read or topic not in known):
+            raise _lost(repr(topic), own, count, "metadata.yaml", path)
+
+
+def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
+    size = path.stat().st_size
+    alone, indexed, statistics, described = Counter[int](), Counter[int](), None, None
+    seen: Counter[int] = Counter()
+    channels: dict[int, bytes] = {}
+    place = len(MCAP)
+    while True:
+        file.seek(place)
+        kind, count = struct.unpack("<BQ", _exact(file, 9))
+        if place + 9 + count > size:
+            raise ValueError("it ends within a record")
+        seen[kind] += 1
+        if kind == MESSAGE:
+            alone[struct.unpack("<H", _exact(file, 2))[0]] += 1
+        elif kind == CHUNK:
+            check_bytes(struct.unpack("<QQQ", _exact(file, 24))[2], "a chunk of an MCAP file", path)
+        elif kind == INDEX:
+            channel, length = struct.unpack("<HI", _exact(file, 6))
+            indexed[channel] += length // 16
+        elif kind == CHANNEL:
+            content = _exact(file, count)
+            if channels.setdefault(int.from_bytes(content[:2], "little"), content) != content:
+                raise ValueError("it defines a channel twice")
+        elif kind == STATISTICS:
+            content = _exact(file, count)
+            statistics, described = _statistics(content), struct.unpack_from("<HI", content, 8)
+        elif kind == DATA_END:
+            _check_sum(file, 0, place, struct.unpack("<I", _exact(file, 4))[0], "data")
+        elif kind == FOOTER:
+            summary, _, check = struct.unpack("<QQI", _exact(file, 20))
+            if summary:
+                _check_sum(file, summary, place + 25, check, "summary")
+            break
+        place += 9 + count
+    schemas, named = described or (seen[SCHEMA], seen[CHANNEL])
+    if seen[CHUNK] and (seen[SCHEMA] < min(schemas, 1) or seen[CHANNEL] < named):
+        rule = "an MCAP file must have its schemas and channels in its summary"
+        raise Refused(f"{rule}, but {path} has them in its chunks alone: mcap recover writes one that is read")
+    if seen[CHUNK_INDEX] and seen[CHUNK_INDEX] != seen[CHUNK]:
+        raise ValueError(f"it has {seen[CHUNK]} chunks, but an index of {seen[CHUNK_INDEX]}")
+    if seen[CHUNK] and seen[CHUNK_INDEX] and not seen[INDEX] and statistics != {}:
+        raise ValueError("its chunks have no index of their messages")
+    found: dict[str, Counts] = {} if statistics is None else {"statistics": statistics}
+    if seen[INDEX] or not seen[CHUNK]:
+        found["records"] = indexed + alone
+    return found
+
+
+def _statistics(content: bytes) -> dict[int, int]:
+    """Messages by channel; ValueError unless their sum is what is said, too."""
+    total, length = struct.unpack_from("<Q", content)[0], struct.unpack_from("<I", content, 42)[0]
+    if 46 + length > len(content) or length % 10:
+        raise ValueError("its statistics are damaged")
+    counts = dict(struct.iter_unpack("<HQ", content[46 : 46 + length]))
+    if sum(counts.values()) != total:
+        raise ValueError(f"its statistics say {total} messages, but {sum(counts.values())} by channel")
+    return counts
+
+
+def _check_sum(file: BinaryIO, begin: int, end: int, check: int, what: str) -> None:
+    """Raise ValueError unless the bytes of a part have its check sum (CRC-32); 0 stands for none."""
+    if not check:
+        return
+    file.seek(begin)
+    found, left = 0, end - begin
+    while left > 0 and (piece := file.read(min(left, PIECE))):
+        found, left = zlib.crc32(piece, found), left - len(piece)
+    if found != check:
+        raise ValueError(f"the check sum of its {what} is wrong")
+
+
+def _of_ros1(file: BinaryIO, path: Path) -> dict[str, Counts]:
+    size, place = path.stat().st_size, file.seek(len(ROS1) + 1)
+    index, chunks = Counter[int](), Counter[int]()
+    seen: Counter[int] = Counter()
+    stated, begin = (0, 0), 0
+    while place < size:
+        header = _fields(_exact(file, struct.unpack("<I", _exact(file, 4))[0]))
+        (count,) = struct.unpack("<I", _exact(file, 4))
+        place = file.tell()
+        kind = header[b"op"][0]
+        if kind == ROS1_HEADER:
+            begin = int.from_bytes(header[b"index_pos"], "little")
+            stated = _number(header, b"conn_count"), _number(header, b"chunk_count")
+        elif kind == ROS1_INDEX:
+            index[_number(header, b"conn")] += _number(header, b"count")
+        elif kind == ROS1_CHUNK:
+            check_bytes(_number(header, b"size"), "a chunk of a bag", path)
+        elif kind == ROS1_CHUNK_INFO:
+            for connection, messages in struct.iter_unpack("<II", _exact(file, count)):
+                chunks[connection] += messages
+        seen[kind] += kind != ROS1_CONNECTION or place > begin  # connections stand in chunks, too
+        place = file.seek(place + count)
+    if place != size:
+        raise ValueError("it ends within a record")
+    found = seen[ROS1_CONNECTION], seen[ROS1_CHUNK]
+    if found != stated or seen[ROS1_CHUNK] != seen[ROS1_CHUNK_INFO]:
+        raise ValueError(
+            f"it has {found[0]} connections and {found[1]} chunks, but says {stated[0]} and {stated[1]}, and "
+            f"describes {seen[ROS1_CHUNK_INFO]} chunks"
+        )
+    return {"index": index, "index of chunks": chunks}
+
+
+def _fields(header: bytes) -> dict[bytes, bytes]:
+    """The fields of a record's header."""
+    found, place = {}, 0
+    while place < len(header):
+        (count,) = struct.unpack_from("<I", header, place)
+        name, _, value = header[place + 4 : place + 4 + count].partition(b"=")
+        found[name] = value
+        place += 4 + count
+    return found
+
+
+def _number(header: Mapping[bytes, bytes], name: bytes) -> int:
+    return struct.unpack("<I", header[name])[0]
+
+
+def _exact(file: BinaryIO, count: int) -> bytes:
+    data = file.read(count)
+    if len(data) < count:
+        raise ValueError("it ends within a record")
+    return data
+
+
+def _of_database(path: Path) -> dict[str, Counts]:
+    log = path.with_name(f"{path.name}-wal")
+    if log.is_file() and log.stat().st_size:
+        way = f"let SQLite write them back: sqlite3 {path.name} 'PRAGMA wal_checkpoint'"
+        raise Refused(f"a bag must be closed, but rows of {path} are still in {log.name}; {way}")
+    with closing(sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)) as database:
+        (fault,) = next(database.execute("PRAGMA integrity_check(1)"))
+        if fault != "ok":
+            raise ValueError(f"its database is damaged: {fault}")
+        if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+            _check_defined_once(database, path)
+        counts = database.execute("SELECT topic_id, COUNT(*) FROM messages NOT INDEXED GROUP BY topic_id")
+        return {"table of messages": dict(counts)}
+
+
+def _check_defined_once(database: sqlite3.Connection, path: Path) -> None:
+    """Raise Refused for a type that has two definitions, of which the reader takes the first."""
+    twice = database.execute(
+        "SELECT topic_type FROM message_definitions GROUP BY topic_type "
+        "HAVING COUNT(DISTINCT encoded_message_definition) > 1"
+    ).fetchone()
+    if twice:
+        raise Refused(f"a file of a bag must define a type once, but {path} defines {twice[0]} twice")
+
+
+def _check_whole(path: Path) -> None:
+    """Raise ValueError for a database of SQLite that has fewer pages than it says; SQLite reads what is left."""
+    with path.open("rb") as file:
+        head = file.read(100)
+    if head[24:28] == head[92:96]:  # the count of pages is that of the last change
+        page = int.from_bytes(head[16:18]) or 1
+        count = int.from_bytes(head[28:32])
+        if path.stat().st_size < count * (page if page > 1 else 65536):
+            raise ValueError(f"{path.name} is cut off")

@@ -1,0 +1,320 @@
+"""Bags of ROS 1 and ROS 2, also as MCAP, by the package rosbags."""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from keyword import iskeyword
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.logs.recorders.bag_counts import check_counts, check_topics, counts_of, is_ros1
+from thruster_env.logs.recorders.bag_files import Bag, files_of, unpacker
+from thruster_env.logs.recorders.one_clock import HEADER, RECEIPT
+from thruster_env.logs.recorders.topics import (
+    MOST_COLUMNS,
+    MOST_FIELDS,
+    Topic,
+    Wanted,
+    bounded,
+    check_bytes,
+    package,
+    reading,
+    wants,
+)
+from thruster_env.logs.recorders.transforms import (
+    HEADER_TYPE,
+    STAMPED,
+    Pairs,
+    array_of_transforms,
+    wants_pairs,
+)
+
+KIND = "bag"
+TICKS = 1e9  # a second
+NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
+NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
+DEEPEST = 8  # messages within messages
+
+
+class Leaf(NamedTuple):
+    """A field of a message that holds a number or an array of them."""
+
+    path: str  # "pose.position.x"
+    is_array: bool
+    why: str = ""  # it is not read
+
+
+def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
+    """The topics of a bag: times are the stamps of the messages' headers, else when the messages were received.
+
+    Times are [s] since the bag's first message was received; a topic has those of headers if these have stamps: 0
+    is one only at the beginning, where simulated time begins. It has the times of reception, too. Fields are
+    numbers and short arrays, of which each message has as many; a bag has no units. Types come from the bag, or
+    where it has none from the newest release of ROS 2 that the package knows. If a topic has several, its messages
+    are matched by the names of fields; a field is NaN in messages without it. An array of transforms (/tf) is a
+    topic for each pair of frames, TOPIC/PARENT/CHILD, with the stamps of its own headers.
+
+    Args:
+        path: of a .bag, .db3 or .mcap file, or of the folder of a bag of ROS 2.
+        wanted: columns whose topics are read; None for all.
+
+    Raises:
+        ValueError: if it is no bag, or has not as many messages as it says.
+
+    Source: ROS, "Bag File Format 2.0"; Foxglove, "MCAP".
+    """
+    contents = Contents(path, wanted)
+    with reading(KIND, path), bounded("a bag", path), files_of(path, KIND) as bag:
+        for file in bag.files:
+            contents.add(file, bag.is_packed)
+        contents.check(bag)
+        begin = bag.begin if bag.begin is not None else contents.begin
+    for name in sorted({*contents.samples, *contents.unread}):
+        yield _topic(name, [*contents.samples.get(name, {}).values()], begin, contents.unread.get(name, {}))
+
+
+class Contents:
+    """What is read of a bag, file by file.
+
+    Attributes:
+        samples: the numbers of a topic by the leaves of its messages, by topic.
+        unread: why a field is not read, by topic and field.
+        begin: when the first message was received [ns].
+    """
+
+    def __init__(self, path: Path, wanted: Wanted):
+        """Nothing is read yet."""
+        self.path, self._wanted, self._is_ros1 = path, wanted, is_ros1(path)
+        self._room = package("rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2", KIND, path)
+        self._types = package("rosbags.typesys", KIND, path)
+        self.samples: dict[str, dict[tuple[Leaf, ...], Samples]] = {}
+        self.unread: dict[str, dict[str, str]] = {}
+        self.begin = 0
+        self._pairs = Pairs(path)
+        self._size, self._known, self._counts = 0, set[str](), Counter[str]()
+
+    def add(self, file: Path, is_packed: bool) -> None:
+        """Read the messages of a file; ValueError unless it has as many as it says."""
+        stated = counts_of(file)
+        with self._room.Reader(file) as reader:
+            names = {one.id: one.topic for one in reader.connections}
+            if len(names) < len(reader.connections):
+                raise ValueError("it has two connections of one number")
+            decoders = dict(self._decoders(reader.connections))
+            some = [one for one in reader.connections if one.id in decoders and decoders[one.id].leaves]
+            rows = Counter({one.id: 0 for one in some})
+            unpack = unpacker(KIND, self.path).decompress if is_packed else bytes
+            for connection, received, data in reader.messages(some) if some else ():
+                decoder = decoders[connection.id]
+                rows[connection.id] += 1
+                for topic, stamp, row in decoder.read(unpack(data)):
+                    if not wants(self._wanted, topic):
+                        continue
+                    parts = self.samples.setdefault(topic, {})
+                    if decoder.leaves not in parts:
+                        parts[decoder.leaves] = Samples(decoder.leaves)
+                    self._size += 8 * parts[decoder.leaves].add(received, stamp, row)
+                    check_bytes(self._size, "the numbers of a bag", self.path)
+            if reader.message_count:
+                self.begin = min(self.begin or reader.start_time, reader.start_time)
+        check_counts(rows, names, stated, self.path)
+        for number, decoder in decoders.items():
+            self.unread.setdefault(names[number], {}).update(decoder.unread)
+        self._known |= set(names.values())
+        for number, count in rows.items():
+            self._counts[names[number]] += count
+
+    def _decoders(self, connections: Sequence[Any]) -> Iterator[tuple[int, Decoder]]:
+        """Decoders of the connections that are wanted, by number."""
+        for one in connections:
+            is_wanted = wants(self._wanted, one.topic)
+            if is_wanted or wants_pairs(self._wanted, one.topic):
+                decoder = Decoder(self._types, one, self._is_ros1, self._pairs)
+                if is_wanted or decoder.transforms:
+                    yield one.id, decoder
+
+    def check(self, bag: Bag) -> None:
+        """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says.
+
+        Nor may a pair of frames have the name of a topic.
+        """
+        self._pairs.check(self._known)
+        check_topics(self._counts, bag.counts, self._known, self.path)
+
+
+class Decoder:
+    """Numbers of the messages of one connection.
+
+    Attributes:
+        leaves: the fields that hold numbers, of a transform where messages are arrays of them.
+        unread: why others are not read, by path.
+        transforms: the field that is an array of transforms; empty for messages that are one row each.
+    """
+
+    def __init__(self, types: Any, connection: Any, is_ros1: bool, pairs: Pairs):
+        """Find the fields that hold numbers, and say of others why they are not read."""
+        store = types.get_typestore(types.Stores.EMPTY)
+        text, kind = connection.msgdef.data, connection.msgtype
+        if text:
+            is_idl = connection.msgdef.format.name == "IDL"
+            defined = types.get_types_from_idl(text) if is_idl else types.get_types_from_msg(text, kind)
+            _check_types(defined)
+            store.register(defined)
+        elif not is_ros1:
+            store = types.get_typestore(types.Stores.LATEST)
+        self.transforms = array_of_transforms(store.fielddefs, kind)
+        row = dict(store.fielddefs[STAMPED][1])["transform"][1] if self.transforms else kind
+        every = [*_leaves(store.fielddefs, row)] if kind in store.fielddefs else []
+        self.leaves = tuple(one for one in every if not one.why)
+        self.unread = {one.path: one.why for one in every if one.why}
+        encoding = "cdr" if is_ros1 else connection.ext.serialization_format
+        if kind not in store.fielddefs or encoding != "cdr":
+            what = f"messages of the type {kind[:80]}, which is not known"
+            self.leaves, self.unread = (), {"": what if encoding == "cdr" else f"messages as {encoding[:80]}"}
+        read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        self._message = lambda data: read(data, kind)
+        self._fields = attrgetter(*(one.path for one in self.leaves), "__class__") if self.leaves else None
+        fields = dict(store.fielddefs.get(kind, ((), ()))[1])
+        self._has_header = "header" in fields and fields["header"][1] == HEADER_TYPE
+        self._topic, self._pairs = connection.topic, pairs
+
+    def read(self, data: bytes) -> Iterator[tuple[str, int, tuple]]:
+        """Topic, stamp of the header [ns], 0 without one, and what each leaf holds, of each row of a message."""
+        message = self._message(data)
+        assert self._fields is not None
+        if not self.transforms:
+            yield self._topic, _stamp(message) if self._has_header else 0, self._fields(message)[:-1]
+            return
+        for topic, one in self._pairs.topics(self._topic, getattr(message, self.transforms)):
+            yield topic, _stamp(one), self._fields(one.transform)[:-1]
+
+
+class Samples:
+    """The numbers of a topic, as they come."""
+
+    def __init__(self, leaves: Sequence[Leaf]):
+        """Nothing is there yet."""
+        self.leaves = leaves
+        self.received, self.stamps = array("q"), array("q")
+        self.numbers = [array("d") for _ in leaves]
+        self.widths: list[int | None] = [None] * len(leaves)  # entries of an array; -1 where they differ
+
+    def add(self, received: int, stamp: int, row: tuple) -> int:
+        """Add a message, received and stamped at some time [ns]; return how many numbers it adds."""
+        first, count = not self.received, 2
+        self.received.append(received)
+        self.stamps.append(stamp)
+        for place, (leaf, value) in enumerate(zip(self.leaves, row, strict=True)):
+            if not leaf.is_array:
+                self.numbers[place].append(value)
+                count += 1
+            elif first or self.widths[place] == len(value):
+                self.widths[place] = len(value)
+                if len(value) <= MOST_COLUMNS:
+                    self.numbers[place].extend(value)
+                    count += len(value)
+            else:
+                self.widths[place] = -1
+                del self.numbers[place][:]
+        return count
+
+    def columns(self) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """The numbers of each field (messages,), in the order of messages, and why an array is not read."""
+        values: dict[str, np.ndarray] = {}
+        unread: dict[str, str] = {}
+        for leaf, numbers, width in zip(self.leaves, self.numbers, self.widths, strict=True):
+            if not leaf.is_array:
+                values[leaf.path] = np.array(numbers)
+            elif width is not None and 0 < width <= MOST_COLUMNS:
+                rows = np.array(numbers).reshape(-1, width)
+                values |= {f"{leaf.path}[{entry}]": rows[:, entry] for entry in range(width)}
+            elif width:
+                unread[leaf.path] = (
+                    "an array whose length changes" if width < 0 else f"an array of {width} entries"
+                )
+        return values, unread
+
+
+def _stamp(message: Any) -> int:
+    """The stamp of a message's header [ns]."""
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def _are_set(stamps: np.ndarray) -> bool:
+    """Whether headers have stamps; 0 stands where there is none, and at the beginning of simulated time."""
+    nothing = np.flatnonzero(stamps == 0)
+    return len(nothing) < len(stamps) and bool((nothing == np.arange(len(nothing))).all())
+
+
+def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str, str]) -> Topic:
+    """A topic whose messages are of one type or several, in order of their times [s] since the beginning [ns]."""
+    stamps, received = (np.concatenate([np.empty(0, np.int64), *some]) for some in _ticks(parts))
+    has_stamps = _are_set(stamps[np.argsort(received, kind="stable")])
+    ticks = (stamps if has_stamps else received).astype(np.int64)
+    order = np.argsort(ticks, kind="stable")
+    values: dict[str, np.ndarray] = {}
+    unread, row = dict(unread), 0
+    for one in parts:
+        columns, others = one.columns()
+        unread |= others
+        for field, numbers in columns.items():
+            values.setdefault(field, np.full(len(ticks), np.nan))[row : row + len(numbers)] = numbers
+        row += len(one.received)
+    times, received = ((some[order] - begin) / TICKS for some in (ticks, received))
+    values = {key: one[order] for key, one in values.items()}
+    clock = (HEADER, received) if has_stamps else (RECEIPT, None)
+    return Topic(name, times, values, unread=unread, clock=clock[0], received=clock[1])
+
+
+def _ticks(parts: Sequence[Samples]) -> Iterator[list[np.ndarray]]:
+    """The stamps of messages, and when they were received [ns]."""
+    yield [np.array(one.stamps, np.int64) for one in parts]
+    yield [np.array(one.received, np.int64) for one in parts]
+
+
+def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Iterator[Leaf]:
+    """Fields of a message of a type that hold numbers or arrays of messages, not those of its header."""
+    for name, (node, what) in defined[kind][1]:
+        path = before + (f"{name}_" if iskeyword(name) else name)
+        if node.name == "BASE" and NUMBER.fullmatch(what[0]):
+            yield Leaf(path, False)
+        elif node.name == "NAME" and what != HEADER_TYPE and what in defined and depth < DEEPEST:
+            yield from _leaves(defined, what, f"{path}.", depth + 1)
+        elif node.name in ("ARRAY", "SEQUENCE"):
+            (inner, base), size = what
+            if inner.name == "NAME":
+                yield Leaf(path, True, "an array of messages")
+            elif NUMBER.fullmatch(base[0]):
+                is_long = node.name == "ARRAY" and size > MOST_COLUMNS
+                yield Leaf(path, True, f"an array of {size} entries" if is_long else "")
+
+
+def _check_types(defined: dict) -> None:
+    """Raise ValueError unless types that a bag defines are names and sizes, for classes are made of them.
+
+    Nor may an array hold messages without numbers, of which any count fits into a few bytes.
+    """
+    for kind, (constants, fields) in defined.items():
+        names = [kind, *(one[0] for one in constants), *(one[0] for one in fields)]
+        arrays = [what for _, (node, what) in fields if node.name in ("ARRAY", "SEQUENCE")]
+        sound = [
+            all(isinstance(one[2], (bool, int, float, str)) for one in constants),
+            all(map(NAME.fullmatch, names)) and len(names) <= MOST_FIELDS,
+            max((what[1] for _, (node, what) in fields if node.name == "ARRAY"), default=0) <= MOST_FIELDS,
+            not any(inner.name == "NAME" and _is_void(defined, one) for (inner, one), _ in arrays),
+        ]
+        if not all(sound):
+            raise ValueError(f"the type {kind[:80]!r} is none of a message")
+
+
+def _is_void(defined: dict, kind: str, depth: int = 0) -> bool:
+    """Whether a message of a type takes no bytes."""
+    if kind not in defined or depth > DEEPEST:
+        return False
+    return all(node.name == "NAME" and _is_void(defined, what, depth + 1) for _, (node, what) in defined[kind][1])

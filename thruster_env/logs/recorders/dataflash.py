@@ -1,0 +1,245 @@
+"""ArduPilot's DataFlash logs (.bin), whose index and units are by the package pymavlink."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.logs.recorders.topics import (
+    Refused,
+    Topic,
+    Wanted,
+    columns_of,
+    joined,
+    package,
+    reading,
+    silent,
+)
+
+KIND = "DataFlash log"
+MAGIC = b"\xa3\x95"
+STAMPS = {"TimeUS": 1e6, "TimeMS": 1e3}  # ticks a second
+OF_WEEK = {"T": 1e3}  # of old messages GPS, whose TimeMS counts from the beginning of the week
+HEADER = 3  # bytes before the body of a message
+FMT, DESCRIPTION = 0x80, 89  # the message that describes others, and its bytes
+LONGEST = 528  # bytes at the end that may be no message, the rest of a page
+NUMBERS = {  # NumPy's kind of each of ArduPilot's, and by what a message's number is divided
+    **{"b": ("i1", 1.0), "B": ("u1", 1.0), "M": ("u1", 1.0), "h": ("<i2", 1.0), "H": ("<u2", 1.0)},
+    **{"i": ("<i4", 1.0), "I": ("<u4", 1.0), "q": ("<i8", 1.0), "Q": ("<u8", 1.0)},
+    **{"g": ("<f2", 1.0), "f": ("<f4", 1.0), "d": ("<f8", 1.0), "a": ("V64", 1.0)},  # a: 32 of int16
+    **{"c": ("<i2", 1e2), "C": ("<u2", 1e2), "e": ("<i4", 1e2), "E": ("<u4", 1e2), "L": ("<i4", 1e7)},
+}
+FORMATS = ("FMT", "FMTU", "UNIT", "MULT")  # messages that describe others
+TEXTS = {"n": 4, "N": 16, "Z": 64}  # bytes
+UNITS = {**dict.fromkeys(("degheading", "deglatitude", "deglongitude"), "deg"), "instance": ""}  # ArduPilot's own
+
+
+def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
+    """The messages of a DataFlash log: times are TimeUS/10^6 (in old logs TimeMS/10^3), [s] since start.
+
+    Units are those of the messages UNIT, MULT and FMTU, where the log has them. Instance 1 of a message, by the
+    field that FMTU marks, is NAME#1. What a loss of power cut off is read up to there. Messages of a name with
+    several formats, as of logs that were put together, are matched by the names of fields, in the file's order.
+
+    Args:
+        path: of the file.
+        wanted: columns whose messages are read; None for all.
+
+    Raises:
+        ValueError: if it is no DataFlash log.
+
+    Source: ArduPilot, AP_Logger, "LogStructure.h".
+    """
+    reader = package("pymavlink.DFReader", KIND, path)
+    with reading(KIND, path), silent():
+        with _without_clock(reader.DFReader_binary)(str(path)) as index:
+            offsets = [np.array(one, np.int64) for one in index.offsets]
+            content = np.memmap(path, np.uint8, "r")
+            formats = _formats(reader, index, offsets, content, path)
+        if not any(len(offsets[kind]) for kind, (one, *_) in formats.items() if one.form.name not in FORMATS):
+            raise ValueError("it holds no messages but those that describe others")
+    damage = _damage(formats, offsets, content)
+    names = None if wanted is None else {one.partition(".")[0].partition("#")[0] for one in wanted}
+    some = [(one.form.name, kind, one) for kind, each in formats.items() for one in each]
+    for name, group in groupby(sorted(some, key=lambda one: one[0]), lambda one: one[0]):
+        if name in FORMATS or not (names is None or name in names):
+            continue
+        found: dict[str, list[tuple[Topic, np.ndarray]]] = {}
+        for _, kind, one in group:
+            own = offsets[kind]
+            own = own[(own >= one.begin) & (own < one.end) & (own + one.form.len <= len(content))]
+            for topic, places in _instances(one.form, content, own) if len(own) else ():
+                found.setdefault(topic.name, []).append((topic._replace(damage=damage), places))
+        for each in found.values():
+            yield joined(*map(list, zip(*each, strict=True)))
+
+
+class Definition(NamedTuple):
+    """A format of a message, and the part of the file that it holds for."""
+
+    form: Any  # pymavlink's
+    begin: int  # [bytes]
+    end: int
+
+
+def _formats(
+    reader: Any, index: Any, offsets: Sequence[np.ndarray], content: np.ndarray, path: Path
+) -> dict[int, list[Definition]]:
+    """The formats of each kind of message, in order: mostly one, more where logs were put together.
+
+    Raises:
+        ValueError: if the length of a message changes, and the package's index does not go by it.
+    """
+    size = len(content)
+    defined: dict[int, list[tuple[int, bytes]]] = {}
+    for place in offsets[FMT].tolist():
+        body = content[place + HEADER : place + DESCRIPTION].tobytes()
+        if len(body) == DESCRIPTION - HEADER:
+            each = defined.setdefault(body[0], [])
+            if not each or each[-1][1] != body:
+                each.append((place, body))
+    units = _units(index, offsets, content)
+    found = {kind: [Definition(form, 0, size)] for kind, form in index.formats.items()}
+    for kind, each in defined.items():
+        if len(each) < 2:
+            continue
+        if len({body[1] for _, body in each}) > 1 and not reader.dfindexer.available:
+            raise Refused(f"a DataFlash log must define a message once, but {path} defines {kind} twice")
+        ends = [place for place, _ in each[1:]] + [size]
+        found[kind] = []
+        for (place, body), end in zip(each, ends, strict=True):
+            form = reader.DFFormat(kind, body[2:6], body[1], *(_text(body[a:b]) for a, b in ((6, 22), (22, 86))))
+            for set_ids in (set_them for at, of, set_them in units if of == kind and place < at < end):
+                set_ids(form)
+            begin = place if found[kind] else 0
+            found[kind].append(Definition(form, begin, end))
+    return found
+
+
+def _units(
+    index: Any, offsets: Sequence[np.ndarray], content: np.ndarray
+) -> list[tuple[int, int, Callable[[Any], None]]]:
+    """Place and kind of the messages that give units, and what sets these in a format."""
+    kind = index.name_to_id.get("FMTU")
+    form = index.formats.get(kind)
+    if form is None or not {"UnitIds", "MultIds"} <= set(form.colhash):
+        return []
+    found: list[tuple[int, int, Callable[[Any], None]]] = []
+    for place in offsets[kind].tolist():
+        body = content[place + HEADER : place + form.len].tobytes()
+        if len(body) + HEADER < form.len:
+            continue
+        values = struct.unpack(form.msg_struct, body)
+        ids, factors = (_text(values[form.colhash[name]]) for name in ("UnitIds", "MultIds"))
+
+        def set_ids(one: Any, ids: str = ids, factors: str = factors) -> None:
+            one.set_unit_ids(ids, index.unit_lookup)
+            one.set_mult_ids(factors, index.mult_lookup)
+
+        found.append((place, int(values[1]), set_ids))
+    return found
+
+
+def _text(part: bytes) -> str:
+    return part.partition(b"\0")[0].decode("ascii", "replace")
+
+
+def _damage(
+    formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.ndarray], content: np.ndarray
+) -> str:
+    """What of a log is not read, in words; a few bytes of 0 or 255 at its end are the rest of a page."""
+    begins = [np.empty(0, np.int64)]
+    ends = [np.empty(0, np.int64)]
+    for kind, each in formats.items():
+        for one in each:
+            own = offsets[kind][(offsets[kind] >= one.begin) & (offsets[kind] < one.end)]
+            begins.append(own)
+            ends.append(own + one.form.len)
+    order = np.argsort(np.concatenate(begins))
+    begin, end = np.concatenate(begins)[order], np.concatenate(ends)[order]
+    if not len(begin):
+        return ""
+    holes = np.append(begin[0], begin[1:] - end[:-1])
+    lost, places, after = int(holes[holes > 0].sum()), int((holes > 0).sum()), len(content) - int(end[-1])
+    rest = set(content[len(content) - after :].tolist()) if 0 < after < LONGEST else set()
+    is_rest = rest in (set(), {0}, {255})
+    nameless = sum(len(one) for kind, one in enumerate(offsets) if kind not in formats)
+    some = [f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"] * (lost > 0)
+    unlike = (
+        one.form.name
+        for kind, each in formats.items()
+        for one in each
+        if len(offsets[kind]) and struct.calcsize(one.form.msg_struct) + HEADER != one.form.len
+    )
+    unnamed = (
+        one.form.name
+        for kind, each in formats.items()
+        for one in each
+        if len(offsets[kind]) and sum(map(bool, one.form.columns)) != len(one.form.format)
+    )
+    some += [f"the format of {name!r} is not as long as its messages" for name in unlike]
+    some += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
+    some += [f"{nameless} messages of the log have no format"] * (nameless > 0)
+    some += ["the log is cut off: its last message is not whole"] * (after < 0)
+    some += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST or not is_rest)
+    return ", and ".join(some)
+
+
+@cache
+def _without_clock(reader: type) -> type:
+    """The reader, which does not look through the whole log for the date: stamps count from the start."""
+    return type("Index", (reader,), {"init_clock": lambda self: None})
+
+
+def _instances(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[tuple[Topic, np.ndarray]]:
+    """The topics of a message, one or one an instance, and the places of their rows in the file.
+
+    Args:
+        form: pymavlink's format of the message.
+        content: of the file, bytes.
+        offsets: of the messages (samples,).
+    """
+    columns, ticks = {}, None
+    stamps = OF_WEEK if {*OF_WEEK, "Week"} <= {*form.columns} else STAMPS
+    for name, kind, numbers in _columns(form, content, offsets):
+        if name in stamps and ticks is None:
+            ticks = numbers / stamps[name]
+        else:
+            columns[name] = numbers if kind != "a" else numbers.view("<i2").reshape(-1, 32)
+    if ticks is None:
+        yield Topic(form.name, None, {}, unread={"": "messages without times"}), offsets
+        return
+    units = {name: unit for name, unit in zip(form.columns, form.units or (), strict=False) if unit}
+    units = {name: UNITS.get(unit, unit) for name, unit in units.items()}
+    which = columns.get(form.instance_field, np.zeros(len(ticks), int))
+    for number in np.unique(which):
+        own = which == number
+        fields = {
+            key: one for name, values in columns.items() for key, one in columns_of(name, values[own]).items()
+        }
+        name = f"{form.name}#{number:g}" if number else form.name
+        told = {key: units.get(key.partition("[")[0], "") for key in fields}
+        yield Topic(name, ticks[own], fields, told), offsets[own]
+
+
+def _columns(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Name, ArduPilot's kind and numbers (samples,) of each column of a message that holds numbers."""
+    place = HEADER
+    for name, kind in zip(form.columns, form.format, strict=False):
+        if kind in TEXTS:
+            place += TEXTS[kind]
+            continue
+        kept, divisor = np.dtype(NUMBERS[kind][0]), NUMBERS[kind][1]
+        place += kept.itemsize
+        if place > form.len:
+            return
+        at = offsets + (place - kept.itemsize)
+        bytewise = np.ndarray((len(content) - kept.itemsize + 1,), kept, content, strides=(1,))
+        numbers = bytewise[at]
+        yield name, kind, numbers if divisor == 1.0 else numbers / divisor

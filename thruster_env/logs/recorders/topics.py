@@ -1,0 +1,163 @@
+"""What readers of recorders' files give: topics, whose fields have samples at the same times; and their limits."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.core.extras import to_install
+
+MOST_BYTES = 2**31  # of all arrays that are read at once, and of a file that a package reads whole
+MOST_MEMORY = 3 * MOST_BYTES  # by which a process may grow while a package unpacks a file
+MOST_COLUMNS = 64  # of a field that is an array: pictures and point clouds are no channels
+MOST_FIELDS = 20_000  # of a message
+
+Wanted = Collection[str] | None  # names of columns; None for all
+
+
+class Topic(NamedTuple):
+    """Fields with samples at the same times."""
+
+    name: str  # "actuator_outputs", "actuator_outputs#1"; empty for an array that stands alone
+    times: np.ndarray | None  # (samples,) [s]; None where the file has none for it
+    values: Mapping[str, np.ndarray]  # (samples,) float64 by field: "output[0]"
+    units: Mapping[str, str] = {}  # by field, where the file has them
+    unread: Mapping[str, str] = {}  # why fields are not read; "" for all of the topic
+    damage: str = ""  # what of the file is not read because it is damaged, in words
+    clock: str = ""  # "header" or "receipt" in a bag
+    received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
+    taken: str = ""  # how times without a unit were read, in words
+
+    def column(self, field: str) -> str:
+        """The name of a field's column: TOPIC.FIELD."""
+        return f"{self.name}.{field}" if self.name else field
+
+
+def joined(parts: Sequence[Topic], order: Sequence[np.ndarray] | None = None) -> Topic:
+    """A topic of which a file has several definitions, matched by the names of fields; NaN in rows without one.
+
+    Args:
+        parts: of the same name, all with times.
+        order: of each part, what its rows are sorted by (samples,); None for the times.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    times = np.concatenate([np.empty(0) if one.times is None else one.times for one in parts])
+    rows = np.argsort(times if order is None else np.concatenate(order), kind="stable")
+    values: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    unread, place = dict(parts[0].unread), 0
+    for one in parts:
+        end = place + len(np.empty(0) if one.times is None else one.times)
+        unread |= one.unread
+        for field, numbers in one.values.items():
+            values.setdefault(field, np.full(len(times), np.nan))[place:end] = numbers
+            unit = one.units.get(field, "")
+            if units.setdefault(field, unit) != unit:
+                unread[field] = f"in {units[field] or 'no unit'} and in {unit or 'no unit'}"
+        place = end
+    return Topic(
+        parts[0].name,
+        times[rows],
+        {field: numbers[rows] for field, numbers in values.items() if field not in unread},
+        {field: unit for field, unit in units.items() if unit},
+        unread,
+        " ".join(dict.fromkeys(one.damage for one in parts if one.damage)),
+    )
+
+
+Reader = Callable[[Path, Wanted], Iterator[Topic]]
+
+
+def wants(wanted: Wanted, topic: str) -> bool:
+    """Whether a column of a topic is wanted."""
+    return wanted is None or any(one.startswith(f"{topic}.") for one in wanted)
+
+
+def package(module: str, kind: str, path: Path) -> Any:
+    """A module of the extra `recorders`; ValueError says how to install it."""
+    try:
+        return import_module(module)
+    except ImportError:
+        name = module.partition(".")[0]
+        rule = f"a {kind} must be read by {name}, which is not installed ({to_install('recorders')})"
+        raise ValueError(f"{rule}, but got {path}") from None
+
+
+class Refused(ValueError):
+    """A file is what its name says, but holds what is not read."""
+
+
+def check_bytes(count: int | float, what: str, path: Path) -> None:
+    """Raise Refused for more than MOST_BYTES, before they are read."""
+    if count > MOST_BYTES:
+        raise Refused(f"{what} must be at most {MOST_BYTES:.3g} bytes, but got {count:.3g} ({path})")
+
+
+def unreadable(kind: str, path: Path, why: object) -> ValueError:
+    """The error for a file that is not what its name says."""
+    said = " ".join(str(why).split())
+    return ValueError(f"a {kind} must be one, but {path} is not: {said[:200] or type(why).__name__}")
+
+
+@contextmanager
+def reading(kind: str, path: Path) -> Iterator[None]:
+    """Make one line of whatever packages raise for bytes that are not as they should be: of a dozen kinds."""
+    try:
+        yield
+    except Refused:
+        raise
+    except Exception as error:
+        raise unreadable(kind, path, error) from None
+
+
+@contextmanager
+def bounded(what: str, path: Path) -> Iterator[None]:
+    """Let the process grow by MOST_MEMORY at most, so that what unpacks to more is refused, in one line.
+
+    The limit is the operating system's, on Linux; elsewhere there is none. Nothing may be yielded within.
+    """
+    most = MOST_MEMORY
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except (ImportError, OSError):
+        yield
+        return
+    before = soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = pages * resource.getpagesize() + most
+    if soft == resource.RLIM_INFINITY or limit < soft:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    try:
+        yield
+    except MemoryError:
+        raise Refused(f"{what} must take at most {most:.3g} bytes of memory, but {path} takes more") from None
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Keep packages from printing, also those in C; nothing may be yielded within."""
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        kept = os.dup(2)
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of an array (samples,) or (samples, entries): NAME, or NAME[0], NAME[1] and so on."""
+    if values.ndim == 1:
+        return {name: values.astype(np.float64)}
+    return {f"{name}[{place}]": values[:, place].astype(np.float64) for place in range(values.shape[1])}

@@ -1,0 +1,338 @@
+"""Tables of numbers in files: CSV, Parquet and npz, with errors that name file, line and column."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from errno import EACCES, EISDIR, ENOENT
+from importlib.util import find_spec
+from os import PathLike, strerror
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+
+from thruster_env.core.checks import as_floats, listed, short_repr
+from thruster_env.core.extras import to_install
+from thruster_env.logs.findings import Remark
+from thruster_env.logs.recorders.process import opened
+from thruster_env.logs.recorders.topics import Refused, check_bytes
+from thruster_env.logs.stamps import MISSING as MISSING_TEXT
+from thruster_env.logs.stamps import seconds_of, since_first
+
+# What stands for a missing number, in any case of letters.
+MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
+DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
+DELIMITERS = ",;\t"
+ZIP_END, ZIP_COUNT = 22, 10  # bytes of a zip's last record, and where in it the number of its files stands
+TIME_HEADER = "time_s"  # of an index of dates
+SUFFIXES = (".csv", ".parquet", ".npz")
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The columns of a file; entries that are not numbers are found when a column is requested.
+
+    Attributes:
+        file: its path, for messages.
+        cells: of each column by name: texts, or an array.
+        lines: of the file in which the rows are, counted from 1.
+        line_word: the word for a line.
+        clock: rows whose times make the grid, where that are not all (rows,).
+        damage: what of the file is not read because it is damaged, in words.
+        remarks: findings in the file, by which its rows were made.
+    """
+
+    file: str
+    cells: Mapping[str, Sequence[str] | np.ndarray]
+    lines: Sequence[int]
+    line_word: str = "line"
+    clock: np.ndarray | None = None
+    damage: tuple[str, ...] = ()
+    remarks: Sequence[Remark] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns, in order."""
+        return tuple(self.cells)
+
+    def place(self, row: int, column: str) -> str:
+        """The position of a number, for messages."""
+        return f"{self.line_word} {self.lines[row]}, column {column!r} of {self.file}"
+
+    def numbers(self, column: str) -> np.ndarray:
+        """A column as float64 (rows,), NaN where a number is missing; ValueError for text and infinite numbers."""
+        cells = self.cells[column]
+        if isinstance(cells, np.ndarray):
+            if cells.dtype.kind not in "biufOU" or cells.ndim != 1:
+                raise ValueError(
+                    f"columns must hold numbers, but column {column!r} of {self.file} holds {cells.dtype}"
+                )
+        if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU":
+            found = cells.astype(np.float64)
+        else:
+            texts = _texts(cells)
+            try:
+                found = np.array(texts, dtype=np.float64)
+                if not _is_written("".join(texts)):
+                    raise ValueError
+            except ValueError:
+                row = next(row for row, text in enumerate(texts) if not _is_number(text))
+                rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
+                raise ValueError(
+                    f"{rule}, but got {short_repr(cells[row])} in {self.place(row, column)}"
+                ) from None
+        if np.isinf(found).any():
+            row = int(np.argmax(np.isinf(found)))
+            raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
+        return found
+
+    def dates(self, column: str) -> np.ndarray | None:
+        """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates."""
+        cells = self.cells[column]
+        if isinstance(cells, np.ndarray) and cells.dtype.kind not in "mMOU":
+            return None
+        if isinstance(cells, np.ndarray) and cells.dtype.kind in "mM":
+            return since_first(cells)
+        texts = _texts(cells)
+        if all(map(_is_number, texts)):
+            return None
+        try:
+            found = seconds_of(texts)
+        except ValueError as error:
+            raise ValueError(f"{error} in column {column!r} of {self.file}") from None
+        if found is None:
+            return None
+        for row, text in enumerate(texts):
+            if text != MISSING_TEXT and np.isnan(found[row]):
+                raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.place(row, column)}")
+        return found
+
+
+def _texts(cells: Sequence | np.ndarray) -> list[str]:
+    """Cells as texts, "nan" for what is missing."""
+    texts = [str(cell).strip() for cell in cells]
+    return [MISSING_TEXT if text.lower() in MISSING else text for text in texts]
+
+
+def read_table(path: str | Path) -> Table:
+    """The table in a file that ends in .csv, .parquet or .npz.
+
+    A CSV file is UTF-8 and begins with a line of names; commas, semicolons, tabs or else spaces part the cells. An
+    empty cell, "nan", "NA" or "null" is a missing number. A column without a name, such as an index that pandas
+    writes, is left out. Parquet needs the package pyarrow.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ValueError: if the file is wrong; the message names file, line and column.
+    """
+    if not isinstance(path, (str, PathLike)):
+        raise ValueError(f"a log must be the path of a file, but got {short_repr(path)}")
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        from thruster_env.logs.recorders.registry import ENDINGS  # which knows tables
+
+        endings = ", ".join((*SUFFIXES, *ENDINGS))
+        raise ValueError(f"a log must be a file that ends in {endings}, but got {short_repr(str(path))}")
+    try:
+        return {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}[suffix](Path(path))
+    except OSError as error:
+        raise ValueError(f"a log must be a file that can be read, but {path} is not: {error.strerror}") from None
+
+
+def _read_csv(path: Path) -> Table:
+    check_bytes(path.stat().st_size, "a CSV file", path)
+    try:
+        text = path.read_text(encoding="utf-8-sig").lstrip("\ufeff")  # some programs write the mark twice
+    except UnicodeDecodeError as error:
+        line = 1 + error.object[: error.start].count(b"\n")
+        raise ValueError(
+            f"a CSV file must be text in UTF-8, but {path} is not: {error.reason} in line {line}"
+        ) from None
+    if "\0" in text:  # as in UTF-16, or where a loss of power left a block empty
+        line = 1 + text[: text.index("\0")].count("\n")
+        raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: a zero byte in line {line}")
+    if not text.strip():
+        raise ValueError(f"a log must have a header and rows, but {path} is empty")
+    first = text.lstrip().splitlines()[0]
+    delimiter = max(DELIMITERS, key=first.count)
+    if delimiter not in first and len(first.split()) > 1:
+        numbered = [(line, row.split()) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
+        numbered[0] = (numbered[0][0], first.removeprefix("#").split())
+    else:
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+        try:
+            numbered = [
+                (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
+            ]
+        except csv.Error as error:
+            raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
+    (line, header), *rows = numbered
+    header[0] = header[0].lstrip("#%").strip()  # headers are comments to some programs
+    _check_header(header, line, path)
+    for line, row in rows:
+        if len(row) != len(header):
+            raise ValueError(
+                f"rows must have as many cells as the header, {len(header)}, but got {len(row)} in line {line} of "
+                f"{path}"
+            )
+    if not rows:
+        raise ValueError(f"a log must have a header and rows, but {path} has only a header")
+    columns = list(zip(*(row for _, row in rows), strict=True))
+    named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
+    damage = f"line {rows[-1][0]} of {path}, the last, has no end, its number the fewest digits: it may be cut"
+    is_cut = not text.endswith(("\n", "\r")) and _is_shortest(columns[-1])
+    return Table(str(path), named, [line for line, _ in rows], damage=(damage,) * is_cut)
+
+
+def _is_shortest(cells: Sequence[str]) -> bool:
+    """Whether the last of some numbers has the fewest digits, behind the point where there are points."""
+    some = [cell.lstrip("+-") for cell in cells]
+    if any("." in cell for cell in some):
+        some = [cell.partition(".")[2] for cell in some]
+    *others, last = map(len, some)
+    return last < min(others, default=0)
+
+
+def _check_header(header: Sequence[str], line: int, path: Path) -> None:
+    if all(map(_is_number, header)):
+        raise ValueError(
+            f"the first line must name the columns, but line {line} of {path} has numbers: {short_repr(header)}"
+        )
+    seen = set()
+    for name in header:
+        if name and name in seen:
+            rule = "names of columns must differ from one another"
+            raise ValueError(f"{rule}, but line {line} of {path} has {short_repr(name)} twice")
+        seen.add(name)
+
+
+def _read_parquet(path: Path) -> Table:
+    if find_spec("pyarrow") is None:
+        raise ValueError(
+            f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')}), "
+            f"but got {path}"
+        )
+    if not path.exists():
+        raise FileNotFoundError(ENOENT, strerror(ENOENT))
+    with _damaged("a Parquet file must be one, but {path} is not", path), opened("parquet", path) as file:
+        check_bytes(max(8 * file.told["numbers"], file.told["bytes"]), "what a Parquet file holds", path)
+        names = [str(name) for name in file.told["names"]]
+        _check_header(names, 1, path)
+        cells = {name: file.read(number) for number, name in enumerate(names)}
+    return _of_arrays(path, cells)
+
+
+def _read_npz(path: Path) -> Table:
+    with _damaged("an npz file must hold arrays of numbers by name, but {path} does not", path):
+        cells = dict(_arrays(path))
+    return _of_arrays(path, cells)
+
+
+def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and arrays of an npz file, whose sizes are read before what is in them."""
+    total = 0
+    with ZipFile(path) as archive, path.open("rb") as file:
+        file.seek(-ZIP_END - len(archive.comment), os.SEEK_END)
+        (count,) = struct.unpack_from("<H", file.read(ZIP_END), ZIP_COUNT)
+        if count not in (len(archive.infolist()), 2**16 - 1):  # the package goes by the sizes alone
+            raise ValueError(f"it says that it has {count} arrays, but lists {len(archive.infolist())}")
+        for one in archive.infolist():
+            with archive.open(one) as member:
+                version = np.lib.format.read_magic(member)
+                read_header = np.lib.format.read_array_header_1_0
+                read_header = np.lib.format.read_array_header_2_0 if version == (2, 0) else read_header
+                shape, _, dtype = read_header(member)
+                total += math.prod(shape) * max(dtype.itemsize, 8)
+                check_bytes(total, "what an npz file holds", path)
+                if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > one.file_size:
+                    raise ValueError(f"{one.filename!r} ends within its array")
+            with archive.open(one) as member:
+                values = np.lib.format.read_array(member, allow_pickle=False)
+                if member.read(1):  # of another shape or type than is stated; the check sum is at the end
+                    raise ValueError(f"{one.filename!r} holds more than its array")
+                yield one.filename.removesuffix(".npy"), values
+
+
+@contextmanager
+def _damaged(rule: str, path: Path) -> Iterator[None]:
+    """Make one line of whatever is raised for bytes that are not as they should be, but not for a missing file."""
+    try:
+        yield
+    except Refused:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.strerror and error.errno in (ENOENT, EACCES, EISDIR):
+            raise
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{rule.format(path=path)}: {why}") from None
+
+
+def table_of(given: Any, name: str) -> Table:
+    """A table that is in memory: a mapping from headers to arrays (rows,), or a pandas.DataFrame.
+
+    An index of dates or of time differences is a column of seconds, and one that has a name is a column.
+
+    Raises:
+        ValueError: if it is neither, or its columns are not of equal length.
+    """
+    if hasattr(given, "columns") and hasattr(given, "index"):
+        given = _with_index(given)
+    if not isinstance(given, Mapping) or not all(isinstance(header, str) for header in given):
+        rule = "a log must be the path of a file, a pandas.DataFrame, a mapping from headers to arrays, or a Log"
+        raise ValueError(f"{rule}, but got {short_repr(given)}")
+    return _of_arrays(name, {header: _unmasked(values) for header, values in given.items()})
+
+
+def _unmasked(values: Any) -> np.ndarray:
+    """Values of a column as an array; what a masked array masks is missing."""
+    return as_floats(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+
+
+def _with_index(frame: Any) -> dict:
+    """The columns of a DataFrame as arrays, and its index where that tells something."""
+    columns = {header: frame[header].to_numpy() for header in frame.columns}
+    index = frame.index
+    kind = getattr(index.dtype, "kind", "")
+    if kind in "mM":
+        return {TIME_HEADER: (index - index[0]).total_seconds().to_numpy(), **columns} if len(index) else columns
+    return columns if index.name is None else {index.name: index.to_numpy(), **columns}
+
+
+def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
+    rule = "a log must have columns of equal length with some rows"
+    first = next((name for name, one in cells.items() if one.ndim == 1 and len(one)), None)
+    if first is None:
+        raise ValueError(f"{rule}, but {path} has {listed(cells) or 'none'}")
+    for name, one in cells.items():
+        if one.shape != cells[first].shape:
+            sizes = f"{short_repr(name)} of shape {one.shape} beside {short_repr(first)} of {cells[first].shape}"
+            raise ValueError(f"{rule}, but {path} has {sizes}: leave one out")
+    return Table(str(path), cells, range(1, len(cells[first]) + 1), "row")
+
+
+def _has_comma(text: str) -> bool:
+    """Whether a text is a number with a decimal comma."""
+    return text.count(",") == 1 and _is_number(text.replace(",", "."))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return _is_written(text)
+
+
+def _is_written(text: str) -> bool:
+    """Whether a text that Python takes for a number is one in other languages: no "1_0", and digits of ASCII."""
+    return "_" not in text and text.isascii()

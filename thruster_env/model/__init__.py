@@ -1,0 +1,1 @@
+"""State-space models: Gaussian, affine, of continuous time; truth drawn from them."""

@@ -1,0 +1,195 @@
+"""Affine models x' = A x + B u + a, z = C x + d, and affine approximations of nonlinear ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thruster_env.core.angles import difference
+from thruster_env.core.checks import covariance, vector
+from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import Source, as_value
+from thruster_env.model.layout import starts_of
+from thruster_env.model.shape import constants_are_array, observation_slopes, transition_slopes
+from thruster_env.model.state_space import StateSpaceModel
+
+
+@makes_functions
+def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
+    """Functions of an affine model whose constants c are A, B, a, C, d in this order, matrices by rows."""
+    starts = starts_of(n * n, n * p, n, m * n)  # of A, B, a, C, d
+    sizes = {"x": (n,), "u": (p,), "c": (starts[-1] + m,)}
+    if constants_are_array(starts[-1] + m):
+        del sizes["c"]  # whatever its size, it is an array
+
+    def function(name: str, arguments: str, rows: int, matrices: dict, offset: int) -> Callable:
+        """The sum of products of matrices, by their first places and columns, with vectors, and of the offset."""
+        shapes: dict[str, Any] = {
+            argument: sizes[argument] for argument in arguments.split(", ") if argument in sizes
+        }
+        source = Source(name, arguments, result=(rows,), work=rows * (n + p), **shapes)
+
+        def entry(i):
+            terms = (
+                source.sum(f"c[{i * columns + j + first}] * {vector}[{j}]" for j in source.range(columns))
+                for vector, (first, columns) in matrices.items()
+            )
+            return " + ".join((*terms, f"c[{i + offset}]"))
+
+        return source.function(source.vector(rows, entry))
+
+    def slopes(name: str, arguments: str, rows: int, first: int) -> Callable:
+        shapes: dict[str, Any] = {key: sizes[key] for key in "c" if key in sizes}
+        source = Source(name, arguments, result=(rows, n), **shapes)
+        return source.function(source.matrix(rows, n, lambda i, j: f"c[{i * n + j + first}]"))
+
+    a, b, state_offset, c, measurement_offset = starts
+    return {
+        "transition": function("transition", "x, u, c", n, {"x": (a, n), "u": (b, p)}, state_offset),
+        "observe": function("observe", "x, c", m, {"x": (c, n)}, measurement_offset),
+        "transition_jacobian": slopes("transition_jacobian", "x, u, c", n, a),
+        "observe_jacobian": slopes("observe_jacobian", "x, c", m, c),
+    }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AffineModel(StateSpaceModel):
+    """A `StateSpaceModel` with f(x, u) = A x + B u + a and h(x) = C x + d; make it with `affine_model`."""
+
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """A (n, n), B (n, p), a (n,), C (m, n), d (m,)."""
+        n, m, p = self.n, self.m, self.inputs
+        parts = np.split(np.array(self.constants), np.cumsum([n * n, n * p, n, m * n]))
+        return parts[0].reshape(n, n), parts[1].reshape(n, p), parts[2], parts[3].reshape(m, n), parts[4]
+
+
+def affine_model(
+    *,
+    a,
+    b,
+    c,
+    process_noise_cov,
+    measurement_noise_cov,
+    prior_mean,
+    prior_cov,
+    state_offset=None,
+    measurement_offset=None,
+    states=None,
+    input_quantities=None,
+    measurements=None,
+) -> AffineModel:
+    """Make a model that is linear in state and input, with constant offsets.
+
+        x' = A x + B u + state_offset + w,  w ~ N(0, Q);   z = C x + measurement_offset + v,  v ~ N(0, R)
+
+    Covariances are per step and do not scale with dt.
+
+    Args:
+        a: A, (n, n).
+        b: B, (n, p).
+        c: C, (m, n).
+        process_noise_cov: Q, (n, n) or n variances.
+        measurement_noise_cov: R, (m, m) or m variances.
+        prior_mean: mean of the initial state, (n,).
+        prior_cov: covariance of the initial state, (n, n) or n variances.
+        state_offset: (n,), zero if None.
+        measurement_offset: (m,), zero if None.
+        states: names and units of the states, as `StateSpaceModel` takes them.
+        input_quantities: those of the inputs.
+        measurements: those of the measurements.
+
+    Raises:
+        ValueError: if shapes do not fit.
+    """
+    a, b, c = (np.atleast_2d(np.array(value, dtype=np.float64)) for value in (a, b, c))
+    n, m, p = len(a), len(c), b.shape[1]
+    if a.shape != (n, n) or b.shape != (n, p) or c.shape != (m, n):
+        raise ValueError(
+            f"a, b, c must have shapes (n, n), (n, p), (m, n), but got {a.shape}, {b.shape}, {c.shape}"
+        )
+    offset = vector("state_offset", [0.0] * n if state_offset is None else state_offset, n)
+    shift = vector("measurement_offset", [0.0] * m if measurement_offset is None else measurement_offset, m)
+    prior_mean = vector("prior_mean", prior_mean, n)
+    measurement_noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, m)
+    return AffineModel(
+        **affine_functions(n, m, p),
+        process_noise_cov=process_noise_cov,
+        measurement_noise_cov=measurement_noise_cov,
+        prior_mean=prior_mean,
+        prior_cov=prior_cov,
+        inputs=p,
+        constants=tuple(float(v) for part in (a, b, offset, c, shift) for v in np.ravel(part)),
+        states=states,
+        input_quantities=input_quantities,
+        measurements=measurements,
+    )
+
+
+def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray) -> np.ndarray:
+    """df/du of one application of f, (n, p), by central differences; inputs of zero have the scale 1."""
+    of_inputs, c = np.where(u == 0, 1.0, np.abs(u)), model.given_constants
+    far = stretch(model.n + model.inputs)((*x, *u), (*scales, *of_inputs))
+    columns = np.zeros((model.inputs, model.n))
+    for j, unit in enumerate(np.eye(model.inputs)):
+        h = step_of(float(u[j]), float(of_inputs[j]), far)
+        above, below = (model.functions.transition(x, as_value(u + side * unit), c) for side in (h, -h))
+        columns[j] = difference(np.array(above), np.array(below), model.shape.state_angles) / (2.0 * h)
+    return columns.T
+
+
+def slopes_of_step(
+    model: StateSpaceModel, x: np.ndarray, u: np.ndarray, by_input: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes of a whole step at a state x (n,) and an input u (p,).
+
+    Returns:
+        df/dx (n, n) and df/du (n, p) over all substeps, the latter zero unless asked for; and f(x, u), (n,).
+    """
+    a, b, point = np.eye(model.n), np.zeros((model.n, model.inputs)), as_value(x)
+    scales, v, functions, c = as_value(model.scales), as_value(u), model.functions, model.given_constants
+    slopes = transition_slopes(functions, model.shape)
+    for _ in range(model.substeps):
+        f = np.array(slopes(point, scales, v, c)).reshape(a.shape)
+        a, b = f @ a, f @ b + (_slopes_by_input(model, point, scales, u) if by_input else 0.0)
+        point = functions.transition(point, v, c)
+    return a, b, np.array(point)
+
+
+def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
+    """Linearise a model about a state x* (n,) and an input u* (p,); the offsets are kept.
+
+        x' = f(x*, u*) + A (x - x*) + B (u - u*),   z = h(x*) + C (x - x*)
+
+    with the Jacobians A = df/dx, B = df/du (over all substeps) and C = dh/dx at x*, u*.
+
+    Args:
+        model: the model; an affine one is returned as it is.
+        state: x*, (n,), in the units of the states.
+        control: u*, (p,), in the units of the inputs.
+
+    Returns:
+        The affine model, with the same noise, prior, names and units.
+    """
+    if isinstance(model, AffineModel):
+        return model
+    x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.given_constants
+    a, b, point = slopes_of_step(model, x, u, by_input=True)
+    h = np.array(observation_slopes(model.functions, model.shape)(as_value(x), as_value(model.scales), c))
+    return affine_model(
+        a=a,
+        b=b,
+        c=h,
+        state_offset=point - a @ x - b @ u,
+        measurement_offset=np.array(model.functions.observe(as_value(x), c)) - h @ x,
+        process_noise_cov=model.process_noise_cov,
+        measurement_noise_cov=model.measurement_noise_cov,
+        prior_mean=model.prior_mean,
+        prior_cov=model.prior_cov,
+        **model.quantities._asdict(),
+    ).replace(
+        state_low=model.state_low, state_high=model.state_high, bounds=model.bounds, bounded_by=model.bounded_by
+    )

@@ -1,0 +1,197 @@
+"""`ContinuousModel`: rates of a plant in continuous time, which give a model for any sample time."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+
+from thruster_env.core.checks import at_least, covariance, positive, short_repr, vector
+from thruster_env.core.compiled import inlined
+from thruster_env.core.derivatives import jacobian
+from thruster_env.core.integration import runge_kutta
+from thruster_env.core.pickling import makes_functions
+from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.model.diffusion import densities_of, noise_of_densities
+from thruster_env.model.state_space import StateSpaceModel
+
+ROUNDING = 1e-9  # of a step that is divided
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContinuousModel:
+    """A plant in continuous time with white noise, measured at any times.
+
+        dx/dt = rates(x, u, c) + w(t),  E[w(t) w(s)'] = S delta(t - s);   z = h(x, c) + v,  v ~ N(0, R)
+
+    `rates(x, u, c)` takes and returns tuples, as the functions of a `StateSpaceModel`; the constants c are a
+    NamedTuple with a field `substep`, the length of a Runge-Kutta step [s], which `at` sets.
+
+    Attributes:
+        rates: dx/dt without noise.
+        observe: h, without noise, which returns a tuple; or a function h_i(x, c) of each channel by its symbol,
+            which returns a number: {"position": ..., "depth": ...}.
+        densities: S, (n, n) or n numbers, in the square of each state's unit per second.
+        constants: of rates and h.
+        arguments: the other fields of `StateSpaceModel`: R, prior, quantities, operating point and the like; also
+            `transition` and Jacobians, of a step of `substep`, if they are known.
+        longest: longest Runge-Kutta step that is accurate enough [s].
+
+    Raises:
+        ValueError: for constants without `substep`, or a density that is no covariance.
+
+    Source: van Loan (1978), "Computing integrals involving the matrix exponential", for Q; Sarkka, Solin (2019),
+    Applied Stochastic Differential Equations, section 6.3.
+    """
+
+    rates: Callable
+    observe: Callable | Mapping[str, Callable]
+    densities: Any
+    constants: Any
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    longest: float = math.inf
+
+    def __post_init__(self):
+        """Check what is given; raise ValueError that states the rule and the value."""
+        _check_constants(self.constants)
+        mean = vector("prior_mean", self.arguments.get("prior_mean", ()))
+        object.__setattr__(self, "densities", covariance("densities", self.densities, len(mean)))
+        if isinstance(self.observe, Mapping):
+            channels = self.observe
+            object.__setattr__(self, "observe", _together(tuple(channels.values())))
+            object.__setattr__(self, "arguments", {"measurements": list(channels), **self.arguments})
+
+    @classmethod
+    def of(cls, model: StateSpaceModel, rates: Callable) -> Self:
+        """The continuous plant of a discrete model: its `at(dt)` is the model itself.
+
+        Its densities give the model's Q, and no Runge-Kutta step is longer than the model's.
+
+        Args:
+            model: whose transition is a Runge-Kutta step of `rates`, of the constant `substep`.
+            rates: dx/dt, as the class takes it.
+
+        Raises:
+            ValueError: for a model of other rates, or a Q that no white noise gives.
+        """
+        _check_constants(model.constants)
+        names = {one.name for one in dataclasses.fields(model)}
+        kept = names - {"observe", "constants", "substeps", "process_noise_cov"}
+        given: dict[str, Any] = {
+            "rates": rates,
+            "observe": model.observe,
+            "constants": model.constants,
+            "arguments": {name: getattr(model, name) for name in kept},
+        }
+        constants: Any = model.constants  # a NamedTuple
+        step, n = constants.substep, model.n
+        plain = cls(**given, densities=np.zeros((n, n)), longest=step)
+        x, u = plain.point
+        moved, own = (f(x, u, model.constants) for f in (runge_kutta(rates, n), model.transition))
+        if not np.allclose(moved, own, rtol=1e-9, atol=1e-12):
+            raise ValueError(
+                f"rates must be those of the model, whose step from {short_repr(x)} leads to {short_repr(own)}, "
+                f"but theirs "
+                f"leads to {short_repr(moved)}"
+            )
+        densities = densities_of(model.process_noise_cov, plain.slope, step * model.substeps)
+        return dataclasses.replace(plain, densities=densities)
+
+    def at(self, dt: float, substeps: int | None = None) -> StateSpaceModel:
+        """The model for a sample time [s]: Runge-Kutta in some equal parts, and Q by van Loan.
+
+        The parts are as few as `longest` allows, unless their number is given. A filter on it can be `live`, with
+        `noise=continuous.noise`.
+        """
+        dt = positive("dt", dt)
+        if substeps is None:
+            substeps = max(1, math.ceil(dt / self.longest - ROUNDING))
+        substeps = at_least("substeps", substeps, 1, 10_000)
+        given: dict[str, Any] = {"transition": runge_kutta(self.rates, len(self.densities)), **self.arguments}
+        given["observe"] = self.observe
+        return StateSpaceModel(
+            **given,
+            constants=self.constants._replace(substep=dt / substeps),
+            substeps=substeps,
+            process_noise_cov=self.noise(dt),
+        )
+
+    def noise(self, dt: float) -> np.ndarray:
+        """Q of a step of length dt [s], of the rates linearised at the operating point, or at the prior mean.
+
+        It is that of `thruster_env.model.diffusion.noise_for_dt` with their slope.
+        """
+        return noise_of_densities(self.densities, self.slope, dt)
+
+    @property
+    def point(self) -> tuple[tuple, tuple]:
+        """State and input about which the rates are linearised."""
+        given = self.arguments
+        x, u = given.get("operating_state"), given.get("operating_input")
+        x = np.asarray(given["prior_mean"] if x is None else x, dtype=np.float64)
+        count = given.get("inputs") or len(given.get("input_quantities") or ())
+        u = np.zeros(count) if u is None else np.asarray(u, dtype=np.float64)
+        return tuple(x.tolist()), tuple(u.tolist())
+
+    @property
+    def slope(self) -> np.ndarray:
+        """A, the derivative of the rates by the state, (n, n)."""
+        x, u = self.point
+        slopes = jacobian(self.rates, None, len(x), len(x), "u, c")
+        return np.array(slopes(x, (1.0,) * len(x), u, self.constants))
+
+
+def continuous_of(offer: Any) -> ContinuousModel | None:
+    """An object that is a model in continuous time, or the one it makes without arguments; otherwise None."""
+    if isinstance(offer, ContinuousModel) or not callable(offer) or hasattr(offer, "state_space_model"):
+        return offer if isinstance(offer, ContinuousModel) else None
+    try:
+        found = offer()
+    except Exception:  # whoever needs the model says what is wrong
+        return None
+    return found if isinstance(found, ContinuousModel) else None
+
+
+def in_discrete_time(offer: Any) -> Any:
+    """A function that makes models for a sample time `dt` from a continuous one or its maker; others unchanged."""
+    if continuous_of(offer) is None:
+        return offer
+    return offer.at if isinstance(offer, ContinuousModel) else AtDt(offer)
+
+
+@dataclass(frozen=True)
+class AtDt:
+    """A function that makes models in continuous time, turned into one for a sample time.
+
+    Attributes:
+        make: the function, whose arguments this has, and `dt` [s].
+    """
+
+    make: Callable[..., ContinuousModel]
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """That of the function, with dt."""
+        own = [one for one in inspect.signature(self.make).parameters.values() if one.kind is not one.VAR_KEYWORD]
+        return inspect.Signature([*own, inspect.Parameter("dt", inspect.Parameter.KEYWORD_ONLY)])
+
+    def __call__(self, *, dt: float, **arguments: Any) -> StateSpaceModel:
+        """The model of a sample time."""
+        return self.make(**arguments).at(dt)
+
+
+def _check_constants(constants: Any) -> None:
+    if "substep" not in getattr(constants, "_fields", ()):
+        raise ValueError(f"constants must be a NamedTuple with a field substep, but got {short_repr(constants)}")
+
+
+@makes_functions
+def _together(functions: tuple[Callable, ...]) -> Callable:
+    """`observe(x, c)` of a function h_i(x, c) a channel."""
+    names: dict[str, Any] = {f"h_{i}": inlined(one) for i, one in enumerate(functions)}
+    return written_out("observe", "x, c", tuple_of(f"{name}(x, c)" for name in names), **names)

@@ -1,0 +1,157 @@
+"""Check that a model's functions take and return the declared shapes: one call, as Python, at the prior mean."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from thruster_env.core.checks import as_floats, short_repr
+from thruster_env.core.derivatives import by_complex_step
+from thruster_env.core.modules import said
+from thruster_env.core.python_floats import with_floats
+from thruster_env.core.sources import as_value, is_array
+
+
+def checked_constants(given) -> tuple:
+    """Return constants as a NamedTuple, as it is given, or a tuple of floats; raise ValueError for others."""
+    try:
+        if isinstance(given, (dict, set, str)):
+            raise ValueError
+        values = as_floats(tuple(given))
+        if values.ndim != 1 or not np.isfinite(values).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        rule = "constants must be a NamedTuple or a tuple of finite numbers"
+        raise ValueError(f"{rule}, but got {short_repr(given)}") from None
+    return given if hasattr(given, "_fields") else tuple(values.tolist())
+
+
+def check_functions(model) -> None:
+    """Raise ValueError unless a model's f and h, and their Jacobians if given, have the shapes of its numbers."""
+    n, m = model.n, model.m
+    states, measured = _count(n, "state"), _count(m, "measurement")
+    by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
+    rules = {
+        "transition": ("x, u, c", (n,), f"a tuple{_or_array(n)} of {states}, {by_states}"),
+        "observe": ("x, c", (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
+        "transition_jacobian": ("x, u, c", (n, n), f"{_count(n, 'row')} of {n}, {by_states}"),
+        "observe_jacobian": ("x, c", (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
+    }
+    for name, (arguments, shape, rule) in rules.items():
+        function = getattr(model, name)
+        if function is not None:
+            _check_arguments(name, function, arguments)
+            _check_result(name, function, model, arguments, shape, rule)
+
+
+def _refuse_slopes(name: str, model, arguments: str, found: str) -> None:
+    """Raise ValueError for a Jacobian that is not finite at the prior mean, if its function is."""
+    function = getattr(model, name.removesuffix("_jacobian"))
+    try:
+        with np.errstate(all="ignore"):
+            value = as_floats(function(*_arguments(arguments, model, model.prior_mean)))
+    except (ArithmeticError, ValueError):
+        return
+    if np.isfinite(value).all():
+        raise ValueError(
+            f"{name} must be finite at the prior mean with inputs of zero, as its function is, but got {found}: "
+            "return a limit there, or leave it out"
+        )
+
+
+def _arguments(names: str, model, x: np.ndarray) -> list:
+    given = {
+        "x": as_value(x.tolist()),
+        "u": as_value([0.0] * model.inputs),
+        "c": model.given_constants,
+    }
+    return with_floats(float, [given[name] for name in names.split(", ")])
+
+
+def _check_arguments(name: str, function: Callable, arguments: str) -> None:
+    if not callable(function):
+        raise ValueError(f"{name} must be a function of ({arguments}), but got {short_repr(function)}")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some are written in C
+        return
+    try:
+        signature.bind(*arguments.split(", "))
+    except TypeError:
+        raise ValueError(f"{name} must be a function of ({arguments}), but takes {signature}") from None
+
+
+def _place(function: Callable) -> str:
+    """Where a function stands, in brackets; nothing where it does not tell, as one that is built from a text."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    if code is None or not Path(code.co_filename).is_file():
+        return ""
+    return f" (function {function.__name__}, {Path(code.co_filename).name} line {code.co_firstlineno})"
+
+
+def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
+    for point in (model.prior_mean, model.prior_mean + model.scales):
+        at_mean, slopes = point is model.prior_mean, name.endswith("jacobian")
+        must_be_known = at_mean and not slopes
+        try:
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of a derivative that is lost
+                result = function(*_arguments(arguments, model, point))
+        except ArithmeticError as error:  # machine code has infinity there
+            if at_mean and slopes:
+                _refuse_slopes(name, model, arguments, said(error))
+            continue
+        except Exception as error:
+            if str(error).startswith("math "):  # "math domain error", where machine code has NaN
+                if must_be_known:
+                    raise ValueError(_not_nan(name, str(error))) from None
+                if at_mean:
+                    _refuse_slopes(name, model, arguments, str(error))
+                continue
+            sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
+            where = _place(function)
+            raise ValueError(f"{name}{where} must work for {sizes}, but raised {said(error)}") from error
+        found = _shape(result)
+        if found != shape:
+            raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
+        if must_be_known and np.isnan(as_floats(result)).any():
+            raise ValueError(_not_nan(name, short_repr(result)))
+        if at_mean and slopes and not by_complex_step(function) and not np.isfinite(as_floats(result)).all():
+            _refuse_slopes(name, model, arguments, short_repr(result))
+        return
+
+
+def _not_nan(name: str, said: str) -> str:
+    return f"{name} must not be NaN at the prior mean with inputs of zero, but got {said}"
+
+
+def _shape(result) -> tuple[int, ...] | None:
+    """Shape of a result; None if it is not made of real numbers."""
+    try:
+        return as_floats(result).shape
+    except ValueError:
+        return None
+
+
+def _said(shape: tuple[int, ...] | None, result) -> str:
+    if shape is None or len(shape) > 2:
+        return short_repr(result)
+    if len(shape) == 1:
+        return _count(shape[0], "entry").replace("entrys", "entries")
+    return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {short_repr(result)}"
+
+
+def _form(count: int) -> str:
+    return f" (x is an array of {count} numbers)" if is_array(count) else ""
+
+
+def _or_array(count: int) -> str:
+    return " or array" if is_array(count) else ""
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,154 @@
+"""Quantities of a model: names, symbols and units of states, inputs, measurements and outputs."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from thruster_env.core.characters import verbatim
+from thruster_env.core.checks import short_repr
+
+LONG = 60  # characters of a name that an axis has room for
+
+
+class Quantity(NamedTuple):
+    """One component of a vector.
+
+    Attributes:
+        name: in words, such as "motor speed".
+        symbol: as in equations and file headers, such as "omega_m"; letters, digits, "_" and "-".
+        unit: SI unit, such as "rad/s"; empty for a pure number.
+        angle: whether it is an angle that wraps at 2 pi [rad]: filters and scores wrap its differences to (-pi,
+            pi].
+    """
+
+    name: str
+    symbol: str
+    unit: str = ""
+    angle: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name and unit, for tables."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def short_label(self) -> str:
+        """Symbol and unit, for columns of tables and of files."""
+        return f"{self.symbol} [{self.unit}]" if self.unit else self.symbol
+
+    @property
+    def text_symbol(self) -> str:
+        """The symbol with Greek letters, for pages: omega_m is "ω_m"."""
+        letter, underscore, index = self.symbol.partition("_")
+        return (_greek(letter) or letter) + underscore + index
+
+    @property
+    def plot_label(self) -> str:
+        """Name, symbol and unit, for axes of figures."""
+        symbol = "" if self.symbol == self.name else f" ${_mathtext(self.symbol)}$"
+        return f"{verbatim(self.name, most=LONG)}{symbol}" + (f" [{verbatim(self.unit)}]" if self.unit else "")
+
+
+class Output(NamedTuple):
+    """An output of a model: a quantity y = function(x, c) of the state x and the model's constants c.
+
+    The function uses operators on the components of x only, so that it takes arrays as well as floats.
+    """
+
+    quantity: Quantity
+    function: Callable
+
+
+class Quantities(NamedTuple):
+    """The components of a model's vectors, named as its fields are."""
+
+    states: tuple[Quantity, ...]
+    input_quantities: tuple[Quantity, ...]
+    measurements: tuple[Quantity, ...]
+
+
+def count_of(given: Any) -> int:
+    """The number of components for some quantities or names; one by default."""
+    return len(given) if _are_several(given) else 1
+
+
+def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> tuple[Quantity, ...]:
+    """Make quantities from `Quantity` values, tuples of their fields, or names; letter_1, letter_2, ... if None.
+
+    Args:
+        kind: their kind, for messages: "states".
+        given: a sequence with `count` entries, or None.
+        count: number of components.
+        letter: default symbol of components without names.
+        counted: the argument that defines their number, for messages: "prior_mean".
+
+    Raises:
+        ValueError: if there are not `count` of them, symbols are equal, or a name, symbol, unit or angle is wrong.
+    """
+    if given is None:
+        return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))
+    if not _are_several(given) or len(given) != count:
+        raise ValueError(
+            f"{kind} must be {count} quantities or names, as {counted} says, but got {short_repr(given)}"
+        )
+    found = tuple(_quantity(kind, one) for one in given)
+    symbols = [one.symbol for one in found]
+    if len(set(symbols)) < count:
+        raise ValueError(f"symbols of {kind} must differ from one another, but got {', '.join(symbols)}")
+    return found
+
+
+def _are_several(given: Any) -> bool:
+    return isinstance(given, Sequence) and not isinstance(given, str)
+
+
+def _quantity(kind: str, given) -> Quantity:
+    try:
+        made = Quantity(given, given.replace(" ", "_")) if isinstance(given, str) else Quantity(*given)
+    except TypeError:
+        made = None
+    if made is None or not _is_valid(made):
+        rule = f"each of {kind} must be a name, or have name, symbol (letters, digits, _ and -), unit and angle"
+        raise ValueError(f"{rule}, and an angle the unit rad, but got {short_repr(given)}")
+    return made
+
+
+def _is_valid(one: Quantity) -> bool:
+    texts = all(isinstance(text, str) for text in one[:3]) and isinstance(one.angle, bool)
+    plain = texts and one.symbol.replace("_", "").replace("-", "").isalnum()
+    return plain and (not one.angle or one.unit == "rad")
+
+
+def outputs(given: Mapping[str, Output | Sequence]) -> dict[str, Output]:
+    """Outputs by symbol, each an `Output` or (quantity, function); ValueError states the rule and the value."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"outputs must map symbols to quantities and functions, but got {short_repr(given)}")
+    found = {}
+    for symbol, one in given.items():
+        if not isinstance(one, Sequence) or len(one) != 2 or not callable(one[1]):
+            raise ValueError(f"the output {symbol!r} must be a quantity and a function, but got {short_repr(one)}")
+        found[symbol] = Output(_quantity(f"outputs, {symbol}", one[0]), one[1])
+    return found
+
+
+_GREEK = {
+    *("alpha", "beta", "gamma", "delta", "epsilon", "theta", "kappa", "lambda", "mu", "nu", "xi", "rho", "sigma"),
+    *("tau", "phi", "chi", "psi", "omega", "eta", "zeta"),
+}
+
+
+def _greek(name: str) -> str | None:
+    """The Greek letter of a name such as "omega" or "Omega"; None if it is none."""
+    if name.lower() not in _GREEK:
+        return None
+    size = "CAPITAL" if name[0].isupper() else "SMALL"
+    return unicodedata.lookup(f"GREEK {size} LETTER {name.upper().replace('LAMBDA', 'LAMDA')}")
+
+
+def _mathtext(symbol: str) -> str:
+    """A symbol as matplotlib reads it, Greek letters by name."""
+    letter, *indices = symbol.split("_")
+    letter = f"\\{letter}" if letter.lower() in _GREEK else letter if len(letter) == 1 else f"\\mathrm{{{letter}}}"
+    return letter + (f"_{{{','.join(indices)}}}" if indices else "")

@@ -1,0 +1,147 @@
+"""Simulation of a model: states and measurements of many trajectories with the model's own noise."""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.core.checks import as_floats
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
+from thruster_env.core.tuples import vector_reader, vector_writer
+from thruster_env.model.layout import constants_reader, number_places, padded
+from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.state_space import StateSpaceModel
+
+
+class Truth(NamedTuple):
+    """True states and measurements of B trajectories over K steps.
+
+    Attributes:
+        states: (B, K + 1, n), in the units of the states.
+        measurements: (B, K + 1, m), in the units of the measurements.
+    """
+
+    states: np.ndarray
+    measurements: np.ndarray
+
+
+@inlined
+def add_correlated(out, numbers, root, count, draws):
+    """Out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
+    for i in range(count):
+        for k in range(i + 1):
+            out[i] += numbers[root + i * count + k] * draws[k]
+
+
+@cache
+def noise_step(n: int, m: int):
+    """Function disturb(x, draws, step, key, numbers), which adds a step's process noise to an array x (n,)."""
+    q_root = number_places(n, m).q_root
+
+    @inlined
+    def disturb(x, draws, step, key_0, key_1, numbers):
+        fill_normals(draws, n, step, PROCESS, key_0, key_1)
+        add_correlated(x, numbers, q_root, n, draws)
+
+    return disturb
+
+
+@lru_cache(maxsize=64)
+def truth_steps(functions: Functions, shape: Shape):
+    """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
+
+    They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
+    """
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    source = number_places(n, m)
+    prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
+    r_root, disturb = source.r_root, noise_step(n, m)
+    state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
+    control, constants = vector_reader(shape.inputs), constants_reader(shape)
+
+    @inlined
+    def begin(x, draws, key_0, key_1, numbers):
+        fill_normals(draws, n, 0, INITIAL, key_0, key_1)
+        for i in range(n):
+            x[i] = numbers[prior_mean + i]
+        add_correlated(x, numbers, prior_root, n, draws)
+
+    @inlined
+    def advance(x, u, draws, step, key_0, key_1, numbers):
+        v, c = control(u), constants(numbers)
+        for _ in range(int(numbers[substeps])):
+            store_state(x, transition(state(x), v, c))
+        disturb(x, draws, step, key_0, key_1, numbers)
+
+    @inlined
+    def measure(z, x, draws, step, key_0, key_1, numbers):
+        store_measurement(z, observe(state(x), constants(numbers)))
+        fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
+        add_correlated(z, numbers, r_root, m, draws)
+
+    return begin, advance, measure
+
+
+def truth_steps_of(model: StateSpaceModel):
+    """`truth_steps` for a model."""
+    return truth_steps(model.functions, model.shape)
+
+
+@lru_cache(maxsize=64)
+def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
+    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
+    room = padded(max(n, m), GROUP)
+
+    def simulate(keys, inputs, numbers, states, measurements):
+        fingerprint  # noqa: B018 - part of the cache's key
+        x, z, u, draws = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), np.zeros(room)
+        for b in range(keys.shape[0]):
+            key_0, key_1 = keys[b, 0], keys[b, 1]
+            begin(x, draws, key_0, key_1, numbers)
+            for k in range(states.shape[1]):
+                if k > 0:
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k - 1, i]
+                    advance(x, u, draws, k, key_0, key_1, numbers)
+                measure(z, x, draws, k, key_0, key_1, numbers)
+                for i in range(n):
+                    states[b, k, i] = x[i]
+                for i in range(m):
+                    measurements[b, k, i] = z[i]
+
+    return CompiledOrPython(simulate)
+
+
+def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:
+    """Simulate a model with its own noise, one trajectory for every key.
+
+        x_{k+1} = f(x_k, u_k) + w_k,  w_k ~ N(0, Q);   z_k = h(x_k) + v_k,  v_k ~ N(0, R);   x_0 ~ N(mean, cov)
+
+    The same keys give the same noise as in the plant, so that an exact model gives the plant's trajectories.
+    Angles are not wrapped: filters and errors (`thruster_env.core.angles.difference`) wrap them.
+
+    Args:
+        model: the model, with Q, R and the prior.
+        keys: random keys, one per trajectory, (B, 2).
+        inputs: u, (B, K, p), in the units of the inputs.
+
+    Returns:
+        `Truth`: states (B, K + 1, n) and measurements (B, K + 1, m).
+
+    Raises:
+        ValueError: if shapes do not fit.
+    """
+    inputs, keys = (np.ascontiguousarray(as_floats(a)) for a in (inputs, keys))
+    if inputs.ndim != 3 or inputs.shape[2] != model.inputs or keys.shape != (len(inputs), 2):
+        raise ValueError(
+            f"keys and inputs must have shapes (B, 2) and (B, K, {model.inputs}), "
+            f"but got {keys.shape} and {inputs.shape}"
+        )
+    count, steps, _ = inputs.shape
+    truth = Truth(np.empty((count, steps + 1, model.n)), np.empty((count, steps + 1, model.m)))
+    run = _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting())
+    run(keys, inputs, model.numbers, truth.states, truth.measurements)
+    return truth

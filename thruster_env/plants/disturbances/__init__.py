@@ -1,1 +1,0 @@
-"""Disturbances of any plant: effects as frozen values, sensor effects and recorded series."""

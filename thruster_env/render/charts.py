@@ -1,0 +1,152 @@
+"""Strip charts of the last steps, one below the other, with their legend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.render.axis import Axis, fitting_axis
+from thruster_env.render.canvas import (
+    BAND,
+    ESTIMATE,
+    FAINT,
+    INK,
+    MEASURED,
+    PANEL,
+    REFERENCE,
+    SIGMAS,
+    SIZE,
+    WHITE,
+    Canvas,
+    number,
+    with_band,
+)
+from thruster_env.render.history import STEPS, newest
+
+LEFT, RIGHT = 44, 486  # of the strip charts [px]
+DASH = 6  # steps in a dash of the reference
+
+
+class Strip(NamedTuple):
+    """One strip chart."""
+
+    name: str  # of the truth in the history
+    title: str
+    digits: int  # shown after the point
+    top: float  # [px]
+    height: float  # [px]
+    scale: float  # full scale, in the unit of the quantity
+    measured: str | None = None
+    reference: str | None = None
+    says_numbers: bool = True  # the newest ones, above the chart
+    downward: bool = False  # as depths are
+
+
+class Charts:
+    """Strip charts and their legend, in the lower part of the picture."""
+
+    def __init__(self, canvas: Canvas, strips: tuple[Strip, ...], *, top: float, dt: float):
+        """Draw what never moves.
+
+        Args:
+            canvas: to draw on.
+            strips: the charts, from above.
+            top: where the panel that holds them begins [px].
+            dt: sample time [s].
+        """
+        self._canvas = canvas
+        self._span = dt * STEPS
+        self._strips = strips
+        canvas.box(0, top, SIZE[0], SIZE[1] - top, PANEL)
+        canvas.box(0, top, SIZE[0], 1, (186, 200, 210))
+        for strip in self._strips:
+            canvas.box(LEFT, strip.top, RIGHT - LEFT, strip.height, WHITE)
+            for fifth in range(6):
+                canvas.box(LEFT + (RIGHT - LEFT) * fifth / 5 - 0.5, strip.top, 1, strip.height, FAINT)
+
+    def draw(self, columns: dict[str, np.ndarray], last: int, label: str) -> list[Axis]:
+        """Draw columns whose last entry is step number `last`; the axes of the charts.
+
+        A label names the filter in the legend; "" if there is none.
+        """
+        axes = [self._draw_strip(columns, strip, last) for strip in self._strips]
+        self._draw_legend(columns, label)
+        for fifth in range(6):
+            text = f"\u2212{self._span * (5 - fifth) / 5:.3g} s" if fifth < 5 else "now"
+            x = LEFT + (RIGHT - LEFT) * fifth / 5
+            self._canvas.text(text, (x, 391), 10, align=0.5)
+        return axes
+
+    def _draw_strip(self, columns, strip: Strip, last: int) -> Axis:
+        canvas, count = self._canvas, len(columns[strip.name])
+        x = RIGHT - np.arange(count)[::-1] * (RIGHT - LEFT) / STEPS
+        estimate, std = columns[f"estimated_{strip.name}"], columns[f"estimated_{strip.name}_std"]
+        others = [columns[name] for name in (strip.measured, strip.reference) if name]
+        values = np.concatenate((columns[strip.name], estimate, *others))
+        axis = fitting_axis(values, strip.scale, strip.top + 2, strip.height - 4)._replace(downward=strip.downward)
+
+        def line(values, colour, width):
+            for run in _runs(np.isfinite(values)):
+                canvas.lines(np.stack((x[run], axis.y(values[run])), axis=-1), colour, width)
+
+        canvas.clip(LEFT, strip.top, RIGHT - LEFT, strip.height)
+        low, high = axis.y(estimate - SIGMAS * std), axis.y(estimate + SIGMAS * std)
+        for run in _runs(np.isfinite(low)):
+            outline = np.concatenate((low[run], high[run][::-1]))
+            canvas.polygon(np.stack((np.concatenate((x[run], x[run][::-1])), outline), axis=-1), BAND)
+        canvas.box(LEFT, axis.y(0.0) - 0.5, RIGHT - LEFT, 1, (170, 182, 192))
+        if strip.measured:
+            dots = np.stack((x, axis.y(columns[strip.measured])), axis=-1)
+            canvas.dots(dots[np.isfinite(dots[:, 1])], 1.1, MEASURED)
+        if strip.reference:
+            dashes = np.arange(last - count + 1, last + 1) // DASH % 2 == 0
+            line(np.where(dashes, columns[strip.reference], np.nan), REFERENCE, 1.5)
+        line(estimate, ESTIMATE, 3)
+        line(columns[strip.name], INK, 1.25)  # thin on thick: both are seen where they agree
+        canvas.clip()
+        axis.label(canvas, LEFT - 5)
+        self._write(columns, strip)
+        return axis
+
+    def _write(self, columns, strip: Strip) -> None:
+        """The title and the newest numbers; the first chart has the legend in their place."""
+        write, x, y = self._canvas.text, RIGHT, strip.top - 9
+        write(strip.title, (LEFT, y), 11, INK)
+        if not strip.says_numbers:
+            return
+        estimate = newest(columns, f"estimated_{strip.name}")
+        if np.isfinite(estimate):
+            std = newest(columns, f"estimated_{strip.name}_std")
+            x -= write(with_band(estimate, std, strip.digits), (x, y), 11, ESTIMATE, 1.0) + 14
+        write(number(columns[strip.name][-1], strip.digits), (x, y), 11, INK, 1.0)
+
+    def _draw_legend(self, columns, label: str) -> None:
+        canvas, x, y = self._canvas, RIGHT, self._strips[0].top - 9
+        entries = [("truth", INK), ("measured", MEASURED)]
+        references = [strip.reference for strip in self._strips if strip.reference]
+        if any(np.isfinite(columns[name]).any() for name in references):
+            entries.append(("reference", REFERENCE))
+        if label:
+            entries.append((f"{label} \u00b1 {SIGMAS}\u03c3", ESTIMATE))
+        for text, colour in reversed(entries):
+            x -= canvas.text(text, (x, y), 11, colour, 1.0) + 5
+            if colour == MEASURED:
+                canvas.disc((x - 4, y), 2.5, colour)
+                x += 8
+            elif colour == REFERENCE:
+                canvas.box(x - 16, y - 0.75, 6, 1.5, colour)
+                canvas.box(x - 7, y - 0.75, 6, 1.5, colour)
+            else:
+                if colour == ESTIMATE:
+                    canvas.box(x - 16, y - 4, 16, 8, BAND)
+                thickness = 1.25 if colour == INK else 3
+                canvas.box(x - 16, y - thickness / 2, 16, thickness, colour)
+            x -= 28
+
+
+def _runs(drawn: np.ndarray) -> Iterator[slice]:
+    """Stretches of a boolean array that are true."""
+    edges = np.flatnonzero(np.diff(np.concatenate(((False,), drawn, (False,)))))
+    return (slice(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True))

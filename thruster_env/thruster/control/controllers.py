@@ -1,0 +1,182 @@
+"""Classical controllers as policies: PI with feed-forward on the measured thrust, LQR on the true state.
+
+Both know the plant's nominal parameters. Both have Stable-Baselines3's `predict(observation, state, episode_start,
+deterministic) -> (action, state)`, for one observation (d,) or one of each env (n, d). Actions are voltages [V],
+(1,) or (n, 1). A controller's memory is `state`, (k,) or (n, k): pass None at first, then the state that the last
+call returned. Rows where `episode_start` is true forget. (Where a vector env resets on the next step, an episode
+starts one step after the last one was done.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thruster_env.core.checks import finite
+from thruster_env.env.remembered import remembered
+from thruster_env.thruster.control.gains import lambda_gains, quadratic_gain
+from thruster_env.thruster.linear.operating import OperatingPoints, operating_points, slopes, thrust_of
+from thruster_env.thruster.plant import Plant
+
+
+@dataclass(frozen=True, eq=False)
+class PIController:
+    """Follow a reference thrust by the measured one.
+
+        V_k = V*(r_{k+1}) + K_p e_k + I_k,    cut off at the voltage range
+        e_k = r_k - z_k,                      I_{k+1} = I_k + K_i dt e_k
+
+    V*(r) is the voltage whose steady thrust is r, or the last one within the range: feed-forward. The measurement
+    z_k is compared with the reference of its own time (with r_1 at the start), because a step of the reference to
+    which the thrust cannot have responded yet is not an error. With both gains zero the controller is feed-forward
+    alone.
+
+    Against windup the integral is clamped: it stands still while the voltage is cut off and the error drives it
+    further out. Source: K. J. Astrom, L. Rundqwist (1989), "Integrator windup and how to avoid it", American
+    Control Conference, 1693-1698 (conditional integration).
+
+    A missing measurement is taken as the env repeats it.
+    """
+
+    plant: Plant
+    points: OperatingPoints
+    proportional_gain: float  # K_p [V/N]
+    integral_gain: float  # K_i [V/(N s)]
+    thrust_entry: int = 0  # of the observation: the measured thrust
+    reference: float | None = None  # [N]; None where the observation ends with it
+
+    @classmethod
+    def for_env(
+        cls,
+        env,
+        proportional_gain: float | None = None,
+        integral_gain: float | None = None,
+        operating_voltage: float | None = None,
+        time_constant: float | None = None,
+    ) -> PIController:
+        """A controller for a bow thruster env or vector env that shows its measurement and takes volts.
+
+        Args:
+            env: the env, wrapped or not.
+            proportional_gain: K_p [V/N]; that of `lambda_gains` if None.
+            integral_gain: K_i [V/(N s)]; that of `lambda_gains` if None.
+            operating_voltage: where `lambda_gains` linearises [V].
+            time_constant: closed-loop time constant for `lambda_gains` [s].
+
+        Raises:
+            ValueError: if the env does not measure its thrust, an argument is wrong, or the rule finds no gains.
+        """
+        plant = env.unwrapped.plant
+        if "thrust" not in plant.channels:
+            raise ValueError(f"sensors must include the thrust, but the env has {', '.join(plant.channels)}")
+        if proportional_gain is None or integral_gain is None:
+            found = lambda_gains(plant, operating_voltage, time_constant)
+            proportional_gain = found[0] if proportional_gain is None else proportional_gain
+            integral_gain = found[1] if integral_gain is None else integral_gain
+        return cls(
+            plant,
+            operating_points(plant),
+            finite("proportional_gain", proportional_gain),
+            finite("integral_gain", integral_gain),
+            plant.channels.index("thrust"),
+            constant_reference(env),
+        )
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Voltage (..., 1) for an observation (..., d), and state (..., 2): I_{k+1} [V] and r_{k+1} [N]."""
+        observation, reference = read(observation, self.reference)
+        at_start = np.stack([np.zeros_like(reference), reference], axis=-1)
+        integral, present_reference = np.moveaxis(remembered(state, episode_start, at_start), -1, 0)
+        error = present_reference - observation[..., self.thrust_entry]
+        steady = self.points.interpolate(self.points.voltage, reference)
+        wanted = steady + self.proportional_gain * error + integral
+        voltage = np.clip(wanted, -self.plant.max_voltage, self.plant.max_voltage)
+        change = self.integral_gain * self.plant.dt * error
+        integral = integral + np.where(change * (wanted - voltage) > 0, 0.0, change)
+        return voltage[..., None].astype(np.float32), np.stack([integral, reference], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class LQRController:
+    """Follow a reference thrust by the true state, with the feedback that is optimal for the reward.
+
+        V_k = V* - K_T (T(x_k) - r) - K_U (U_a - U_a*) - K_V (V_{k-1} - V*),    cut off at the voltage range
+
+    V* and U_a* belong to the steady state whose thrust is the reference r_{k+1}, or to the last one within the
+    range; K is the gain of `gains.quadratic_gain` there. So the gain changes with the reference (gain scheduling).
+    The last voltage is in it because the reward counts its change.
+
+    The deviation of the motor speed is written as one of the thrust. With dT = C_omega domega_m + C_U dU_a the
+    feedback K_1 domega_m + K_2 dU_a is K_T dT + K_U dU_a, where K_T = K_1/C_omega and K_U = K_2 - K_T C_U, to
+    first order. But thrust is quadratic in the state: far from the operating point C dx is wrong, and T(x) - r is
+    not. (On `tunnel`, whose flow lags far behind, the three tasks cost 0.4 to 0.6 of their cost with domega_m.)
+
+    There is no integral: where the thruster is not the nominal one, an error stays. Observations begin with
+    omega_m and U_a, true (see `thruster_env.env.observe.ObserveState`) or estimated.
+    """
+
+    plant: Plant
+    points: OperatingPoints
+    gains: np.ndarray  # (3, n): K_T [V/N], K_U [V s/m] and K_V [-] of every point
+    reference: float | None = None  # [N]; None where the observation ends with it
+
+    @classmethod
+    def for_env(cls, env) -> LQRController:
+        """A controller for a bow thruster env or vector env, from its plant and the weights of its reward.
+
+        Raises:
+            ValueError: if `quadratic_gain` finds no gain.
+        """
+        plant, task = env.unwrapped.plant, env.unwrapped.task
+        points = operating_points(plant)
+        by_speed, by_flow, by_voltage = np.array([quadratic_gain(plant, task, v) for v in points.voltage]).T
+        of_speed, of_flow = np.array([slopes(plant, v)[2][0] for v in points.voltage]).T
+        by_thrust = by_speed / of_speed
+        gains = np.stack([by_thrust, by_flow - by_thrust * of_flow, by_voltage])
+        return cls(plant, points, gains, constant_reference(env))
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Voltage (..., 1) for an observation (..., d), and state (..., 1): the same voltage, V_k [V].
+
+        Raises ValueError for an observation that is too short to hold the state.
+        """
+        observation, reference = read(observation, self.reference)
+        states = read_state(observation, self.reference)
+        last_voltage = remembered(state, episode_start, np.zeros((*reference.shape, 1)))[..., 0]
+        thrust, voltage, flow = (self.points.interpolate(values, reference) for values in self.points)
+        by_thrust, by_flow, by_voltage = (self.points.interpolate(gain, reference) for gain in self.gains)
+        wanted = (
+            voltage
+            - by_thrust * (thrust_of(self.plant, states) - thrust)
+            - by_flow * (states[..., 1] - flow)
+            - by_voltage * (last_voltage - voltage)
+        )
+        voltage = np.clip(wanted, -self.plant.max_voltage, self.plant.max_voltage)[..., None]
+        return voltage.astype(np.float32), voltage
+
+
+def constant_reference(env) -> float | None:
+    """The reference [N] of an env that does not observe it; None if it does."""
+    base = env.unwrapped
+    if getattr(base, "single_env", base).observes_reference:
+        return None
+    return float(base.task.reference[0].thrust)
+
+
+def read(observation, reference: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Observation (..., d) in float64 and the reference (...) [N]."""
+    observation = np.asarray(observation, dtype=np.float64)
+    if reference is None:
+        return observation, observation[..., -1]
+    return observation, np.full(observation.shape[:-1], reference)
+
+
+def read_state(observation: np.ndarray, reference: float | None) -> np.ndarray:
+    """The state (..., 2) that an observation (..., d) begins with; ValueError if it is too short to hold one."""
+    if observation.shape[-1] < 2 + (reference is None):
+        rule = "an observation must begin with the state"
+        raise ValueError(
+            f"{rule}, but has {observation.shape[-1]} entries: see thruster_env.env.observe.ObserveState"
+        )
+    return observation[..., :2]

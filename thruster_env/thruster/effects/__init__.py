@@ -1,0 +1,1 @@
+"""Disturbances of a thruster: amplifier, ambient flow, reference signals and uncertain parameters."""

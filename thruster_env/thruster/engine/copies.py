@@ -1,0 +1,56 @@
+"""Many copies of a thruster, stepped in place by envs and by `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from thruster_env.core.checks import options as checked_options
+from thruster_env.core.compiled import CompiledOrPython
+from thruster_env.core.memory import set_row
+from thruster_env.env.copies import PlantCopies
+from thruster_env.thruster.effects.uncertainty import drawn_parameters
+from thruster_env.thruster.engine.encoding import encode, is_plain, known_effects
+from thruster_env.thruster.engine.memory import COMMAND, CONSTANT_COUNT, FIXED_ROWS, REPORTED
+from thruster_env.thruster.engine.step import advance, advance_in_parts
+from thruster_env.thruster.parameters import derive_constants
+from thruster_env.thruster.plant import Plant
+from thruster_env.thruster.plant import state as checked_state
+from thruster_env.thruster.task import Task
+
+
+class Copies(PlantCopies):
+    """N copies of a thruster with a task; rows of their reports are in `thruster_env.thruster.engine.memory`."""
+
+    commands, reported = (COMMAND,), REPORTED
+
+    def __init__(self, plant: Plant, task: Task, count: int):
+        """Allocate the memory of `count` copies; `begin` comes next."""
+        self.plant, self.task = plant, task
+        numbers, self._extra_rows = encode(plant, task)
+        super().__init__(count, numbers, FIXED_ROWS + self._extra_rows)
+
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
+        """The compiled step of this plant and task."""
+        effects = known_effects(self.plant, self.task), is_plain(self.plant, self.task)
+        return advance(*effects), advance_in_parts(*effects)
+
+    def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
+        """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
+        given = checked_options(options).get("state")
+        if given is None:
+            return None
+        state = checked_state("the state of options", given)
+        return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
+
+    def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
+        """Draw uncertain parameters for episodes with keys (count, 2)."""
+        plant = self.plant
+        if not plant.uncertainty:
+            return
+        parameters = drawn_parameters(plant.parameters, plant.uncertainty, keys)
+        constants = derive_constants(parameters, plant.ambient_velocity, plant.dt / plant.substeps)
+        first = FIXED_ROWS + self._extra_rows - CONSTANT_COUNT
+        for i, values in enumerate(constants):
+            set_row(memory, first + i, np.broadcast_to(values, len(keys)))

@@ -1,0 +1,92 @@
+"""The linear bow thrusters that the papers print, as data.
+
+Two papers print the same two linear models, "tunnel" and "open-bladed", beside the nonlinear equations and the
+parameters that `dynamics` and `parameters` hold. They are no linearisation of those. For small deviations from
+an operating point the equations give
+
+    A_11 = -K1 - K_h dQ/d omega_m    A_12 = -K_h dQ/dU_a    B_11 = K2
+    A_21 = C_1/K3                    A_22 = C_2/K3 - B_22   B_22 = 2 (K4/K3) |U_a - U_0|
+
+with C = (dT/d omega_m, dT/dU_a). So A_11, A_12 and C fix the four slopes of thrust and torque. In every state
+(omega_m, U_a), for any area and pair of angles, at least one slope of the model has the opposite sign.
+
+Other open questions of the print:
+
+- Open-bladed: A_22 = -0.13 contradicts C_2/K3 - B_22 = -10.4/4 - 2.73 = -5.33, with which the system would be
+  stable. That it is unstable is therefore a slip of the print. (The tunnel's own numbers agree:
+  -12.2/0.954 - 1.9 = -14.7 beside -14.8.)
+- Tunnel: -C A^-1 B is -4.8 N/V, so its thrust falls as the voltage grows, and A_21 < 0
+  makes the water flow against the propeller.
+- Open-bladed: its eigenvalue 3.1872 is printed "31872", and its characteristic polynomial has 528.83 where
+  the trace gives 523.83.
+- Open-bladed: B_11 = 0.65 here; Nurhadi et al. print 0.065, but the printed B_d follows from 0.65 only.
+- The tunnel's C serves as measurement matrix in both cases of the papers' runs: see
+  `tuning.experiments.published`.
+
+Sources: M. Kiki (2020), final project KM184801, Institut Teknologi Sepuluh Nopember, Surabaya (in Indonesian);
+H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), IJECE 12(6), 5988-5997,
+doi:10.11591/ijece.v12i6.pp5988-5997.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+SAMPLE_TIME = 0.01  # [s], of the printed zero-order hold
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+class PublishedLinearModel(NamedTuple):
+    """dx/dt = A x + B u, T = C x for x = (omega_m [rad/s], U_a [m/s]), u = (V_s [V], U_0 [m/s]), T in N.
+
+    Matrices are rows of floats. A_d and B_d are the zero-order hold as printed, with four decimals.
+    """
+
+    a: Rows  # A (2, 2)
+    b: Rows  # B (2, 2)
+    c: Rows  # C (1, 2)
+    printed_a_d: Rows  # A_d (2, 2) at SAMPLE_TIME
+    printed_b_d: Rows  # B_d (2, 2)
+    presets: tuple[str, ...]  # presets of the same thruster, beside which the model can be shown
+    source: str
+    remark: str  # what a reader must know of the print
+
+
+SOURCE = "Kiki (2020); Nurhadi et al. (2022), IJECE 12(6), 5988-5997"
+
+PUBLISHED: dict[str, PublishedLinearModel] = {
+    "tunnel": PublishedLinearModel(
+        a=((-70.7, 1.2), (-2.1, -14.8)),
+        b=((1133.2, 0.0), (0.0, 1.9)),
+        c=((-2.03, -12.2),),
+        printed_a_d=((0.4930, 0.0079), (-0.0139, 0.8623)),
+        printed_b_d=((8.1241, 0.0001), (-0.0905, 0.0177)),
+        presets=("tunnel", "tunnel_physical"),
+        source=SOURCE,
+        remark="Its A, B and C agree with one another, but its thrust falls as the voltage grows.",
+    ),
+    "open_bladed": PublishedLinearModel(
+        a=((-523.7, -1519.8), (-1.15, -0.13)),
+        b=((0.65, 0.0), (0.0, 2.73)),
+        c=((-4.62, -10.4),),
+        printed_a_d=((0.0116, -2.9445), (-0.0022, 1.0260)),
+        printed_b_d=((0.0013, -0.0647), (0.0, 0.0276)),
+        presets=("open_bladed", "open_bladed_corrected"),
+        source=SOURCE,
+        remark="Its A_22 of -0.13 contradicts its B and C, which give -5.33: that it is unstable is a slip.",
+    ),
+}
+
+NO_LINEARISATION = (
+    "The published matrices are kept as data. They are not a linearisation of the equations printed beside "
+    "them, in which at least one slope of thrust or torque has the opposite sign in every state."
+)
+
+
+def published_for(preset: str) -> tuple[str, PublishedLinearModel] | None:
+    """Name and model of the published linear thruster of a preset, or None if there is none."""
+    for name, model in PUBLISHED.items():
+        if preset in model.presets:
+            return name, model
+    return None

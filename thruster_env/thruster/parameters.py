@@ -1,0 +1,264 @@
+"""Thruster parameters with units and sources, checked at construction, and the presets by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.core.checks import between, meant, one_of, positive, short_repr, within
+from thruster_env.thruster.dynamics import Constants
+
+LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
+ANGLES = ("as-printed", "rotor-plane", "shaft-axis")
+
+
+class ThrusterParameters(NamedTuple):
+    """The parameters of Healey's two-state thruster model.
+
+    `angles` says how the attack angle alpha and the direction theta of the thrust axis follow from the
+    inflow angle phi = arctan2(U_a, U_p) and the blade angle p:
+
+    - "as-printed": alpha = (pi/2 - p) - phi, theta = p - alpha. The pair of the papers; its force components
+      are axial and tangential only for p = pi/4.
+    - "rotor-plane": alpha = p - phi, theta = phi.
+    - "shaft-axis": alpha = (pi/2 - p) - phi, theta = phi.
+
+    `thrust_asymmetry` e is ours: the thrust is multiplied by 1 + e cos(phi), so at the bollard by 1 + e ahead and
+    by 1 - e astern, the torque by nothing. The papers' thruster is symmetric.
+    """
+
+    lift_coefficient: float  # C_Lmax [-]
+    drag_coefficient: float  # C_Dmax [-]
+    motor_damping: float  # K1 [1/s]
+    voltage_gain: float  # K2 [rad/(s^2 V)]
+    load_gain: float  # K_h [1/(kg m^2)]
+    added_mass: float  # K3 = rho A L gamma [kg]
+    momentum_drag: float  # K4 = rho A dbeta [kg/m]
+    area: float  # A [m^2]
+    diameter: float  # D [m]
+    gear_ratio: float  # N, motor turns for one turn of the propeller [-]
+    density: float  # rho [kg/m^3]
+    blade_angle: float  # p [rad]
+    angles: str = "as-printed"
+    thrust_asymmetry: float = 0.0  # e [-]
+
+
+def checked(parameters: ThrusterParameters) -> ThrusterParameters:
+    """Return the parameters as floats; raise ValueError that names the rule and the value if one is off."""
+    values: dict[str, Any] = {}
+    for name, value in parameters._asdict().items():
+        if name == "angles":
+            values[name] = one_of("angles", value, ANGLES)
+        elif name in ("drag_coefficient", "load_gain", "momentum_drag"):
+            values[name] = within(name, positive(name, value, zero_allowed=True), LARGEST)
+        elif name == "blade_angle":
+            values[name] = within(name, value, LARGEST)
+        elif name == "thrust_asymmetry":
+            values[name] = within(name, value, 0.9)
+        else:
+            values[name] = between(name, positive(name, value), 1.0 / LARGEST, LARGEST)
+    return ThrusterParameters(**values)
+
+
+TUNNEL = ThrusterParameters(
+    lift_coefficient=1.75,
+    drag_coefficient=1.2,
+    motor_damping=70.15,
+    voltage_gain=1133.2,
+    load_gain=17.79,
+    added_mass=0.954,
+    momentum_drag=0.910,
+    area=0.00445,
+    diameter=0.0762,
+    gear_ratio=2.0,
+    density=998.0,
+    blade_angle=math.pi / 6,
+)
+"""The tunnel table as printed by Nurhadi et al. (2022), its K_h and area included."""
+
+OPEN_BLADED = ThrusterParameters(
+    lift_coefficient=2.0,
+    drag_coefficient=0.5,
+    motor_damping=10.8,
+    voltage_gain=0.65,
+    load_gain=8333.0,
+    added_mass=4.0,
+    momentum_drag=30.0,
+    area=0.00445,
+    diameter=0.15,
+    gear_ratio=2.0,
+    density=998.0,
+    blade_angle=math.pi / 4,
+)
+"""The open-bladed table as printed. With K2 = 0.65 in volts it hardly turns: 0.06 rad/s a volt."""
+
+TUNNEL_PHYSICAL = TUNNEL._replace(
+    load_gain=17790.0,
+    area=math.pi * 0.0762**2 / 4,
+    angles="rotor-plane",
+)
+"""The tunnel table with three corrections; everything else as printed.
+
+- K_h = 17 790. The print's 17.790 is most likely that number with a dot as thousands separator: J = 1/K_h is then
+  5.6e-5 kg m^2, the inertia of a small motor. With a thousand times more inertia, as printed, the motor would
+  hardly notice the propeller's torque.
+- A = pi D^2/4 = 0.00456 m^2. With this area rho A L gamma and rho A dbeta are the printed K3 and K4; with the
+  printed 0.00445 m^2 they are 0.931 kg and 0.888 kg/m.
+- Rotor-plane angles. Thrust and torque are the axial and tangential parts of the forces only if theta is the
+  inflow angle, which the printed pair gives for p = pi/4 alone. The bollard K_T = T/(rho n^2 D^4) is 1.55 with the
+  printed pair, 1.27 with the shaft-axis pair and 0.22 with this one; measured small thrusters have 0.18 to 0.46.
+"""
+
+OPEN_BLADED_CORRECTED = OPEN_BLADED._replace(voltage_gain=650.0, area=math.pi * 0.15**2 / 4)
+"""The open-bladed table with two corrections; everything else as printed.
+
+- A = pi D^2/4 = 0.01767 m^2. With this area rho A L gamma and rho A dbeta are the printed K3 and K4; with the
+  printed 0.00445 m^2 they are 1.00 kg and 7.55 kg/m.
+- K2 = 650. The papers used 0.65, with which a volt turns the motor at 0.06 rad/s. That their V_s is in millivolts
+  is an inference.
+
+The angles need no correction: for p = pi/4 the three pairs are one. Corrected, but not physical: the bollard K_T
+of 2.1 is about five times that of any measured thruster.
+"""
+
+T200 = ThrusterParameters(
+    lift_coefficient=0.3943,
+    drag_coefficient=0.2062,
+    motor_damping=47.68,
+    voltage_gain=2386.0,
+    load_gain=20000.0,
+    added_mass=0.4363,
+    momentum_drag=6.791,
+    area=math.pi * 0.076**2 / 4,
+    diameter=0.076,
+    gear_ratio=1.0,
+    density=998.0,
+    blade_angle=math.pi / 6,
+    angles="rotor-plane",
+    thrust_asymmetry=0.1603,
+)
+"""A Blue Robotics T200, identified from its static bollard table by `tuning/experiments/t200_identification.py`.
+
+Source: Blue Robotics, "T200 Public Performance Data 10-20V September 2019"; 14 and 18 V held out.
+
+Identified: C_Lmax, C_Dmax, e, K1, K2. Inferred, because a static table cannot tell:
+
+- K_h = 1/J with J = 5e-5 kg m^2 for rotor, propeller and the water that turns along. The table fixes only ratios
+  of K1, K2 and K_h, so the motor's time constant goes with J.
+- K3 = rho A (L + 1.22 R) = 0.436 kg: the water in a nozzle of L = 0.05 m and at its two open ends. With these two
+  the poles are at -65 and -128 1/s at full throttle ahead from 10 V, and at -82 and -171 1/s from 20 V.
+- K4 = 1.5 rho A: between a duct that the jet leaves at full width (1) and an open propeller (2).
+- p = pi/6, as in the tunnel. C_Lmax, C_Dmax and e hold together with this p and this K4.
+- C_Dmax sets the torque, which is read off the current: a motor without friction, torque K1/K2 times current.
+
+Asymmetry: with e = 0.160 the bollard K_T is 0.424 ahead and 0.338 astern; the table's medians are 0.429 and 0.335,
+its ranges 0.40 to 0.46 and 0.31 to 0.37. The torque is not scaled by e, yet 5 % larger astern: less thrust draws
+less flow, which makes the attack angle larger. By the table's current it is 2 % smaller. At one |V_s| the model
+turns 1.4 % slower astern. With 13 V and an ambient flow above 3.4 m/s its jet takes more power than the shaft has.
+
+Errors above a quarter of full speed, medians of fitted / held-out voltages: thrust from measured speed 2.2 / 2.7 %
+ahead and 2.8 / 2.9 % astern; thrust from pulse width and supply 2.7 / 2.6 % ahead and 2.4 / 2.0 % astern; current
+from measured speed 3.3 / 2.7 % ahead and 4.3 / 3.9 % astern. Nine rows in ten are within 10 %. At 20 V and full
+throttle the model has too little thrust: 8 % ahead and 3 % astern, at the measured speed 8 and 10 %.
+
+V_s is what reaches the motor: 8.3 V at full throttle from 10 V, 13.3 V from 20 V
+(`tuning.experiments.t200_identification` has the map from pulse width). `max_voltage` should thus be 13 V; the
+thrust of 140 N at 24 V is extrapolated.
+"""
+
+PRESETS: dict[str, ThrusterParameters] = {
+    "tunnel": TUNNEL,
+    "open_bladed": OPEN_BLADED,
+    "tunnel_physical": TUNNEL_PHYSICAL,
+    "open_bladed_corrected": OPEN_BLADED_CORRECTED,
+    "t200": T200,
+}
+
+
+LARGEST_VOLTAGE = {
+    "t200": 13.3
+}  # [V], that the data behind a preset reach; of the others plant.DEFAULT_MAX_VOLTAGE
+
+
+def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
+    """Parameters from a preset's name, a preset FILE.toml, a mapping of all fields, or parameters.
+
+    Raises ValueError for others. See `preset_and_dead_band` for other entries of a file.
+    """
+    return preset_and_dead_band(preset)[0]
+
+
+def preset_and_dead_band(preset) -> tuple[ThrusterParameters, tuple[float, float]]:
+    """Parameters as `preset_parameters`, and the dead band (low, high) [V] that a file or a mapping may have."""
+    from thruster_env.thruster.preset_file import checked_band, is_file, read_preset
+
+    if is_file(preset):
+        return read_preset(preset)[:2]
+    if isinstance(preset, Mapping) and "dead_band" in preset:
+        rest = {name: value for name, value in preset.items() if name != "dead_band"}
+        return _parameters(rest), checked_band(preset["dead_band"])
+    return _parameters(preset), (0.0, 0.0)
+
+
+def _parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
+    if isinstance(preset, ThrusterParameters):
+        return checked(preset)
+    if isinstance(preset, Mapping):
+        try:
+            return checked(ThrusterParameters(**preset))
+        except TypeError as error:
+            names = ", ".join(ThrusterParameters._fields)
+            raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
+    if not isinstance(preset, str) or preset not in PRESETS:
+        names = ", ".join(PRESETS)
+        rule = f"preset must be one of {names}, or a file that ends in .toml"
+        raise ValueError(f"{rule}, but got {short_repr(preset)}{meant(preset, PRESETS)}")
+    return PRESETS[preset]
+
+
+def derive_constants(p: ThrusterParameters, ambient_velocity: float = 0.0, substep: float = 0.0) -> Constants:
+    """Constants of the equations of motion for parameters, a flow U_0 [m/s] and a time step [s].
+
+    The parameters may be arrays of one shape, for many thrusters at once; so then are the constants.
+    """
+    attack = p.blade_angle if p.angles == "rotor-plane" else math.pi / 2 - p.blade_angle  # at zero inflow
+    turn = 2 * p.blade_angle - math.pi / 2 if p.angles == "as-printed" else 0.0 * p.blade_angle  # theta - phi
+    arm = 0.7 * p.diameter / 2
+    pressure = 0.5 * p.density * p.area  # over V^2
+    # Polynomials in (U_p, U_a), as factors of U_p^2, U_p U_a, U_a^2 or of U_p, U_a.
+    lift = _scaled(
+        pressure * p.lift_coefficient, (np.sin(2 * attack), -2 * np.cos(2 * attack), -np.sin(2 * attack))
+    )
+    drag = _scaled(
+        pressure * p.drag_coefficient, (1 - np.cos(2 * attack), -2 * np.sin(2 * attack), 1 + np.cos(2 * attack))
+    )
+    along, across = (np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))  # V cos(theta), V sin(theta)
+    blade_speed = arm / p.gear_ratio
+    thrust = zip(_product(lift, along), _product(drag, across), strict=True)
+    torque = zip(_product(lift, across), _product(drag, along), strict=True)
+    values = (
+        p.motor_damping,
+        p.voltage_gain,
+        p.load_gain,
+        1.0 / p.added_mass,
+        p.momentum_drag / p.added_mass,
+        blade_speed,
+        p.thrust_asymmetry,
+        *((a - b) * blade_speed**power for power, (a, b) in zip((3, 2, 1, 0), thrust, strict=True)),
+        *((a + b) * blade_speed**power * arm for power, (a, b) in zip((3, 2, 1, 0), torque, strict=True)),
+        ambient_velocity,
+        substep,
+    )
+    return Constants(*(value if np.ndim(value) else float(value) for value in values))
+
+
+def _scaled(factor, polynomial) -> tuple:
+    return tuple(factor * a for a in polynomial)
+
+
+def _product(quadratic, linear) -> tuple:
+    (a, b, c), (d, e) = quadratic, linear
+    return a * d, a * e + b * d, b * e + c * d, c * e

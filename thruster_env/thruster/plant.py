@@ -1,0 +1,213 @@
+"""The noisy plant from plain arguments: a thruster, its noise, sensors and disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.core.checks import (
+    at_least,
+    between,
+    covariance,
+    finite,
+    one_of,
+    positive,
+    short_repr,
+    vector,
+    within,
+)
+from thruster_env.effects.effects import Effect, dropping_channels
+from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
+from thruster_env.thruster.dynamics import Constants
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, dead_band_of
+from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
+from thruster_env.thruster.linear.analysis import LinearModel
+from thruster_env.thruster.linear.steady_state import required_substeps_of_all, steady_state
+from thruster_env.thruster.parameters import (
+    LARGEST_VOLTAGE,
+    ThrusterParameters,
+    derive_constants,
+    preset_and_dead_band,
+)
+from thruster_env.thruster.preset_file import is_file, read_preset
+
+DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
+DEFAULT_MAX_VOLTAGE = 24.0  # [V]
+# Tunnel, signal to noise: w drives motor and flow by 0.5 % of their values at 12 V each step (in stationarity
+# 1.15 rad/s and 0.035 m/s at 12 V); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
+DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
+DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"].variance  # [N^2]
+# Beyond these limits there is no ship, and floating point may overflow.
+SAMPLE_TIMES = (1e-9, 10.0)  # [s]
+VOLTAGES = (1e-3, 1e6)  # [V]
+FASTEST_FLOW = 1e3  # [m/s]
+LARGEST_STATE = 1e50  # [rad/s], [m/s]; its square of a variance
+DEFAULT_INITIAL_VARIANCES = (1.0, 0.01)  # about rest, [(rad/s)^2, (m/s)^2]
+
+
+class Plant(NamedTuple):
+    """A thruster with its noise, sampled every dt seconds; `make_plant` makes one from plain arguments."""
+
+    parameters: ThrusterParameters
+    dt: float  # [s]
+    max_voltage: float  # [V]
+    ambient_velocity: float  # [m/s]
+    substeps: int  # Runge-Kutta steps a sample time
+    process_noise_cov: np.ndarray  # (2, 2), a step
+    measurement_noise_cov: np.ndarray  # (m, m)
+    initial_mean: np.ndarray  # (2,)
+    initial_cov: np.ndarray  # (2, 2)
+    sensors: dict[str, tuple[Effect, ...]]  # effects by channel; the m channels in their order
+    flow: tuple[Effect, ...] = ()
+    amplifier: tuple[Effect, ...] = ()
+    uncertainty: dict[str, Uniform | LogNormal] = {}
+    linear: LinearModel | None = None  # moves the plant in place of the equations of motion
+    dead_band: tuple[float, float] = (0.0, 0.0)  # of a preset file [V], the first of `amplifier`; models have it
+
+    @property
+    def constants(self) -> Constants:
+        """Constants of the equations of motion, for one Runge-Kutta step."""
+        return derive_constants(self.parameters, self.ambient_velocity, self.dt / self.substeps)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the measured quantities, in order."""
+        return tuple(self.sensors)
+
+    @property
+    def dropping_channels(self) -> tuple[int, ...]:
+        """Numbers of the channels whose measurements may be missing."""
+        return dropping_channels(self.sensors)
+
+
+def largest_known_voltage(preset) -> float:
+    """The voltage up to which a preset is known [V]: what the logs of an identified one reached, or its data."""
+    if is_file(preset):
+        return float(read_preset(preset).identified.get("largest_voltage", DEFAULT_MAX_VOLTAGE))
+    return LARGEST_VOLTAGE.get(preset, DEFAULT_MAX_VOLTAGE) if isinstance(preset, str) else DEFAULT_MAX_VOLTAGE
+
+
+def make_plant(
+    preset: str | Mapping | ThrusterParameters = "tunnel",
+    dt: float = DEFAULT_DT,
+    max_voltage: float = DEFAULT_MAX_VOLTAGE,
+    ambient_velocity: float = 0.0,
+    process_noise_cov=DEFAULT_PROCESS_NOISE,
+    measurement_noise_cov=None,
+    initial_state=None,
+    sensors=None,
+    flow=None,
+    amplifier=None,
+    uncertainty=None,
+    substeps: int | None = None,
+) -> Plant:
+    """Make a plant from plain arguments, the same ones that the env takes.
+
+    Args:
+        preset: a preset's name, a preset FILE.toml, a mapping of all fields of `ThrusterParameters`, or one of
+            these; a file or a mapping may have a dead band, too.
+        dt: sample time [s]. Covariances are per step and do not scale with dt.
+        max_voltage: voltages are clipped to plus and minus this [V].
+        ambient_velocity: flow U_0 along the thruster's axis [m/s].
+        process_noise_cov: Q, covariance (2, 2) or two variances per step [(rad/s)^2, (m/s)^2]; zero allowed.
+        measurement_noise_cov: R, covariance (m, m) or m variances, in the channels' units squared; zero allowed.
+            None for the defaults of `channels.CHANNELS`.
+        initial_state: None for N(0, diag(1, 0.01)), a fixed state [omega_m, U_a], or a mapping:
+            {"voltage": V} for the steady state of V volts, {"mean": [..], "cov": [..]} for a distribution.
+        sensors: None for the thrust alone, a list of channels of `channels.CHANNELS`, or a mapping from
+            channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
+        flow: signals of `flow.FLOW_SIGNALS` that add to ambient_velocity.
+        amplifier: effects of `amplifier.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
+        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `linear.ONE_STEP_ACCURACY`.
+        uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
+
+    Raises:
+        ValueError: if an argument is wrong; the message states the rule and the value.
+    """
+    parameters, dead_band = preset_and_dead_band(preset)
+    dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
+    max_voltage = between("max_voltage", positive("max_voltage", max_voltage), *VOLTAGES, "V")
+    ambient_velocity = within("ambient_velocity", ambient_velocity, FASTEST_FLOW)
+    mean, cov = _initial_distribution(initial_state, parameters, ambient_velocity)
+    sensors = _sensors(sensors)
+    if "current" in sensors and parameters.load_gain == 0:
+        raise ValueError("load_gain must be positive for a motor current to follow from it, but got 0.0")
+    if measurement_noise_cov is None:
+        measurement_noise_cov = [CHANNELS[channel].variance for channel in sensors]
+    uncertainty = make_uncertainty(uncertainty)
+    corners = extreme_parameters(parameters, uncertainty)
+    flow = FLOW_SIGNALS.make(flow)
+    swing = sum(signal.largest() for signal in flow)
+    flows = {ambient_velocity - swing, ambient_velocity + swing}  # between which the integration has to do
+    if substeps is None:
+        cases = tuple((corner, u_0) for corner in corners for u_0 in flows)
+        substeps = required_substeps_of_all(cases, dt, max_voltage)
+    else:
+        substeps = at_least("substeps", substeps, 1, 10_000)
+    return Plant(
+        parameters,
+        dt,
+        max_voltage,
+        ambient_velocity,
+        substeps,
+        covariance("process_noise_cov", process_noise_cov, 2, largest=LARGEST_STATE**2),
+        covariance("measurement_noise_cov", measurement_noise_cov, len(sensors), largest=LARGEST_STATE**2),
+        mean,
+        cov,
+        sensors,
+        flow,
+        (*dead_band_of(*dead_band), *AMPLIFIER_EFFECTS.make(amplifier)),
+        uncertainty,
+        dead_band=dead_band,
+    )
+
+
+def _sensors(given) -> dict[str, tuple[Effect, ...]]:
+    if given is None:
+        given = ("thrust",)
+    if not isinstance(given, Mapping):
+        if isinstance(given, str) or not hasattr(given, "__iter__"):
+            raise ValueError(
+                f"sensors must be a list of channels or a mapping from them, but got {short_repr(given)}"
+            )
+        names = list(given)
+        given = {name: () for name in names if isinstance(name, str)}
+        if len(given) != len(names):
+            raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
+    if not given:
+        raise ValueError("sensors must name at least one channel, but got none")
+    if len(given) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
+    return {
+        one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
+        for channel, effects in given.items()
+    }
+
+
+def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[np.ndarray, np.ndarray]:
+    if initial_state is None:
+        return np.zeros(2), np.diag(DEFAULT_INITIAL_VARIANCES)
+    if not isinstance(initial_state, Mapping):
+        return state("initial_state", initial_state), np.zeros((2, 2))
+    if set(initial_state) == {"voltage"}:
+        voltage = finite("the voltage of initial_state", initial_state["voltage"])
+        return np.array(steady_state(parameters, voltage, ambient_velocity)[:2]), np.zeros((2, 2))
+    if set(initial_state) == {"mean", "cov"}:
+        mean = state("the mean of initial_state", initial_state["mean"])
+        return mean, covariance("the cov of initial_state", initial_state["cov"], 2, largest=LARGEST_STATE**2)
+    raise ValueError(
+        "initial_state must be None, two numbers, {'voltage': V} or {'mean': [..], 'cov': [..]}, "
+        f"but got {short_repr(initial_state)}"
+    )
+
+
+def state(name: str, value) -> np.ndarray:
+    """Return a state (2,); raise ValueError unless it is two numbers from which finite ones can follow."""
+    given = vector(name, value, 2)
+    if np.abs(given).max() > LARGEST_STATE:
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
+    return given

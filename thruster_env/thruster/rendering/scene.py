@@ -1,0 +1,173 @@
+"""The upper half of the picture: the hull cut through at the thruster, and the propeller seen from port.
+
+One looks forward, port on the left. The motor stands above the tunnel and turns the propeller through a
+right-angle gear. Positive flow goes to starboard and pushes the ship to port. This is a scheme, not to scale.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from thruster_env.render.canvas import INK, SIZE, SOFT_INK, Canvas, number
+from thruster_env.thruster.rendering.history import Moment
+from thruster_env.thruster.rendering.propeller import end_view, side_view
+
+HEIGHT = 186  # [px]
+MIDDLE = 250  # the ship's centre line [px]
+WATER, DECK, KEEL = 50, 30, 180  # [px]
+AXIS, TUNNEL_RADIUS = 114, 33  # of the tunnel [px]
+LEG = MIDDLE + 12  # where the leg carries the pod [px]
+PROPELLER = MIDDLE - 18  # the propeller's plane [px]
+PROPELLER_RADIUS = TUNNEL_RADIUS - 3
+PORTHOLE, PORTHOLE_RADIUS = (572, 88), 52
+
+SKY, SEA_TOP, SEA_BOTTOM = (241, 246, 249), (214, 231, 240), (172, 204, 221)
+TUNNEL_WATER, ROOM, SHELL = (226, 240, 247), (250, 247, 240), (84, 99, 114)
+FLOW, AMBIENT, FORCE = (22, 108, 140), (112, 158, 180), (176, 66, 52)
+STEEL, DARK_STEEL, MOTOR = (150, 162, 173), (98, 111, 124), (86, 124, 110)
+MARK = (255, 214, 90)
+
+ARROW_HEIGHT = 22  # of the outer arrows above and below the axis [px]
+IN_TUNNEL, OUTSIDE, AMBIENT_LENGTH, FORCE_LENGTH = 76, 100, 80, 130  # arrows at full scale [px]
+
+
+class Scene:
+    """Hull, tunnel, propeller and arrows."""
+
+    def __init__(
+        self, canvas: Canvas, *, diameter: float, gear_ratio: float, thrust_scale: float, flow_scale: float
+    ):
+        """Draw what never moves onto the canvas, and the blades into tables; scales are for arrows [m, N, m/s]."""
+        self._canvas = canvas
+        self._diameter = diameter
+        self._gear_ratio = gear_ratio
+        self._thrust_scale = thrust_scale
+        self._flow_scale = flow_scale
+        self._side = side_view(PROPELLER_RADIUS)
+        self._end = end_view(PORTHOLE_RADIUS - 4)
+        self._draw_sea()
+        self._draw_hull()
+        self._draw_machinery()
+        self._draw_porthole()
+
+    def draw(self, moment: Moment, start: float, end: float) -> None:
+        """Draw what moves at a moment, the propeller blurred from one angle [rad] to another."""
+        part = _limited(moment.U_a / self._flow_scale)
+        ambient = _limited(moment.ambient_velocity / self._flow_scale)
+        push = _limited(-moment.thrust / self._thrust_scale)  # water driven to starboard pushes the ship to port
+        for height in (-ARROW_HEIGHT, ARROW_HEIGHT):  # the machinery is between them
+            for side in (-64, 64):
+                self._level_arrow(MIDDLE + side, AXIS + height, IN_TUNNEL * part, 4, FLOW)
+        for height in (-ARROW_HEIGHT, 0, ARROW_HEIGHT):
+            self._draw_jet(height, part)
+        if ambient:
+            self._level_arrow(70, HEIGHT - 14, AMBIENT_LENGTH * ambient, 3.5, AMBIENT)
+        self._level_arrow(MIDDLE, 14, FORCE_LENGTH * push, 5.5, FORCE)
+        self._draw_swept_angle(start, end)
+        self._canvas.picture(self._side.mean(start, end), (PROPELLER, AXIS))
+        self._canvas.picture(self._end.mean(start, end), PORTHOLE)
+        self._write(moment)
+
+    def _write(self, moment: Moment) -> None:
+        write, (x, y) = self._canvas.text, PORTHOLE
+        write("propeller from port", (x, 15), 11, SOFT_INK, 0.5)
+        write(number(moment.omega_m / self._gear_ratio * 30 / math.pi, 0) + " rpm", (x, y + 74), 15, INK, 0.5)
+        write(f"\u00d8 {1000 * self._diameter:.0f} mm", (x, HEIGHT - 8), 10, SOFT_INK, 0.5)
+        write("port", (12, WATER + 12))
+        write("starboard", (SIZE[0] - 152, WATER + 12), align=1.0)
+        write("push on the ship", (MIDDLE + 84, 14), 11, FORCE)
+        write(f"{number(moment.time, 2)} s", (12, 14), 13, INK)
+        if moment.ambient_velocity:
+            write(f"ambient {number(moment.ambient_velocity, 2)} m/s", (12, HEIGHT - 28))
+
+    def _draw_sea(self) -> None:
+        canvas = self._canvas
+        canvas.box(0, 0, SIZE[0], WATER, SKY)
+        for y in range(WATER, HEIGHT):
+            depth = (y - WATER) / (HEIGHT - WATER)
+            canvas.box(0, y, SIZE[0], 1, [a + depth * (b - a) for a, b in zip(SEA_TOP, SEA_BOTTOM, strict=True)])
+        canvas.box(0, WATER - 0.75, SIZE[0], 1.5, (132, 176, 199))
+
+    def _draw_hull(self) -> None:
+        canvas = self._canvas
+        canvas.polygon(_section(DECK - 8, KEEL, 0), SHELL)
+        canvas.polygon(_section(DECK - 9, DECK, 2.5), SKY)  # between the bulwarks
+        canvas.polygon(_section(DECK + 3, KEEL - 3.5, 3.5), ROOM)
+        for y in (AXIS - TUNNEL_RADIUS - 26, KEEL - 14):  # stringers
+            for side in (-1, 1):
+                shell = float(_half_breadth(y)) - 3
+                canvas.lines([(MIDDLE + side * shell, y), (MIDDLE + side * (shell - 16), y)], (205, 203, 195), 1.5)
+        top, bottom = AXIS - TUNNEL_RADIUS, AXIS + TUNNEL_RADIUS
+        canvas.polygon(_section(top - 3, bottom + 3, 0), SHELL)
+        canvas.polygon(_section(top, bottom, -0.5), TUNNEL_WATER)
+        edge = _section(top, bottom, 0)
+        for mouth in (edge[: len(edge) // 2], edge[len(edge) // 2 :]):  # the hull behind the cut
+            canvas.lines(mouth, (150, 176, 192), 1)
+
+    def _draw_porthole(self) -> None:
+        canvas = self._canvas
+        canvas.disc(PORTHOLE, PORTHOLE_RADIUS + 6, SHELL)
+        canvas.disc(PORTHOLE, PORTHOLE_RADIUS - 1, TUNNEL_WATER)
+        x, y = PORTHOLE
+        canvas.box(x - 6, y - PORTHOLE_RADIUS + 1, 12, PORTHOLE_RADIUS, STEEL)  # the leg, behind the propeller
+
+    def _draw_machinery(self) -> None:
+        """Motor, leg and pod."""
+        canvas, top = self._canvas, AXIS - TUNNEL_RADIUS
+        canvas.polygon([(LEG - 7, top), (LEG + 7, top), (LEG + 5, AXIS), (LEG - 5, AXIS)], STEEL)
+        canvas.box(PROPELLER, AXIS - 9, 66, 18, DARK_STEEL, 9)
+        canvas.box(PROPELLER + 6, AXIS - 6, 50, 5, STEEL, 2.5)
+        canvas.box(LEG - 16, top - 6, 32, 5, DARK_STEEL, 1)
+        canvas.box(LEG - 5, top - 12, 10, 7, STEEL)
+        canvas.box(LEG - 15, DECK + 9, 30, top - DECK - 21, MOTOR, 3)
+        for x in range(LEG - 10, LEG + 11, 5):  # cooling ribs
+            canvas.box(x - 0.75, DECK + 13, 1.5, top - DECK - 29, (64, 98, 86))
+
+    def _draw_swept_angle(self, start: float, end: float) -> None:
+        """A mark on the rim goes round with one blade; its tail is the angle turned since the last frame."""
+        x, y = PORTHOLE
+        radius = PORTHOLE_RADIUS + 2.5
+        swept = max(-2 * math.pi, min(2 * math.pi, end - start))
+        count = max(2, math.ceil(abs(swept) / 0.05))
+        angles = end - np.linspace(swept, 0.0, count + 1)
+        points = np.stack((x + radius * np.sin(angles), y - radius * np.cos(angles)), axis=-1)
+        for k in range(count):
+            fade = (k + 1) / count
+            colour = [a + fade * (b - a) for a, b in zip(SHELL, MARK, strict=True)]
+            self._canvas.lines(points[k : k + 2], colour, 3)
+        self._canvas.disc(points[-1], 3, MARK)
+
+    def _level_arrow(self, x: float, y: float, length: float, width: float, colour) -> None:
+        self._canvas.arrow((x - length / 2, y), (x + length / 2, y), width, colour)
+
+    def _draw_jet(self, height: float, part: float) -> None:
+        """Water drawn in from all around on one side leaves as a jet on the other."""
+        forward = -1 if part < 0 else 1
+        mouth = float(_half_breadth(AXIS + height)) + 14
+        for side, slope, length in ((-forward, 0.45, 0.6), (forward, 0.1, 1.0)):
+            rise = slope * height / ARROW_HEIGHT
+            near = np.array((MIDDLE + side * mouth, AXIS + height))
+            away = np.array((side, rise)) / math.hypot(1, rise)
+            far = near + away * OUTSIDE * length * abs(part)
+            tail, tip = (near, far) if side == forward else (far, near)
+            self._canvas.arrow(tail, tip, 4, FLOW)
+
+
+def _half_breadth(y):
+    """Half the breadth of the hull at a height of the picture [px]."""
+    return 26 + 130 * np.clip((KEEL - np.asarray(y)) / (KEEL - DECK), 0, None) ** 0.55
+
+
+def _section(top: float, bottom: float, inset: float) -> np.ndarray:
+    """The hull between two heights, `inset` pixels inside its skin, as a polygon (n, 2)."""
+    y = np.linspace(top, bottom, 60)
+    breadth = _half_breadth(y) - inset
+    left, right = np.stack((MIDDLE - breadth, y), axis=-1), np.stack((MIDDLE + breadth, y), axis=-1)
+    return np.concatenate((left, right[::-1]))
+
+
+def _limited(part: float) -> float:
+    """A part of full scale within plus and minus 1.15; zero if it is not a number."""
+    return max(-1.15, min(1.15, part)) if math.isfinite(part) else 0.0

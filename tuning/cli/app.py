@@ -1,0 +1,144 @@
+"""The sub-commands of `thruster`, put together; a command's own module is imported when it is called."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from collections.abc import MutableMapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+from tuning.cli.printing import printed_whole
+
+PANELS = {
+    "First steps": ("demo", "inspect", "simulate", "filters", "new"),
+    "Tune and evaluate a filter": ("tune", "explore", "ways", "evaluate", "report", "verify", "export", "compare"),
+    "Recorded logs": ("log", "identify", "estimate"),
+    "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
+    "Published results and long studies": ("reproduce", "study"),
+}
+COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
+MARKUP: Final = "markdown"
+LOADING = "loading ..."
+
+
+class Command(TyperCommand):
+    """A command whose help Ctrl-C does not cut."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """Print the help."""
+        with printed_whole():
+            super().format_help(ctx, formatter)
+
+
+class Group(TyperGroup):
+    """A group of commands whose help Ctrl-C does not cut."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """Print the help."""
+        with printed_whole():
+            super().format_help(ctx, formatter)
+
+
+class Commands(Group):
+    """The group of commands, each of the module of its name: a `command`, or an `app` of further ones."""
+
+    _listing = False
+
+    def list_commands(self, ctx) -> list[str]:
+        """Names in the order of the help."""
+        return list(COMMANDS)
+
+    @property
+    def commands(self) -> MutableMapping[str, Any]:
+        """All commands by name, as they are listed."""
+        return {name: listed(name) for name in COMMANDS}
+
+    @commands.setter
+    def commands(self, given: MutableMapping[str, Any]) -> None:
+        self._made = given
+
+    def format_help(self, ctx, formatter) -> None:
+        """List the commands without importing them, which takes a second."""
+        self._listing = True
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._listing = False
+
+    def get_command(self, ctx, name: str):
+        """The command of a name, None if there is none."""
+        if name not in COMMANDS:
+            return None
+        if self._listing:
+            return listed(name)
+        if name not in self._made:
+            module = imported(f"tuning.cli.{file_of(name)}")
+            alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
+            if hasattr(module, "app"):
+                alone = module.app
+            else:
+                alone.command(name, cls=Command)(module.command)
+            self._made[name] = get_command(alone)
+            self._made[name].name = name
+        return self._made[name]
+
+
+def file_of(name: str) -> str:
+    """The name of a command's module."""
+    return name.replace("-", "_")
+
+
+def listed(name: str) -> TyperCommand:
+    """A command with its name, panel and help alone, read from its file."""
+    tree = ast.parse(Path(__file__).with_name(f"{file_of(name)}.py").read_text(encoding="utf-8"))
+    functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == "command"]
+    text = ast.get_docstring(functions[0] if functions else tree) or ""
+    return TyperCommand(
+        name, help=text if functions else text.partition(": ")[2].capitalize(), rich_help_panel=COMMANDS[name]
+    )
+
+
+def imported(module: str):
+    """A module; on a terminal a word stands there while it is imported, which takes up to a second."""
+    if not sys.stderr.isatty():
+        return importlib.import_module(module)
+    sys.stderr.write(LOADING)
+    sys.stderr.flush()
+    try:
+        return importlib.import_module(module)
+    finally:
+        sys.stderr.write("\r" + " " * len(LOADING) + "\r")
+        sys.stderr.flush()
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"thruster-env {version('thruster-env')}")
+        raise typer.Exit
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="A ship's bow thruster, the filters that estimate its hidden state, and tuning for these filters; "
+    "both also work with your own model, env or log.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=MARKUP,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _callback(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass

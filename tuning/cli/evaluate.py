@@ -1,0 +1,131 @@
+"""`thruster evaluate`: a filter, tuned or not, on a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import RenderableType
+
+from filters.registry import filter_type
+from tuning.api.evaluate import subject_of
+from tuning.api.held_out import on_held_out
+from tuning.api.user_choice import DEFAULT_FILTER
+from tuning.cli.consistency import check_covariance, check_request
+from tuning.cli.options import (
+    FILTER,
+    FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
+    JsonOption,
+    LogModelOption,
+    OfPresetOption,
+    SeedOption,
+    filter_option,
+    one_file,
+)
+from tuning.cli.output import announce_compilation, emit, progress_console, working
+from tuning.cli.problems import PROBLEMS
+from tuning.cli.tables import choice_table
+from tuning.evaluation.baselines import GIVEN, TUNED, given
+from tuning.problems.problem import Problem
+from tuning.reporting.error_tables import comparison_table
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice
+
+
+def command(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="Tuned file; it names filter, parameters and scenario."),
+    ] = None,
+    tuned: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The same as the argument.", rich_help_panel=FILTER)
+    ] = None,
+    filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
+    own: Annotated[
+        bool,
+        typer.Option(
+            "--given",
+            help="Use the Q and R of the problem's model instead of the rule of thumb.",
+            rich_help_panel=FILTER,
+        ),
+    ] = False,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--problem",
+            "--scenario",
+            help=f"By default the tuned file's, or nominal. {PROBLEMS}",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    preset: OfPresetOption = None,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
+    consistency: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also check whether the filter's covariance is consistent, and draw it: .png, .svg or .pdf.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    model: LogModelOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Run a filter on held-out seeds of a scenario and compare it with its baselines.
+
+    The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
+    is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
+    the plant's own Q and R.
+
+    --given evaluates the model's own Q and R, in an ekf unless --filter names another filter.
+
+    --consistency compares a filter's errors and innovations with its covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, rank histograms, with a sentence on each and one picture.
+
+    Example: thruster evaluate out/enkf-mismatch-seed0.json
+
+    Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
+    """
+    tuned = one_file(file, tuned)
+    if own and tuned is not None:
+        raise ValueError(f"--given must come without a tuned file, but got both, with {tuned}")
+    filter_name = filter_name or (DEFAULT_FILTER if own else None)
+    if (tuned is None) == (filter_name is None):
+        got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
+        raise ValueError(f"give either a tuned file or --filter NAME, but got {got}")
+    choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
+    if own:
+        choice = _given(choice.name, chosen)
+    if consistency is not None:
+        check_request(consistency, choice.filter(chosen))
+    announce_compilation()
+    found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
+    comparison, data = found.comparison, found.to_dict()
+    seeds_used = f"{chosen.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
+    where = f"held-out {seeds_used}, scenario {chosen.name}"
+    shown: list[RenderableType] = [choice_table(found.choices, chosen)]
+    shown.append(comparison_table(found.evaluations, comparison.bound, where, chosen.scale_about))
+    shown += found.sentences()
+    if consistency is not None:
+        name = TUNED if tuned is not None else GIVEN if own else comparison.rule
+        with working("checking the covariance"):
+            words, data["consistency"] = check_covariance(choice, name, chosen, comparison, consistency)
+        shown += words
+    emit(shown, data, json)
+
+
+def _given(name: str, problem: Problem) -> Choice:
+    """The filter with the given Q and R of the problem's model; ValueError if there are none."""
+    if not filter_type(name).has_covariance:
+        raise ValueError(f"--given must be used with a filter that has a Q and R, but got {name}")
+    found = given(name, problem)
+    if found is None:
+        raise ValueError(
+            f"--given must be used with a problem whose model has a given Q and R, but got {problem.name}"
+        )
+    return found

@@ -1,0 +1,171 @@
+"""`thruster filters`: the available filters and the parameters of each."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import textwrap
+from inspect import cleandoc
+from itertools import groupby
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from rich.console import RenderableType
+from rich.text import Text
+
+from filters.ensembles.stochastic import EnsembleKalmanFilter
+from filters.filter import Filter
+from filters.registry import FILTERS, filter_type
+from tuning.cli.fitting import fit_table, fits_of
+from tuning.cli.options import INPUT, JsonOption, spelt
+from tuning.cli.output import console, emit, table
+from tuning.cli.problems import PROBLEMS
+from tuning.problems.find import find_problem
+from tuning.search.filter_parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES
+
+MADE = EnsembleKalmanFilter.ensemble_size  # by default
+ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
+OWNERS_WIDTH = 27  # of the longest number, so that the names of filters take no room from what it means
+
+
+class Number(NamedTuple):
+    """A parameter of a filter."""
+
+    name: str
+    default: Any
+    meaning: str
+
+
+class Entry(NamedTuple):
+    """The description of a filter."""
+
+    name: str
+    about: str
+    covariance: bool  # whether it says how far it may be off
+    ensemble: bool
+    numbers: tuple[Number, ...]
+    documentation: str
+
+
+def command(
+    name: Annotated[str | None, typer.Argument(help="A filter to show in full.", callback=spelt(FILTERS))] = None,
+    problem: Annotated[
+        str | None,
+        typer.Option(
+            "--problem", "--scenario", help=f"Show which filters fit its model. {PROBLEMS}", rich_help_panel=INPUT
+        ),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """List the filters and their parameters; or show one filter with its equations and sources.
+
+    Other commands take these names for --filter; so do EstimateState and make_filter.
+
+    Example: thruster filters ukf
+
+    Example: thruster filters --problem my_module:problem
+    """
+    if name is not None:
+        filter_type(name)
+    if problem is not None:
+        found = find_problem(problem)
+        fits = fits_of(found, tuple(FILTERS) if name is None else (name,))
+        emit(fit_table(found, fits), {"problem": found.name, "filters": [one._asdict() for one in fits]}, json)
+        return
+    entries = [entry(known) for known in FILTERS if name in (None, known)]
+    shown = overview(entries) if name is None else in_full(entries[0], console.width)
+    emit(shown, {"filters": [_plain(one) for one in entries]}, json)
+
+
+def entry(name: str) -> Entry:
+    """The description in a filter's class."""
+    kind = filter_type(name)
+    own = kind.filter_class
+    text, meaning = cleandoc(own.__doc__ or ""), _meanings(own)
+    defaults = {field.name: field.default for field in dataclasses.fields(own)}
+    numbers = tuple(Number(number, defaults[number], meaning[number]) for number in kind.numbers)
+    return Entry(name, first_sentence(text), kind.has_covariance, kind.has_ensemble, numbers, text)
+
+
+def overview(entries: list[Entry]) -> list[RenderableType]:
+    """All filters in one table and all their parameters in another, each shared one once."""
+    filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
+    owners: dict[Number, list[str]] = {}
+    for one in entries:
+        for number in one.numbers:
+            owners.setdefault(number, []).append(one.name)
+    numbers = []
+    for names, group in groupby(owners, owners.__getitem__):
+        numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
+        numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
+    return [
+        table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
+        table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
+        "cov.: it has a covariance, the uncertainty of the estimate. ens.: it has an ensemble.",
+        f"ensemble_size: {MADE} members in make_filter and estimate, {KALMAN_SIZES.untuned} in the rule of thumb, "
+        f"from which tune, evaluate and compare start (particles: {PARTICLE_SIZES.untuned} in both, "
+        f"{GAUSSIANS.untuned} of rbpf); a tuned file has its own.",
+        "thruster filters NAME shows one in full, with its equations and sources.",
+    ]
+
+
+def in_full(one: Entry, width: int) -> list[RenderableType]:
+    """One filter: its documentation, fitted to a width, and a table of its parameters."""
+    kind = filter_type(one.name).filter_class
+    has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
+    shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
+    shown.append(fitted(one.documentation, width))
+    if one.numbers:
+        shown += ["", table("Its own numbers", ["number", "default", "meaning"], list(one.numbers), words=True)]
+    return shown
+
+
+def first_sentence(text: str) -> str:
+    """The text up to the first full stop that ends a sentence, on one line."""
+    return re.split(r"(?<=\.)\s", " ".join(text.split()), maxsplit=1)[0]
+
+
+def fitted(documentation: str, width: int) -> str:
+    """A docstring without its attributes: sentences fill the width, equations keep their lines while these fit."""
+    paragraphs = [part for part in documentation.split("\n\n") if not part.startswith(ATTRIBUTES)]
+    return "\n\n".join(_fitted_paragraph(part, width) for part in paragraphs)
+
+
+def _fitted_paragraph(text: str, width: int) -> str:
+    if text[0] != " " and not text.startswith(ERRORS):
+        return textwrap.fill(" ".join(text.split()), width, break_on_hyphens=False)
+    return "\n".join(_fitted_equations(line, width) for line in text.splitlines())
+
+
+def _fitted_equations(line: str, width: int) -> str:
+    """A line of equations, broken where two spaces part them; the rest stands below the first one."""
+    equations = re.sub(r"^ *([\w, ]+: +)?", "", line)
+    label = len(line) - len(equations)
+    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", equations)
+    for number, part in enumerate(parts):
+        if number and len(lines[-1]) + 2 + len(part) <= width:
+            lines[-1] += "  " + part
+            continue
+        first = " " * label if number else lines.pop()
+        rest = " " * (label + 2)
+        lines += textwrap.wrap(part, width, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False)
+    return "\n".join(lines)
+
+
+def _meanings(kind: type[Filter]) -> dict[str, str]:
+    """The descriptions of attributes in the docstrings of a class and of its bases."""
+    found = {}
+    for base in reversed(kind.__mro__):
+        text = cleandoc(base.__doc__ or "")
+        for section in (part for part in text.split("\n\n") if part.startswith(ATTRIBUTES)):
+            for name, meaning in re.findall(r"^    (\w+): (.*(?:\n     .*)*)", section, flags=re.MULTILINE):
+                found[name] = " ".join(meaning.split())
+    return found
+
+
+def _yes(answer: bool) -> str:
+    return "yes" if answer else "no"
+
+
+def _plain(one: Entry) -> dict:
+    return {**one._asdict(), "numbers": [number._asdict() for number in one.numbers]}

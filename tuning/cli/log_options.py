@@ -1,0 +1,179 @@
+"""Options of commands that read recorded logs, declared once as dataclasses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, signature
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from filters.starts import STARTS
+from thruster_env.logs.recorders.one_clock import STAMPS
+from tuning.cli.options import (
+    A_LOG,
+    INPUT,
+    ColumnOption,
+    HoldGapsOption,
+    LogPresetOption,
+    SensorOption,
+    spelt,
+)
+
+
+def with_groups(command: Callable) -> Callable:
+    """Let a command take dataclasses of options; Typer reads their fields in its signature."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters: list[Parameter] = []
+    for one in signature(command).parameters.values():
+        if one.name not in groups:
+            parameters.append(one.replace(annotation=hints[one.name], kind=Parameter.POSITIONAL_OR_KEYWORD))
+            continue
+        of_fields = get_type_hints(groups[one.name], include_extras=True)
+        for part in fields(groups[one.name]):
+            kind, hint = Parameter.POSITIONAL_OR_KEYWORD, of_fields[part.name]
+            parameters.append(Parameter(part.name, kind, default=part.default, annotation=hint))
+    flat = signature(command).replace(parameters=parameters)
+
+    @wraps(command)
+    def with_fields(*args, **kwargs):
+        bound = flat.bind(*args, **kwargs)
+        bound.apply_defaults()
+        given = bound.arguments
+        made = {
+            name: group(**{part.name: given.pop(part.name) for part in fields(group)})
+            for name, group in groups.items()
+        }
+        return command(**given, **made)
+
+    taking: Any = with_fields
+    taking.__signature__, taking.__annotations__ = flat, {one.name: one.annotation for one in parameters}
+    return taking
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How a log is read."""
+
+    preset: LogPresetOption = None
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="MODULE:OBJECT",
+            help="Instead of a thruster: a StateSpaceModel, or a function that returns one (called with dt if it "
+            "has that argument).",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    sensor: SensorOption = None
+    column: ColumnOption = None
+    clock_offset: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--clock-offset",
+            metavar="NAME=SECONDS",
+            help="Offset of a channel's clock, positive if it is ahead.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    dt: Annotated[
+        float | None,
+        typer.Option(
+            "--dt",
+            help="Sample time [s] of a log without times, or of the grid for irregular ones. Variances are per "
+            "step of it.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+
+    stamps: Annotated[
+        str | None,
+        typer.Option(
+            help="Clock of all topics of a bag: header (stamps of their headers) or receipt (when messages were "
+            "received); by default that of the headers if all have one clock.",
+            callback=spelt(STAMPS),
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+
+    def named(self) -> dict[str, Any]:
+        """The arguments of `tuning.logs.read.read_named`."""
+        of_model = {"preset": self.preset, "model": self.model, "sensors": self.sensor}
+        of_times = {"clock_offset": self.clock_offset, "dt": self.dt, "stamps": self.stamps}
+        return {**of_model, "columns": self.column, **of_times}
+
+
+@dataclass(frozen=True)
+class GridOptions(ReadingOptions):
+    """How a log is read, and whether it is put on a grid."""
+
+    no_grid: Annotated[
+        bool,
+        typer.Option(
+            "--no-grid",
+            help="Use the log's own time stamps, for a model in continuous time; variances are per step of --dt.",
+            rich_help_panel=INPUT,
+        ),
+    ] = False
+
+    def named(self) -> dict[str, Any]:
+        """The arguments of `tuning.logs.read.read_named`."""
+        return {**super().named(), **({"grid": False} if self.no_grid else {})}
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """Logs in place of a problem, and how they are cut into blocks."""
+
+    log: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--log",
+            help=f"Instead of a problem: a recorded run; may be repeated. {A_LOG}",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--held-out",
+            help="Held-out recorded run, never used by the study; by default every third one.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    blocks: Annotated[
+        int | None,
+        typer.Option(
+            "--blocks",
+            help="Number of blocks per run; about 72 in total by default.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    lead: Annotated[
+        int | None,
+        typer.Option(
+            "--lead",
+            help="Number of rows at the beginning of a block that are not scored; 50 by default.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    hold_gaps: HoldGapsOption = False
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start",
+            help="Initial state of blocks: prior, or measurement, from their first measurement.",
+            callback=spelt(STARTS),
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+
+    def named(self) -> dict[str, Any]:
+        """Other arguments of `tuning.logs.problem.log_problem`; None where an option is not given."""
+        cuts = {"held_out": self.held_out, "blocks": self.blocks, "lead": self.lead, "start": self.start}
+        return {**cuts, "hold_gaps": self.hold_gaps or None}

@@ -1,0 +1,116 @@
+"""Shared output of commands: tables on the terminal, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console, RenderableType
+from rich.text import Text
+
+from thruster_env.core.compiled import tell_when_compiling
+from thruster_env.core.files import check_not_read, check_target, write_whole
+from thruster_env.core.progress import listening
+from thruster_env.core.text_tables import BEST as BEST
+from thruster_env.core.text_tables import console
+from thruster_env.core.text_tables import table as table  # for the commands, beside what follows
+from thruster_env.logs.recorders.registry import ENDINGS
+from thruster_env.logs.table import SUFFIXES
+from thruster_env.logs.write import check_not_among, check_suffix
+from thruster_env.thruster.plant import largest_known_voltage
+from tuning.cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
+from tuning.cli.printing import printed_whole
+
+PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
+progress_console = Console(stderr=True, markup=False, highlight=False)
+
+
+def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
+    """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
+    if json_target == "-":
+        with printed_whole():
+            sys.stdout.write(as_text(data))
+            sys.stdout.flush()
+        return
+    _check_json(json_target)
+    if json_target is not None:  # first: there may be nobody left who reads what is printed
+        write_whole(json_target, as_text(data))
+    with printed_whole():
+        for part in parts:
+            console.print(part)
+
+
+def _check_json(target: str | None) -> None:
+    """Raise ValueError for a path that would be a log, or the description of one."""
+    if target is not None and Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
+        raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
+
+
+def check_picture(path: Path, option: str) -> None:
+    """Raise ValueError unless the name of a figure's file ends in one of PICTURES."""
+    check_suffix(path, option, PICTURES)
+
+
+def check_targets(targets: Iterable[str | Path | None], json_target: str | None, read: Iterable = ()) -> None:
+    """Raise ValueError unless all files can be written, before long work, and none of those read is among them.
+
+    Args:
+        targets: paths to be written, None for those not requested.
+        json_target: of `--json`.
+        read: paths to be read, None for those not given.
+    """
+    named = [one for one in (*targets, None if json_target == "-" else json_target) if one is not None]
+    given = [one for one in read if one is not None]
+    for target in named:
+        check_not_read(target, given)
+    for target in named:
+        check_not_among(target)
+        check_target(target)
+    _check_json(json_target)
+
+
+def warn_beyond(preset: str, voltage: float) -> None:
+    """Say on standard error that a preset is driven by a larger voltage [V] than it is valid for."""
+    known = largest_known_voltage(preset)
+    if abs(voltage) > known:
+        said = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
+        progress_console.print(f"thruster: warning: {said}")
+
+
+@cache
+def announce_compilation() -> None:
+    """Say on standard error when this process has to compile; later ones find the result in a cache."""
+    tell_when_compiling(
+        lambda: progress_console.print("compiling numerical code: the first run only, some seconds per filter ...")
+    )
+
+
+@contextmanager
+def working(text: str) -> Iterator[None]:
+    """Say on standard error what is running, with its progress if known."""
+    with progress_console.status(Text(f"{text} ...")) as status:  # names are a user's, and no markup
+        with listening(lambda far: status.update(Text(f"{text}: {far}"))):
+            yield
+
+
+def as_text(data) -> str:
+    """JSON of plain data, arrays and NamedTuples; numbers that are not finite become null."""
+    return json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

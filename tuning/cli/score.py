@@ -1,0 +1,191 @@
+"""`thruster score`: trained and classical policies on held-out episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+from rich.console import RenderableType
+from rich.text import Text
+
+from filters.consistency.intervals import mean_interval
+from thruster_env.core.checks import one_of
+from tuning.cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
+from tuning.cli.output import announce_compilation, emit, progress_console, table
+from tuning.cli.train import LEARNABLE
+from tuning.policies.extras import check_installed
+from tuning.policies.observations import find_observation_set
+from tuning.policies.plants.find import plant_of
+from tuning.policies.setup import TrainingConfiguration, in_scenario
+from tuning.problems.scenario import BaseScenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.reporting.error_tables import about, unless_blank
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.thruster.logs import of_preset
+
+if TYPE_CHECKING:
+    from tuning.policies.score import Scores
+
+SEEN = "seen"  # heads the column of what the policy is shown
+
+
+class Scored(NamedTuple):
+    """A policy and its scores."""
+
+    label: str
+    folder: Path | None  # of a learnt policy
+    setup: TrainingConfiguration
+    scores: Scores
+
+
+def command(
+    models: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Folders that `thruster train` made.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help=f"A plant other than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
+        ),
+    ] = None,
+    preset: OfPresetOption = None,
+    classical: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="pi, lqr, one-step or mpc; may be repeated. A controller with the observations of each "
+            "policy; all but pi need a state.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(help="Number of held-out episodes.", rich_help_panel=RUNS)
+    ] = HELD_OUT_SEEDS,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Score trained policies on held-out episodes, the same for all, without exploration.
+
+    Returns come with 95 % intervals. Thrust errors are root mean squares of the true thrust against the reference:
+    within 0.15 s of its steps, elsewhere, and within 0.15 s of changes of its sign. Several policies are compared
+    with the first one episode by episode.
+
+    With --scenario the plant changes, including its noise and sensors, but filters and controllers do not: a
+    filter still assumes the plant of training, a classical controller keeps its gains. A scenario's settings for
+    filters are ignored.
+
+    Needs the extra rl: pip install '.[rl]' in the project's folder
+
+    mpc plans a few steps ahead with the thruster's equations, one-step plans one step; lqr is linear.
+
+    Example: thruster score out/policies/* --classical mpc --scenario ambient
+    """
+    check_installed()
+    if preset is not None and scenario is None:
+        raise ValueError(f"--preset must come with --scenario, but got --preset {preset} alone")
+    held_out = held_out_seeds(seed, seeds)
+    with progress_console.status("loading torch ..."):
+        from tuning.policies.saved import find_saved, read_configuration
+    folders = {model: find_saved(model) for model in models}
+    setups = {model: read_configuration(folder) for model, folder in folders.items()}
+    kind = plant_of(next(iter(setups.values())).task)
+    for name in classical or []:
+        one_of("classical", name, kind.controllers)
+    plant = None if scenario is None else of_preset(kind.find_scenario(scenario), preset)
+    check_alike(list(setups.values()), plant)
+    announce_compilation()
+    scored = []
+    with progress_console.status("scoring ...") as status:
+        for model, folder in folders.items():
+            status.update(Text(f"scoring {model} on {seeds} episodes ..."))
+            scored.append(_learnt(model, folder, setups[model], plant, held_out))
+        for name in classical or []:
+            for setup in _each_arm(setups.values()):
+                if name in kind.of_states and not find_observation_set(setup.observe).shows_state:
+                    continue
+                status.update(Text(f"scoring {name} on {setup.observe} ..."))
+                scored.append(_classical(name, setup, plant, held_out))
+    emit(report(scored, held_out), as_json(scored, held_out), json)
+
+
+def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | None) -> None:
+    """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
+    for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
+        found = sorted({getattr(setup, name) for setup in setups})
+        if len(found) > 1:
+            way_out = ": give one with --scenario" if name == "scenario" else ""
+            raise ValueError(
+                f"models to compare must have one {name.replace('_', ' ')}, but got {', '.join(found)}{way_out}"
+            )
+
+
+def _learnt(
+    model: Path, folder: Path, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+) -> Scored:
+    from tuning.policies.environments import make_environments
+    from tuning.policies.saved import load
+    from tuning.policies.score import score
+
+    met = setup if plant is None else in_scenario(setup, plant)
+    policy = load(folder, make_environments(met, seeds[:1]))
+    name = setup.algo if setup.controller is None else f"{setup.algo}+{setup.controller}"
+    return Scored(f"{setup.observe} {name}", model, setup, score(policy, met, seeds))
+
+
+def _classical(
+    name: str, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+) -> Scored:
+    from tuning.policies.classical import classical_policy
+    from tuning.policies.score import score
+
+    setup = replace(setup, controller=None)  # there is no policy to correct it
+    met = setup if plant is None else in_scenario(setup, plant)
+    return Scored(f"{setup.observe} {name}", None, setup, score(classical_policy(name, setup), met, seeds))
+
+
+def _each_arm(setups) -> list[TrainingConfiguration]:
+    """One setup for each way to observe, filter arguments included."""
+    found: list[TrainingConfiguration] = []
+    for setup in setups:
+        if all((setup.observe, setup.filter_arguments) != (one.observe, one.filter_arguments) for one in found):
+            found.append(setup)
+    return found
+
+
+def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
+    """A table of policies, and the folders of the learned ones."""
+    kind = plant_of(scored[0].setup.task)
+    rows, first, shown_parts = [], scored[0].scores.returns, [part for part in kind.parts if part != "all"]
+    for number, (label, _, _, scores) in enumerate(scored, start=1):
+        over = "" if number == 1 else about(mean_interval(scores.returns - first), 3)
+        errors = [unless_blank(scores.parts[part].rms, ".2f") for part in shown_parts]
+        rows.append([f"{number} {label}", about(mean_interval(scores.returns), 3), over, *errors])
+    headers = [f"{SEEN if part == 'observed' else part}\n[{kind.parts[part]}]" for part in shown_parts]
+    columns = ["policy", "mean return", "over the\nfirst", *headers]
+    title = f"Held-out episodes {seeds.start} to {seeds.stop - 1}, {scored[0].setup.task}"
+    caption = (
+        f"±: half of the 95 % interval. The other columns are root mean square errors: {kind.errors}; blank: "
+        "no such step."
+    )
+    shown: list[RenderableType] = [table(title, columns, rows, caption=caption)]
+    learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
+    return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]
+
+
+def as_json(scored: Sequence[Scored], seeds: range) -> dict:
+    """The same as plain data, with the return of every episode."""
+    first = scored[0].scores.returns
+    return {
+        "seeds": [seeds.start, seeds.stop],
+        "policies": [
+            {
+                "policy": label,
+                "folder": None if folder is None else str(folder),
+                "mean_return": mean_interval(scores.returns)._asdict(),
+                "over_the_first": mean_interval(scores.returns - first)._asdict(),
+                **{f"{name}_rms": part.rms for name, part in scores.parts.items()},
+                "returns": scores.returns,
+            }
+            for label, folder, _, scores in scored
+        ],
+    }

@@ -1,0 +1,105 @@
+"""`thruster study ways`: all ways of tuning on the same filters, data and budgets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from tuning.cli.options import OUTPUT, RUNS, JsonOption
+from tuning.cli.output import announce_compilation, emit, progress_console
+
+RESULTS = Path("out") / "ways"
+
+
+def command(
+    groups: Annotated[str, typer.Option(help="Groups of problems.", rich_help_panel=RUNS)] = "ABCDEFGH",
+    way: Annotated[
+        list[str] | None,
+        typer.Option("--way", help="A way, may be repeated; by default all.", rich_help_panel=RUNS),
+    ] = None,
+    sets: Annotated[int | None, typer.Option(min=2, max=20, help="Data sets; 20.", rich_help_panel=RUNS)] = None,
+    runs: Annotated[
+        float | None, typer.Option(min=100, max=1e7, help="Passes that a way may take; 1e5.", rich_help_panel=RUNS)
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, max=1e4, help="Seconds of one core; 100.", rich_help_panel=RUNS)
+    ] = None,
+    many: Annotated[
+        int | None, typer.Option(min=10, max=10**5, help="Runs of the reference; 2000.", rich_help_panel=RUNS)
+    ] = None,
+    starts: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Starts of the reference; 20.", rich_help_panel=RUNS)
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=1000, help="Processes.", rich_help_panel=RUNS)] = 1,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="A test run without meaningful results.", rich_help_panel=RUNS),
+    ] = False,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder of results, which several hosts may share; existing ones are not recomputed.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = RESULTS,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.md",
+            help="Page whose tables are rewritten, with the picture beside it.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Run every way of tuning on the same data within the same budget, and score it on held-out truth.
+
+    The regret of a way is its score over that of the best constant parameters, found by gradients from many starts
+    on many runs. Ctrl-C keeps finished results, and the same command continues. The whole study takes days; the
+    options reduce it, and results of different budgets are stored separately.
+
+    Example: thruster study ways --quick
+    """
+    from thruster_env.core.files import write_whole
+    from thruster_env.core.markdown import with_tables
+    from tuning.experiments.ways.figure import figure
+    from tuning.experiments.ways.predictions import PREDICTIONS
+    from tuning.experiments.ways.protocol import FAST, Protocol
+    from tuning.experiments.ways.runs import run_protocol
+    from tuning.experiments.ways.tables import tables
+
+    protocol = FAST if quick else Protocol()
+    given: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
+    given["ways"] = tuple(way) if way else None
+    given["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
+    protocol = protocol._replace(**{name: one for name, one in given.items() if one is not None})
+    text = None if page is None else page.read_text(encoding="utf-8")
+    announce_compilation()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    try:
+        with Progress(*columns, console=progress_console) as progress:
+            bar = progress.add_task("ways", total=None)
+            results = run_protocol(
+                protocol,
+                out,
+                jobs,
+                lambda said, done, count: progress.update(bar, description=said, completed=done, total=count),
+            )
+    except KeyboardInterrupt:
+        progress_console.print(f"Interrupted: finished results are in {out}, and the same command continues.")
+        raise
+    made = tables(results, protocol)
+    written = [figure(results, protocol, (out if page is None else page.parent) / "ways_groups.png")]
+    if page is not None and text is not None:
+        write_whole(page, with_tables(text, made))
+        written.append(page)
+    shown = {name: make() for name, make in made.items()}
+    data = {
+        "results": [one._asdict() for one in results],
+        "predictions": [one._asdict() for one in PREDICTIONS],
+        "files": [str(one) for one in written],
+    }
+    emit([*(f"{name}\n\n{one}" for name, one in shown.items()), *[f"wrote {one}" for one in written]], data, json)

@@ -1,0 +1,19 @@
+"""Published experiments and standard problems, with the published numbers beside ours.
+
+Papers are in `authorYEAR.py` each; those on the underwater vehicle are done again in `vehicle`. Standard problems
+are modules with a `BENCHMARK`, and a `problem` for `thruster tune --problem tuning.experiments.NAME:problem`.
+"""
+
+from tuning.experiments.kiki2020 import TABLE as KIKI_2020
+from tuning.experiments.nurhadi2022 import TABLE as NURHADI_2022
+
+STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
+BENCHMARKS = {
+    "lorenz63": "tuning.experiments.lorenz63",
+    "lorenz63-sparse": "tuning.experiments.lorenz63_sparse",
+    "lorenz96": "tuning.experiments.lorenz96",
+    "range-bearing": "tuning.experiments.range_bearing",
+}  # modules by name
+VEHICLE_STUDIES = ("ngatini2017", "ngatini2019")  # see `tuning.experiments.vehicle`
+
+__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES", "VEHICLE_STUDIES"]

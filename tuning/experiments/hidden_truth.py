@@ -1,0 +1,81 @@
+"""The loss of tuning without true states: from logs of a simulation, and with its truth."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from thruster_env.logs.log import Log
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.problems.log_problem import LogProblem
+from tuning.problems.problem import Problem
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.space import Choice
+from tuning.search.study import open_study, quiet_optuna, run_study
+
+TRIALS = 60
+RUNS, MANY_RUNS = 96, 300  # logs, two thirds of which are for training
+FILTERS = ("kf", "ekf", "enkf")
+CASES = (*product(("nominal", "outliers"), FILTERS), ("published_tunnel", "kf"))
+
+
+class Hidden(NamedTuple):
+    """Two studies of one filter on the same runs, both evaluated on the same held-out seeds with truth."""
+
+    seen: Choice  # of the study with true states
+    blind: Choice  # of the study on logs without them
+    seen_evaluation: Evaluation
+    blind_evaluation: Evaluation
+
+    @property
+    def ratio(self) -> Interval:
+        """Score of the study without truth over that with truth, paired: 1 where the truth has no effect."""
+        return score_ratio(self.blind_evaluation, self.seen_evaluation)
+
+    @property
+    def rmse_ratios(self) -> np.ndarray:
+        """RMSE of the study without truth over that with truth, (n,), by state."""
+        pairs = zip(self.blind_evaluation.rmse, self.seen_evaluation.rmse, strict=True)
+        return np.array([blind.value / seen.value for blind, seen in pairs])
+
+
+def logs_of(problem: Problem, seed: int = 0, count: int = RUNS) -> list[Log]:
+    """Logs of runs with a problem's training seeds: inputs and measurements only."""
+    data, model, dt = problem.data(problem.training_seeds(seed, count)), problem.model(), problem.dt
+    if dt is None:
+        raise ValueError(f"logs must have a sample time, but problem {problem.name} has none")
+    return [
+        Log(f"run{place}", dt, inputs, measurements, model.input_quantities, model.measurements)
+        for place, (inputs, measurements) in enumerate(zip(data.inputs, data.measurements, strict=True))
+    ]
+
+
+def hide_truth(
+    filter_name: str,
+    problem: Problem,
+    trials: int = TRIALS,
+    seed: int = 0,
+    runs: int = RUNS,
+    held_out: int = HELD_OUT_SEEDS,
+) -> Hidden:
+    """Tune a filter on a problem with its truth, and on logs of the same runs without it.
+
+    Args:
+        filter_name: name of the filter.
+        problem: a problem with truth.
+        trials: number of trials of each study.
+        seed: seed of both studies.
+        runs: number of logs, every third of which is held out by their problem; the study with truth has 32 runs.
+        held_out: number of held-out seeds of the problem for the evaluation of both.
+    """
+    quiet_optuna()
+    blind_problem = LogProblem(logs_of(problem, seed, runs), problem.model(), blocks=1, name="logs")
+    plans = Plan(filter_name, (problem,), seed), Plan(filter_name, (blind_problem,), seed, ("likelihood",))
+    studies = ((open_study(f"hidden-{filter_name}", plan), plan) for plan in plans)
+    seen, blind = (run_study(study, plan, trials).or_interrupted().choice for study, plan in studies)
+    data = problem.data(problem.held_out_seeds(seed, held_out))
+    by_seen, by_blind = (evaluate(one.filter(problem), data, problem.scale) for one in (seen, blind))
+    return Hidden(seen, blind, by_seen, by_blind)

@@ -1,0 +1,135 @@
+"""Structures of the model, each identified from recordings, to compare the effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.batch import run
+from filters.gaussian.extended import ExtendedKalmanFilter
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.experiments.recordings.model import LOAD_CELL, on_line, to_identify
+from tuning.experiments.recordings.runs import Recording
+from tuning.identification.identify import identify
+from tuning.identification.result import Identification
+from tuning.identification.runs import runs_of
+from tuning.identification.values import valued
+from tuning.problems.parameter import Parameter
+
+
+def _positive(name: str, low: float, high: float, unit: str = "", default: float | None = None) -> Parameter:
+    return Parameter(name, low, high, unit, default=default)
+
+
+def _any(name: str, low: float, high: float, unit: str = "", default: float | None = None) -> Parameter:
+    return Parameter(name, low, high, unit, log=False, default=default)
+
+
+MOTOR = (
+    _positive("motor_rate", 8.0, 200.0, "1/s", 60.0),
+    _any("motor_gain", 40.0, 65.0, "rad/(s V)", 51.0),
+)
+BAND = (_any("dead_band_low", -1.2, -0.3, "V", -0.8), _any("dead_band_high", 0.3, 1.2, "V", 0.8))
+LAG = (_positive("tachometer_lag", 8e-3, 0.12, "s", 0.04),)
+# Thrust over squared speed is 0.7 to 1.2 times 1e-3 within one ramp, and greatest before the water moves.
+BLADES = (_positive("thrust_factor", 8e-4, 2e-3, "N s^2", 1.5e-3),)
+SIDES = (_any("gain_ratio", 0.8, 1.25, default=1.0), _any("thrust_ratio", 0.8, 1.3, default=1.05))
+FLOW = (
+    _positive("flow_factor", 0.01, 3.0, "N s^2/m", 0.4),
+    _positive("flow_linear", 0.02, 30.0, "1/s", 1.0),
+    _positive("flow_quadratic", 0.02, 200.0, "1/m", 20.0),
+)
+INERTIA = (_any("inertia", -0.02, 0.15, "N s^2", 5e-3),)
+AMBIENT = (_any("ambient_factor", -3.0, 3.0, default=0.1),)
+MOUNT = (
+    _any("mount_share", 0.0, 1.5, default=0.4),
+    _any("mount_frequency", 11.0, 16.0, "Hz", 14.0),
+    _positive("mount_damping", 0.02, 0.4, default=0.1),
+)
+NOISE = (
+    _positive("Q11", 0.25, 400.0, "(rad/s)^2", 9.0),
+    _positive("Q22", 0.01, 40.0, "(rad/s)^2", 1.0),
+    _positive("R11", 0.1, 40.0, "(rad/s)^2", 3.0),
+    _positive("R22", 0.04, 25.0, "N^2", 1.0),
+)
+
+
+DEGREES = 20.0  # degrees of freedom of the load cell's errors: it rings after each start and reversal
+
+
+class Structure(NamedTuple):
+    """Effects in the model, and the free parameters."""
+
+    about: str
+    free: tuple[Parameter, ...]
+    fixed: Mapping[str, float] = {}
+    ambient: bool = False  # whether the measured ambient flow is an input
+
+    def model(self, **values: float) -> StateSpaceModel:
+        """The model with the load cell for values of the free parameters."""
+        mount = MOUNT[0] in self.free
+        return valued(to_identify(self.ambient, mount), {**self.fixed, **values})
+
+
+STATIC = (*MOTOR, *BAND, *LAG, *BLADES, *SIDES, *NOISE)
+WHOLE = (*STATIC, *FLOW, *INERTIA)
+
+
+def _without(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    return tuple(one for one in WHOLE if one not in parameters)
+
+
+CHOSEN = "flow and inertia"
+STRUCTURES = {
+    "static": Structure("thrust by motor speed alone", STATIC, {"flow_factor": 0.0}),
+    "flow": Structure("with axial flow", (*STATIC, *FLOW)),
+    CHOSEN: Structure("with axial flow and inertial force: the chosen one", WHOLE),
+    "ambient": Structure("... and the measured ambient flow", (*WHOLE, *AMBIENT), ambient=True),
+    "mount": Structure("... and the mount's swinging", (*WHOLE, *MOUNT)),
+    "no flow": Structure("the chosen one, without axial flow", _without(FLOW), {"flow_factor": 0.0}),
+    "no dead band": Structure(
+        "... without the dead band", _without(BAND), {"dead_band_low": 0.0, "dead_band_high": 0.0}
+    ),
+    "no lag": Structure("... with a tachometer's lag of 8 ms", _without(LAG), {"tachometer_lag": 8e-3}),
+    "symmetric": Structure(
+        "... the same ahead and astern", _without(SIDES), {"gain_ratio": 1.0, "thrust_ratio": 1.0}
+    ),
+}
+
+
+def identified(
+    structure: Structure, runs: Sequence[Recording], starts: int = 1, progress: Callable | None = None
+) -> Identification:
+    """The parameters of a structure with the best prediction of tachometer and load cell.
+
+    The filter uses the tachometer only; the load cell's channel is predicted (`identify`).
+    """
+    return identify(
+        [one.log(structure.ambient) for one in runs],
+        structure.model,
+        structure.free,
+        predicted=[LOAD_CELL.symbol],
+        degrees=DEGREES,
+        starts=starts,
+        simulation_first=False,  # a simulation would have the wrong sign of the speed for a while
+        progress=progress,
+    )
+
+
+def thrusts(model: StateSpaceModel, runs: Sequence[Recording], ambient: bool = False) -> list[np.ndarray]:
+    """Estimated thrust (K + 1,) on each run, of an EKF with command and tachometer, on the recorder's clock.
+
+    Args:
+        model: identified, with or without the load cell.
+        runs: recorded.
+        ambient: whether the measured ambient flow is an input.
+    """
+    data = runs_of([one.log(ambient) for one in runs])
+    seen = on_line(model)
+    estimates = run(
+        ExtendedKalmanFilter(model=seen), data.filter_keys, data.inputs, data.measurements[..., :1].copy()
+    )
+    found = seen.output("T", estimates.means)
+    return [found[place, : len(one.times)] for place, one in enumerate(runs)]

@@ -1,0 +1,102 @@
+"""Rows of the tables of docs/real_data.md and of `thruster study recordings`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tuning.experiments.recordings.comparison import OURS, structure_ratios
+from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES
+from tuning.experiments.recordings.measure import ratios, rmse, settled_rmse
+from tuning.experiments.recordings.results import Task
+from tuning.experiments.recordings.runs import Recording
+
+MEAN = "mean"
+RATIO_HEADER = ["run", "own, N", "ours, N", "ratio", "best clocks", "raw rows"]
+CLOCK_HEADER = ["run", "offset, s", "first half", "second half"]
+LADDER_HEADER = ["model", "ratio, worst", "ratio, mean", "raw rows, worst", "log-likelihood"]
+NUMBER_HEADER = ["constant", "value", "standard error", "without one run", "unit"]
+
+Estimates = Mapping[str, Sequence[np.ndarray]]
+
+
+class Table(NamedTuple):
+    """A header and rows of cells."""
+
+    header: list[str]
+    rows: list[list[str]]
+
+
+def tables_of(
+    runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
+) -> dict[str, Table]:
+    """All tables by name, in their order; those of structures and parameters where these were identified again."""
+    made = {
+        "ratios": Table(RATIO_HEADER, ratio_rows(runs, estimates)),
+        "estimators": Table(["run", *estimates], baseline_rows(runs, estimates)),
+        "clocks": Table(CLOCK_HEADER, clock_rows(runs)),
+    }
+    if tasks is not None:
+        made["structures"] = Table(LADDER_HEADER, ladder_rows(runs, tasks))
+        made["numbers"] = Table(NUMBER_HEADER, number_rows(runs, tasks))
+    return made
+
+
+def ratio_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:
+    """Our error over that of the recorder's own, on each run and on average."""
+    found = [ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)]
+    rows = []
+    for run, one, ours in zip(runs, found, estimates[OURS], strict=True):
+        mark = " (desired)" if run.own_is_desired else ""
+        own = f"{rmse(run.own, run):.2f}{mark}"
+        rows.append([run.name, own, f"{rmse(ours, run):.2f}", *(f"{value:.2f}" for value in one)])
+    return [*rows, [MEAN, "", "", *(f"{value:.2f}" for value in np.mean(found, axis=0))]]
+
+
+def baseline_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:
+    """RMSE of every estimator over 0.2 s on each run: all rows, then settled ones [N]."""
+    rows = []
+    for place, run in enumerate(runs):
+        cells = [f"{rmse(one[place], run):.2f}/{settled_rmse(one[place], run):.2f}" for one in estimates.values()]
+        rows.append([run.name, *cells])
+    return rows
+
+
+def clock_rows(runs: Sequence[Recording]) -> list[list[str]]:
+    """The offset of the load cell's clock on each run."""
+    return [[run.name, *(f"{value + 0.0:+.3f}" for value in (run.offset, *run.halves))] for run in runs]
+
+
+def ladder_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[list[str]]:
+    """The errors of each structure, on runs left out of the identification."""
+    rows = []
+    for name, structure in STRUCTURES.items():
+        found = np.array(structure_ratios(name, runs, tasks))
+        cells = found[:, 0].max(), found[:, 0].mean(), found[:, 2].max()
+        likelihood = tasks[Task(name).name]["log_likelihood"]
+        rows.append([structure.about, *(f"{value:.2f}" for value in cells), f"{likelihood:.0f}"])
+    return rows
+
+
+def number_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[list[str]]:
+    """The chosen parameters, their standard errors, and their range when one run is left out."""
+    whole, rows = tasks[Task(CHOSEN).name], []
+    for one in STRUCTURES[CHOSEN].free:
+        value, error = whole["values"][one.name], whole["standard_errors"][one.name]
+        others = [tasks[Task(CHOSEN, run.name).name]["values"][one.name] for run in runs]
+        name = one.name if whole["determined"][one.name] else f"{one.name} (not determined)"
+        rows.append([name, f"{value:.4g}", f"{error:.2g}", f"{min(others):.4g} to {max(others):.4g}", one.unit])
+    return rows
+
+
+def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
+    """The table of ratios in one sentence."""
+    found = np.array([ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)])
+    averaged, best, raw = found.T
+    return [
+        f"Averaged over 0.2 s the error of the estimated thrust is on average {averaged.mean():.2f} times that of "
+        f"the recorder's own, at most {averaged.max():.2f}; with the best clocks at most {best.max():.2f}; "
+        f"on raw rows {raw.min():.2f} to {raw.max():.2f}."
+    ]

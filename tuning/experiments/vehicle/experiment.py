@@ -1,0 +1,216 @@
+"""All filters on the same runs of a path: truth, estimates and scores.
+
+NEES is the normalised estimation error squared.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.bounds import path_bound
+from filters.consistency.nees import normalized_squares
+from filters.engine.batch import run
+from filters.filter import Filter
+from filters.wrapped import wrapped_variances
+from thruster_env.core.checks import at_least
+from thruster_env.model.simulate import Truth, simulate
+from tuning.experiments.vehicle.estimators import Estimator
+from tuning.experiments.vehicle.models import papers_model
+from tuning.experiments.vehicle.paths import PATHS, find_path
+from tuning.experiments.vehicle.pose import full_pose, planar_pose, pose_errors
+from tuning.experiments.vehicle.printed import DT, MEASURED, RUNS
+from tuning.experiments.vehicle.scores import Scores, joined
+
+MOST_RUNS = 10_000
+AT_A_TIME = (
+    4  # runs: 31560 steps of eight states with their covariances are 23 MB a run, and Ctrl-C waits for them
+)
+SETTLED = 2000  # steps, after which velocities are scored
+MEASURED_PLACES = tuple("uvwpqr".index(name) for name in MEASURED)
+
+
+class Bound(NamedTuple):
+    """Least RMSE of any estimate along the noise-free path: roots of mean variances over the scored steps."""
+
+    velocities: np.ndarray  # (6,)
+    attitude: np.ndarray  # (2,)
+    pose: np.ndarray  # (4,)
+
+
+class PathResult(NamedTuple):
+    """All filters on one path of one world."""
+
+    path: str
+    world: str
+    steps: int
+    end: np.ndarray  # (4,), x, y, z [m] and psi [rad] at the end without noise
+    planar_gap: np.ndarray  # (4,), RMSE of the transformation by yaw alone, of the velocities without noise
+    outside: np.ndarray  # (7,), fraction of time in which each velocity is outside 0..1, then in which any is
+    bound: Bound
+    scores: dict[str, Scores]  # by label of the filter
+
+
+class Task(NamedTuple):
+    """A path, a world, and the filters to run there."""
+
+    path: str
+    world: str
+    estimators: Sequence[Estimator]
+
+
+OnPart = Callable[[int, int, str], None]  # (done, total, what was done)
+
+
+def settled(steps: int) -> slice:
+    """The scored steps of velocities: from 2 s on, or the second half of a shorter run."""
+    return slice(min(SETTLED, steps // 2) + 1, None)
+
+
+def keys_of(path: str, runs: int, seed: int) -> np.ndarray:
+    """Keys of the runs of one path, (runs, 2), for both truth and filters, whose random streams differ."""
+    generator = np.random.default_rng([seed, tuple(PATHS).index(path)])
+    return generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64)
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    *,
+    runs: int = RUNS,
+    seed: int = 0,
+    steps: int | None = None,
+    on_part: OnPart = lambda done, total, label: None,
+) -> list[PathResult]:
+    """Run every task's filters on the same runs.
+
+    Args:
+        tasks: the tasks.
+        runs: number of independent runs of each path, at least 2.
+        seed: seed of all random numbers.
+        steps: number of first steps of each path; all if None.
+        on_part: called with the number of finished parts, the number of all parts, and the next one.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+    runs, seed = at_least("runs", runs, 2, MOST_RUNS), at_least("seed", seed, 0)
+    if steps is not None:
+        steps = at_least("steps", steps, 2, max(path.steps for path in PATHS.values()))
+    parts = [slice(first, min(first + AT_A_TIME, runs)) for first in range(0, runs, AT_A_TIME)]
+    total, done, results = sum(len(task.estimators) for task in tasks) * len(parts), 0, []
+    for task in tasks:
+        inputs, keys = find_path(task.path).inputs(steps), keys_of(task.path, runs, seed)
+        found: dict[str, list[Scores]] = {one.label: [] for one in task.estimators}
+        for part in parts:
+            truth = true_runs(task.world, keys[part], inputs)
+            for one in task.estimators:
+                on_part(done, total, f"path {task.path}, {one.label}")
+                found[one.label].append(scores_of(one, truth, keys[part], inputs))
+                done += 1
+        scores = {label: joined(several) for label, several in found.items()}
+        results.append(PathResult(task.path, task.world, len(inputs), *along_path(task.world, inputs), scores))
+    on_part(done, total, "done")
+    return results
+
+
+def true_runs(world: str, keys: np.ndarray, inputs: np.ndarray) -> Truth:
+    """True states (B, K + 1, 12) and measurements (B, K + 1, 4), one run for each of the keys (B, 2)."""
+    return simulate(papers_model("navigation", world), keys, for_all(inputs, len(keys)))
+
+
+def for_all(inputs: np.ndarray, runs: int) -> np.ndarray:
+    """The same inputs (K, p) for each of so many runs, (B, K, p)."""
+    return np.ascontiguousarray(np.broadcast_to(inputs, (runs, *inputs.shape)))
+
+
+def for_filter(filter_: Filter, inputs: np.ndarray, runs: int) -> np.ndarray:
+    """Inputs of a filter's model; where roll and pitch are inputs, they are zero."""
+    level = np.zeros((len(inputs), filter_.model.inputs - inputs.shape[1]))
+    return for_all(np.concatenate([inputs, level], axis=1), runs)
+
+
+def estimate(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray):
+    """Estimates of a filter on some runs, and its seconds of one core without compilation."""
+    if one.filter is None:
+        raise ValueError(f"an estimate must be by a filter, but {one.label} has none")
+    given = for_filter(one.filter, inputs, len(keys))
+    run(one.filter, keys[:1], given[:1, :1], truth.measurements[:1, :2])
+    began = time.process_time()
+    estimates = run(one.filter, keys, given, truth.measurements)
+    return estimates, time.process_time() - began
+
+
+def scores_of(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray) -> Scores:
+    """The scores of an estimator on some runs."""
+    count, steps, true_pose = len(keys), settled(len(inputs)), truth.states[..., [9, 10, 11, 8]]
+    nothing = np.full((count, 4), np.nan)
+    if one.filter is None:
+        velocities = measured_velocities(truth)
+        errors = (velocities - truth.states[..., :6])[:, steps]
+        errors[..., 3:5] = np.nan
+        attitude, nees, divergences, seconds = nothing[:, :2], nothing[:, 0], np.zeros(count), 0.0
+        full = None
+    else:
+        estimates, seconds = estimate(one, truth, keys, inputs)
+        n = one.filter.model.n
+        all_errors = (estimates.means - truth.states[..., :n])[:, steps]
+        nees = normalized_squares(all_errors, estimates.covs[:, steps]).mean(axis=1)
+        divergences = estimates.divergences
+        velocities, errors = estimates.means[..., :6], all_errors[..., :6]
+        attitude = np.square(all_errors[..., 6:]).mean(axis=1) if one.has_attitude else nothing[:, :2]
+        reckoned = full_pose(velocities, estimates.means[..., 6:] if one.has_attitude else None, DT)
+        full = pose_errors(reckoned, true_pose)
+    by_yaw = planar_pose(velocities, DT)
+    planar = pose_errors(by_yaw, true_pose)
+    both = pose_errors(by_yaw, planar_pose(truth.states[..., :6], DT))
+    return Scores(
+        np.square(errors).mean(axis=1),
+        attitude,
+        nothing if full is None else np.square(full).mean(axis=1),
+        np.square(planar).mean(axis=1),
+        np.square(both).mean(axis=1),
+        nothing if full is None else np.abs(full[:, -1]),
+        np.abs(planar[:, -1]),
+        nees,
+        divergences,
+        np.full(count, seconds / count),
+    )
+
+
+def measured_velocities(truth: Truth) -> np.ndarray:
+    """The measurements as velocities (B, K + 1, 6), with zeros for p and q."""
+    velocities = np.zeros((*truth.measurements.shape[:2], 6))
+    velocities[..., list(MEASURED_PLACES)] = truth.measurements
+    return velocities
+
+
+def noise_free(world: str, inputs: np.ndarray) -> np.ndarray:
+    """States (K + 1, 12) from rest at the origin without any noise."""
+    model = papers_model("navigation", world, process_noise_cov=(0.0,) * 12)
+    still = model.replace(prior_cov=(0.0,) * 12)
+    return simulate(still, np.zeros((1, 2)), inputs[None]).states[0]
+
+
+def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bound]:
+    """End, gap of the transformation by yaw alone, share outside the bounds, and the bound, all without noise.
+
+    The bound is `filters.bounds.path_bound`: the posterior bound is useless with a noise of 1e-6 rad per step on
+    the angles.
+    """
+    states, steps = noise_free(world, inputs), settled(len(inputs))
+    pose = states[:, [9, 10, 11, 8]]
+    gap = pose_errors(planar_pose(states[None, :, :6], DT)[0], pose)
+    beyond = (states[:, :6] < 0.0) | (states[:, :6] > 1.0)
+    outside = np.append(beyond.mean(axis=0), beyond.any(axis=1).mean())
+    model = papers_model("navigation", world)
+    covs = path_bound(model, inputs[None])[0]
+    variances = wrapped_variances(np.diagonal(covs, axis1=1, axis2=2), model.shape.state_angles)
+    bound = Bound(
+        np.sqrt(variances[steps, :6].mean(axis=0)),
+        np.sqrt(variances[steps, 6:8].mean(axis=0)),
+        np.sqrt(variances[:, [9, 10, 11, 8]].mean(axis=0)),
+    )
+    return pose[-1], np.sqrt(np.square(gap).mean(axis=0)), outside, bound

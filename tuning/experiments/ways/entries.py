@@ -1,0 +1,245 @@
+"""A way on a data set of a case, within a budget, and the best constant numbers that it is held against."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tuning.evaluation.baselines import scaled_default
+from tuning.evaluation.evaluate import compute_metrics
+from tuning.evaluation.runs import metrics_of_all
+from tuning.experiments.ways.problems import FULL, LIDAR_RUNS, LIDAR_SETS, Case, lidar
+from tuning.experiments.ways.protocol import (
+    FROM_NOISE,
+    ORACLE,
+    REFERENCE,
+    RUNS,
+    SCALED,
+    SECONDS,
+    STARTS,
+    STUDY,
+    STUDY_LOG_SCORE,
+    TRIALS,
+    WITH_FULL,
+    Protocol,
+)
+from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.gradient import optimum
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
+from tuning.search.objectives import LOG_SCORE, SCORE
+from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
+from tuning.search.plan import Plan
+from tuning.search.quiet import quiet_optuna
+from tuning.search.space import Choice, oracle_choice, untuned_choice
+from tuning.search.study import open_study, run_study
+from tuning.ways.registry import WAYS, find_way
+from tuning.ways.task import Budget, Kept, Task
+
+SIMPLEX = 400  # evaluations of a descent to the reference of an ensemble, which has no gradient
+
+
+class Scored(NamedTuple):
+    """A choice on the held-out runs."""
+
+    score: float
+    nees: float  # over the number of states
+    nis: float  # over the number of channels
+    log_likelihood: float  # a run
+    log_score: float  # a step
+
+
+class Result(NamedTuple):
+    """A way on a data set: the error that it ended in, and what it would have given for each budget."""
+
+    case: str
+    way: str
+    set: int
+    by_runs: Mapping[str, Scored]
+    by_seconds: Mapping[str, Scored]
+    last: Scored | None  # None where the way cannot be followed
+    taken_runs: float
+    taken_seconds: float
+    choice: Mapping[str, Any]
+    error: str = ""
+
+
+def data_set(case: Case, place: int) -> Data:
+    """The runs of a data set, to learn from."""
+    problem = case.make()
+    if case.make is lidar:
+        data = problem.data(range(32 * place, 32 * place + case.runs))
+    else:
+        data = problem.data(problem.training_seeds(place, max(case.runs, 2))).slice(0, case.runs)
+    return data if case.truth else data._replace(states=None, outputs=None)
+
+
+@cache
+def _held_out(make: Callable[[], Problem], count: int) -> Data:
+    problem = make()
+    if make is lidar:
+        first = 32 * LIDAR_SETS
+        return problem.data(range(first, first + min(LIDAR_RUNS, 2 * count)))
+    return problem.data(problem.held_out_seeds(0, count))
+
+
+def scored(choice: Choice, case: Case, count: int) -> Scored:
+    """A choice on the held-out runs."""
+    problem, data = case.make(), _held_out(case.make, count)
+    filter_ = choice.filter(problem)
+    runs = metrics_of_all(filter_, data, True, False, problem.scale)
+    found = compute_metrics(filter_, runs, data, problem.scale, False, False)
+    ratios = found.nees.value / len(found.rmse), found.nis.value / found.expected_nis
+    return Scored(found.score.value, *ratios, found.log_likelihood, found.log_score.value)
+
+
+def start_of(case: Case, place: int) -> Choice:
+    """Where a data set's ways begin."""
+    problem, (on_q, on_r) = case.make(), STARTS[place % len(STARTS)]
+    found = untuned_choice(case.filter, problem)
+    if case.members is not None:
+        found = found.with_size(case.members)
+    for one in model_parameters(problem, hold_r=case.options.get("hold_r", False)):
+        factor = {ProcessVariance: on_q, MeasurementVariance: on_r}.get(type(one.place), 1.0)
+        found = one.set(found, min(max(factor * (one.get(found) or 1.0), one.low), one.high))
+    return found
+
+
+def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
+    """A way on a data set."""
+    data, error, label = data_set(case, place), "", way
+    informed = way.endswith(FROM_NOISE)
+    if informed or way.endswith(WITH_FULL):
+        if case.options == FULL and not informed:
+            return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here")
+        way = way.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
+        case = case._replace(options=FULL)
+    try:
+        _check(case, way, _task(case, data, place, Budget()))
+    except ValueError as lacking:
+        return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, str(lacking))
+    if way in WAYS:  # so that nothing is left to compile
+        with suppress(ValueError):
+            find_way(way).run(way, _task(case, data.slice(0, 4), place, Budget(60, 5.0)))
+    task = _task(case, data, place, Budget(protocol.runs, protocol.seconds))
+    try:
+        if informed:
+            find_way("noise-estimation").run("noise-estimation", task)
+            task.start = task.best
+        _follow(case, way, place, task)
+    except ValueError as problem:
+        error = str(problem) or type(problem).__name__
+    taken = task.runs, task.seconds  # without that of scoring
+    known: dict[int, Scored] = {}
+
+    def at(choice: Choice) -> Scored:
+        if id(choice) not in known:
+            known[id(choice)] = scored(choice, case, protocol.held_out)
+        return known[id(choice)]
+
+    last = task.start if error else task.best
+    by_runs = {
+        f"{one:g}": at(last if error else task.best_within(runs=one)) for one in RUNS if one <= protocol.runs
+    }
+    by_seconds = {
+        f"{one:g}": at(last if error else task.best_within(seconds=one))
+        for one in SECONDS
+        if one <= protocol.seconds
+    }
+    return Result(case.name, label, place, by_runs, by_seconds, at(last), *taken, _plain(last), error)
+
+
+def _task(case: Case, data: Data, place: int, budget: Budget) -> Task:
+    given: dict[str, Any] = {"options": case.options, "budget": budget, "seed": place}
+    return Task(case.filter, case.make(), data, start=start_of(case, place), **given)
+
+
+def _check(case: Case, way: str, task: Task) -> None:
+    """Raise ValueError if a case lacks what a way needs."""
+    if way in WAYS:
+        find_way(way).check(way, task)
+    elif way == ORACLE and oracle_choice(case.filter, task.problems[0]) is None:
+        raise ValueError("the plant's own Q and R are unknown")
+    elif way in (STUDY, STUDY_LOG_SCORE) and (case.runs != 32 or case.group in "EG" or case.make is lidar):
+        raise ValueError("a study draws its own runs, not these")
+
+
+def _follow(case: Case, way: str, place: int, task: Task) -> None:
+    """Let a task keep what a way finds."""
+    problem = task.problems[0]
+    if way in WAYS:
+        return find_way(way).run(way, task, guarded=False)
+    found: Choice | None = task.start
+    if way == SCALED:
+        found = scaled_default(case.filter, problem, place).choice
+    elif way == ORACLE:
+        found = oracle_choice(case.filter, problem)
+    elif way in (STUDY, STUDY_LOG_SCORE):
+        return _study(case, way, place, task)
+    if found is None:
+        raise ValueError(f"there is no {way}")
+    return task.keep(found if case.members is None else found.with_size(case.members))
+
+
+def _study(case: Case, way: str, place: int, task: Task) -> None:
+    """What `thruster tune` does, which draws runs of its own to choose among its best trials; in one piece."""
+    objective = SCORE if way == STUDY else LOG_SCORE
+    given: dict[str, Any] = dict(case.options)
+    plan = Plan(case.filter, (case.make(),), place, (objective,), **given)
+    with quiet_optuna():
+        with task.uncounted():  # so that nothing is left to compile
+            other = plan._replace(seed=place + 1000)
+            run_study(open_study("first", other), other, 2)
+        result = run_study(open_study("ways", plan), plan, TRIALS)
+    task.runs += TRIALS * task.passes
+    task.kept.append(Kept(task.runs, task.seconds, result.choice))
+
+
+def reference(case: Case, protocol: Protocol) -> Result:
+    """The best constant numbers: those with the least score on many runs, from many starts."""
+    problem = case.make()
+    if case.make is lidar:
+        data = problem.data(range(32 * LIDAR_SETS))
+    else:
+        data = problem.data(range(10**8, 10**8 + protocol.many))
+    start = start_of(case, 0)
+    begin = time.process_time()
+    task = Task(case.filter, problem, data, options=case.options, start=start)
+    if case.filter in DIFFERENTIABLE:
+        goal, best = task.goal(SCORE, keeps=False), None
+        coordinates, rng = goal.coordinates, np.random.default_rng(0)
+        first = coordinates.of(goal.untuned)
+        for turn in range(protocol.starts):
+            moved = first + rng.uniform(-np.log(100.0), np.log(100.0), len(first)) * coordinates.log * (turn > 0)
+            found = optimum(goal, np.clip(moved, coordinates.low, coordinates.high))
+            best = found if best is None or found.value > best.value else best
+        assert best is not None
+        choice = goal.choice_at(coordinates.of(best.parameters))
+    else:
+        least, choice = math.inf, start
+        some = data.slice(0, min(protocol.many, 200))
+        budget = Budget(SIMPLEX * len(some.seeds))
+        starts = [start_of(case, turn) for turn in range(min(protocol.starts, len(STARTS)))]
+        for turn, begun in enumerate(starts):
+            if begun in starts[:turn]:
+                continue
+            one = Task(case.filter, problem, some, options=case.options, start=begun, budget=budget)
+            find_way("nelder-mead").run("nelder-mead", one)
+            value = one.value(one.best)
+            if value < least:
+                least, choice = value, one.best
+    found_score, seconds = scored(choice, case, protocol.held_out), time.process_time() - begin
+    return Result(case.name, REFERENCE, 0, {}, {}, found_score, 0.0, seconds, _plain(choice))
+
+
+def _plain(choice: Choice) -> dict[str, Any]:
+    """A choice as JSON has it."""
+    found: dict[str, Any] = json.loads(json.dumps(choice._asdict(), default=lambda one: np.asarray(one).tolist()))
+    return found

@@ -1,0 +1,192 @@
+"""The problems of the study, in groups: what is known of the model decides which way is good."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from filters import affine_model
+from tuning.experiments import lorenz96
+from tuning.experiments.benchmark import noise_free_problem
+from tuning.experiments.lidar import drawn, lidar_problem
+from tuning.experiments.pendulum import model as pendulum
+from tuning.problems.excitation import Steps
+from tuning.problems.find import find_problem
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.problem import Problem
+
+NOTHING: Mapping[str, bool] = {}
+FULL: Mapping[str, bool] = {"full_q": True, "full_r": True}
+FULL_Q: Mapping[str, bool] = {"full_q": True}
+HELD_R: Mapping[str, bool] = {"hold_r": True}
+LIDAR_RUNS, LIDAR_SETS = 700, 20  # that are held out, and sets of runs to learn from
+MASSES, STIFFNESS, DAMPING, DT = 5, 200.0, 0.4, 0.02  # of a chain, each mass 1 kg
+
+
+class Case(NamedTuple):
+    """A filter to be tuned on runs of a problem."""
+
+    name: str
+    group: str
+    make: Callable[[], Problem]
+    filter: str
+    options: Mapping[str, bool] = NOTHING
+    runs: int = 32  # to learn from, in a data set
+    members: int | None = None  # of an ensemble
+    truth: bool = True  # whether they have true states
+    about: str = ""
+
+    @property
+    def model(self) -> str:
+        """A name of the filter and what it is of, which cases that differ in their data alone share."""
+        return f"{self.name.split(',')[0]} {self.filter}"
+
+
+GROUPS = {
+    "A": "linear, right",
+    "B": "nonlinear, right",
+    "C": "wrong model",
+    "D": "outliers and a dead band",
+    "E": "small ensembles",
+    "F": "eight to ten states",
+    "G": "no truth to learn from",
+    "H": "little data",
+}
+
+
+@cache
+def walk() -> Problem:
+    """A level that wanders."""
+    one = np.eye(1)
+    noise = {"process_noise_cov": [1.0], "measurement_noise_cov": 4.0}
+    model = affine_model(a=one, b=np.zeros((1, 0)), c=one, prior_mean=[0.0], prior_cov=[4.0], **noise)
+    given = {"process_noise_cov": (0.01,), "measurement_noise_cov": 4.0}
+    return ModelProblem(
+        model, steps=300, untuned=given, name="walk", about="a level that wanders, seen with noise"
+    )
+
+
+@cache
+def velocity() -> Problem:
+    """Motion in a plane at nearly constant velocity."""
+    model = affine_model(
+        a=np.eye(4) + np.eye(4, k=2),
+        b=np.zeros((4, 0)),
+        c=np.eye(2, 4),
+        process_noise_cov=[0.02, 0.05, 0.01, 0.03],
+        measurement_noise_cov=[4.0, 1.0],
+        prior_mean=[0.0] * 4,
+        prior_cov=[10.0, 10.0, 1.0, 1.0],
+    )
+    given = {"process_noise_cov": (1.0,) * 4, "measurement_noise_cov": (1.0, 1.0)}
+    about = "motion in a plane at nearly constant velocity, both positions measured"
+    return ModelProblem(model, steps=300, untuned=given, name="velocity", about=about)
+
+
+@cache
+def swing() -> Problem:
+    """Gymnasium's pendulum, drawn from the model that filters assume."""
+    true = pendulum(0.3)
+    given = {"process_noise_cov": (1e-3, 1e-1), "measurement_noise_cov": (0.01, 0.01, 0.25)}
+    push = Steps(amplitude=2.0, hold=20)
+    name = "pendulum"
+    return ModelProblem(true, true, push, steps=300, dt=0.05, untuned=given, name=name, about="a pendulum, right")
+
+
+@cache
+def chain() -> Problem:
+    """Five masses in a chain of springs, whose model is right: thirteen numbers."""
+    from scipy.linalg import expm
+
+    k = 2.0 * STIFFNESS * np.eye(MASSES) - STIFFNESS * (np.eye(MASSES, k=1) + np.eye(MASSES, k=-1))
+    eye, zero = np.eye(MASSES), np.zeros((MASSES, MASSES))
+    a = np.block([[zero, eye], [-k, -DAMPING * eye]])
+    b = np.vstack([zero, eye])[:, :1]
+    whole = expm(DT * np.block([[a, b], [np.zeros((1, 2 * MASSES + 1))]]))
+    n = 2 * MASSES
+    model = affine_model(
+        a=whole[:n, :n],
+        b=whole[:n, n:],
+        c=np.eye(n)[[0, 2, 4]],
+        process_noise_cov=[1e-6] * MASSES + [1e-4, 4e-4, 1e-4, 1e-3, 1e-4],
+        measurement_noise_cov=[2.5e-5, 1e-4, 2.5e-5],
+        prior_mean=np.zeros(n),
+        prior_cov=[1e-4] * MASSES + [1e-2] * MASSES,
+    )
+    given = {"process_noise_cov": (1e-5,) * MASSES + (1e-3,) * MASSES, "measurement_noise_cov": (1e-4,) * 3}
+    push = Steps(amplitude=20.0, hold=40)
+    about = "five masses and springs, ten states, three displacements measured: thirteen numbers"
+    return ModelProblem(model, model, push, steps=300, dt=DT, untuned=given, name="chain", about=about)
+
+
+@cache
+def targets() -> Problem:
+    """A target in a plane and another one beside it, whose noise goes together: Q has two full blocks.
+
+    A velocity that wanders for a time T = 1 with the intensity S moves the position, too:
+    Q = (T^3/3 S, T^2/2 S; T^2/2 S, T S), van Loan's integral.
+    """
+    motion, eye = np.eye(4) + np.eye(4, k=2), np.eye(2, 4)
+    times = np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
+    intensities = np.array([[0.10, 0.06], [0.06, 0.05]]), np.array([[0.02, -0.01], [-0.01, 0.04]])
+    q = np.zeros((8, 8))
+    q[:4, :4], q[4:, 4:] = (np.kron(times, one) for one in intensities)
+    model = affine_model(
+        a=np.kron(np.eye(2), motion),
+        b=np.zeros((8, 0)),
+        c=np.block([[eye, np.zeros((2, 4))], [-eye, eye]]),
+        process_noise_cov=q,
+        measurement_noise_cov=[4.0, 1.0, 0.25, 0.25],
+        prior_mean=np.zeros(8),
+        prior_cov=[10.0, 10.0, 1.0, 1.0] * 2,
+    )
+    given = {"process_noise_cov": (0.1,) * 8, "measurement_noise_cov": (1.0,) * 4}
+    about = "a target and another one seen from it, eight states; Q has two full blocks: forty numbers"
+    return ModelProblem(model, steps=300, untuned=given, name="targets", about=about)
+
+
+@cache
+def ring(steps: int = 300) -> Problem:
+    """Lorenz-96, where twenty members need some inflation; in the first half of a run it reaches its attractor."""
+    given: dict[str, Any] = {"scale": np.ones(lorenz96.STATES), "dt": lorenz96.SUBSTEP}
+    return noise_free_problem(
+        lorenz96.model(), steps=steps, first_scored_step=steps // 2, about="Lorenz-96", **given
+    )
+
+
+@cache
+def lidar() -> Problem:
+    """OKF's lidar: twenty sets of 32 runs to learn from, and others that are held out."""
+    return lidar_problem(drawn(LIDAR_SETS * 32 + LIDAR_RUNS), LIDAR_RUNS)
+
+
+def found(name: str) -> Callable[[], Problem]:
+    """A problem by its name."""
+    return partial(find_problem, name)  # which another process can be sent
+
+
+CASES = (
+    Case("walk", "A", walk, "kf"),
+    Case("velocity", "A", velocity, "kf"),
+    Case("published_tunnel", "A", found("published_tunnel"), "kf"),
+    Case("nominal", "B", found("nominal"), "ekf"),
+    Case("pendulum", "B", swing, "ekf"),
+    Case("mismatch", "C", found("mismatch"), "ekf"),
+    Case("ambient", "C", found("ambient"), "ekf"),
+    Case("lidar", "C", lidar, "kf", FULL),
+    Case("outliers", "D", found("outliers"), "ekf"),
+    Case("deadband", "D", found("deadband"), "ekf"),
+    Case("nominal, N = 10", "E", found("nominal"), "enkf", members=10),
+    Case("lorenz96, N = 20", "E", ring, "etkf", HELD_R, 16, 20),
+    Case("chain", "F", chain, "kf"),
+    Case("targets", "F", targets, "kf", FULL_Q),
+    Case("auv:motion", "F", found("auv:motion"), "ekf"),
+    Case("nominal, blind", "G", found("nominal"), "ekf", truth=False),
+    Case("mismatch, blind", "G", found("mismatch"), "ekf", truth=False),
+    *(Case(f"nominal, {runs} runs", "H", found("nominal"), "ekf", runs=runs) for runs in (1, 3, 10)),
+    *(Case(f"velocity, {runs} runs", "H", velocity, "kf", runs=runs) for runs in (1, 3, 10)),
+)
+QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "kf", runs=4, truth=False))

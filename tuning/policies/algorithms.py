@@ -1,0 +1,119 @@
+"""Algorithms of Stable-Baselines3 by name, with hyperparameters that suit the thruster.
+
+The voltage sets the thrust of the next step, and a controller with a horizon of one step is as good as one with a
+longer horizon (docs/policies.md). So a short horizon (gamma 0.5) suffices, and returns are less noisy.
+`hyperparams/` has the same hyperparameters for rl_zoo3.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from thruster_env.core.checks import one_of
+from tuning.policies.extras import check_installed
+
+PPO_STEPS = 98 * 64 * 64  # complete rollouts of 64 steps of 64 copies: the learning rate ends at zero
+LAYERS = {"net_arch": [64, 64, 64]}
+ON_POLICY = {"gamma": 0.5, "gae_lambda": 0.9, "n_epochs": 5, "policy_kwargs": {**LAYERS, "log_std_init": -1.0}}
+OFF_POLICY = {
+    "gamma": 0.5,
+    "learning_rate": 1e-3,
+    "batch_size": 256,
+    "buffer_size": 200_000,
+    "learning_starts": 2_000,
+    "train_freq": 1,
+    "gradient_steps": 8,
+    "policy_kwargs": LAYERS,
+}
+
+# Hyperparameters that may be given, all plain data: neither output paths nor classes or functions.
+HYPERPARAMETERS = (
+    *("learning_rate", "gamma", "gae_lambda", "n_steps", "n_epochs", "batch_size", "policy_kwargs", "noise_std"),
+    *("clip_range", "clip_range_vf", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "target_kl"),
+    *("use_sde", "sde_sample_freq", "use_sde_at_warmup", "buffer_size", "learning_starts", "tau", "train_freq"),
+    *("gradient_steps", "target_update_interval", "target_entropy", "policy_delay", "stats_window_size"),
+    *("target_policy_noise", "target_noise_clip", "optimize_memory_usage"),
+)
+POLICY_ARGUMENTS = (
+    *(
+        "net_arch",
+        "log_std_init",
+        "ortho_init",
+        "full_std",
+        "use_expln",
+        "squash_output",
+        "n_critics",
+    ),
+    *("share_features_extractor", "lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm"),
+)
+
+
+class Algorithm(NamedTuple):
+    """An algorithm and its defaults."""
+
+    about: str
+    module: str
+    policy: str
+    steps: int
+    num_envs: int
+    hyperparameters: Mapping  # learning_rate: the initial one; it falls linearly to zero
+
+    @property
+    def name(self) -> str:
+        """Name of its class."""
+        return self.module.partition(":")[2]
+
+    def load_class(self):
+        """The class itself; raises ValueError if the extra `rl` is not installed."""
+        check_installed()
+        module, _, name = self.module.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "ppo": Algorithm(
+        "proximal policy optimisation, on-policy; the shortest training time",
+        "stable_baselines3:PPO",
+        "MlpPolicy",
+        PPO_STEPS,
+        64,
+        {**ON_POLICY, "n_steps": 64, "batch_size": 256, "learning_rate": 1e-3},
+    ),
+    "sac": Algorithm(
+        "soft actor-critic, off-policy; few steps, but each one is slow",
+        "stable_baselines3:SAC",
+        "MlpPolicy",
+        40_000,
+        16,
+        OFF_POLICY,
+    ),
+    "td3": Algorithm(
+        "twin delayed deep deterministic policy gradient, off-policy",
+        "stable_baselines3:TD3",
+        "MlpPolicy",
+        40_000,
+        16,
+        {**OFF_POLICY, "noise_std": 0.1},  # of actions: its only exploration
+    ),
+    "recurrent-ppo": Algorithm(
+        "PPO with an LSTM, which can learn its own filter; very slow",
+        "sb3_contrib:RecurrentPPO",
+        "MlpLstmPolicy",
+        PPO_STEPS,
+        64,
+        {
+            **ON_POLICY,
+            "n_steps": 64,
+            "batch_size": 512,
+            "learning_rate": 1e-3,
+            "policy_kwargs": {"net_arch": [64], "log_std_init": -1.0, "lstm_hidden_size": 32},
+        },
+    ),
+}
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The algorithm of a name; raises ValueError for an unknown one."""
+    return ALGORITHMS[one_of("algo", name, tuple(ALGORITHMS))]

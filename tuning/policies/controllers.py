@@ -1,0 +1,83 @@
+"""Controllers of plants as policies, and policies that correct a controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from tuning.policies.spaces import size_of
+
+
+class Controller(Protocol):
+    """A controller that acts on observations (n, d) of the env, in the units of its inputs."""
+
+    def predict(self, observation, state=None, episode_start=None):
+        """Inputs (n, p), and the controller's state."""
+
+
+@dataclass(frozen=True)
+class ClassicalPolicy:
+    """A controller of a plant with the observations and actions of learnt policies."""
+
+    controller: Controller
+    skipped: int  # entries before those that the controller reads
+    half: float | np.ndarray  # half of the range of each input, in its unit: the voltage's is max_voltage ...
+    middle: float | np.ndarray = 0.0  # ... about this
+    keeps_input: bool = False  # whether its state begins with its last input
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, p) in [-1, 1] for observations (n, d), and the controller's state."""
+        seen = np.asarray(observation)[..., self.skipped :]
+        inputs, state = self.controller.predict(seen, state, episode_start)
+        return (inputs - self.middle) / self.half, state
+
+    def replace_last_actions(self, state: np.ndarray, actions: np.ndarray) -> None:
+        """Replace the last actions in a state by those that were applied, (n, p)."""
+        if self.keeps_input:
+            state[:, 0] = self.middle + self.half * actions[:, 0]
+
+
+class CorrectController(VecEnvWrapper):
+    """Let a policy correct a controller: a = clip(a_c + share a_p) of the two actions, each in [-1, 1].
+
+    The controller's action is appended to the observation. With a policy of zero action the result is the
+    controller.
+    Source: T. Johannink et al. (2019), "Residual reinforcement learning for robot control", ICRA, 6023-6029.
+
+    Args:
+        venv: envs whose observations the controller takes, with actions in [-1, 1].
+        controller: the controller that is corrected.
+        share: the largest correction, as a fraction of half of each input's range.
+    """
+
+    def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
+        """Wrap the envs; see the class."""
+        self._controller, self._share = controller, share
+        size = size_of(venv.observation_space) + size_of(venv.action_space)
+        super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs."""
+        observations = self.venv.reset()
+        self._actions, self._state = self._controller.predict(observations)
+        return np.concatenate([observations, self._actions], axis=1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Correct the controller's actions."""
+        applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
+        self._controller.replace_last_actions(self._state, applied)
+        self.venv.step_async(applied.astype(np.float32))
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            last = infos[i]["terminal_observation"]
+            action, _ = self._controller.predict(last, self._state[i])
+            infos[i]["terminal_observation"] = np.concatenate([last, action])
+        self._actions, self._state = self._controller.predict(observations, self._state, dones)
+        return np.concatenate([observations, self._actions], axis=1), rewards, dones, infos

@@ -1,0 +1,234 @@
+"""Train a policy, with evaluations, checkpoints and TensorBoard; an interrupted training can be continued."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from thruster_env.core.files import write_whole
+from tuning.policies.environments import make_environments, seed_episodes
+from tuning.policies.model import new_model
+from tuning.policies.saved import (
+    BEST,
+    CHECKPOINTS,
+    EVALUATIONS,
+    FINAL,
+    POLICY,
+    SETUP,
+    latest_checkpoint,
+    load,
+    mend,
+    read_configuration,
+    remove,
+    reopen,
+    save,
+    whole,
+)
+from tuning.policies.score import score
+from tuning.policies.setup import TrainingConfiguration
+from tuning.policies.torch_settings import learning
+from tuning.problems.seeds import SEEDS_APART, training_seeds
+from tuning.search.interruption import stop_on_interrupt
+
+VALIDATION_EPISODES = 32  # of an evaluation during training; always the same ones
+KEPT = 2  # checkpoints
+OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
+
+
+class Trained(NamedTuple):
+    """The result of a training."""
+
+    folder: Path
+    steps: int  # total number
+    learnt: int  # number in this call
+    seconds: float  # of this call
+    curve: list[tuple[int, float]]  # steps and mean return of each evaluation
+    interrupted: bool
+    idle: float = math.nan  # mean return of actions of zero on the episodes of the evaluations; NaN without any
+
+
+def train(
+    setup: TrainingConfiguration,
+    folder: str | Path,
+    *,
+    evaluations: int = 20,
+    checkpoints: int = 10,
+    native: bool = True,
+    tensorboard: bool = True,
+    on_progress: OnProgress = lambda steps, mean_return: None,
+) -> Trained:
+    """Train a policy until it has learnt from `setup.steps` steps, and save it.
+
+    The folder gets `final/`, `best/` (by evaluation), `checkpoints/`, the evaluations and TensorBoard's files. If
+    it holds a training with the same configuration, this one continues from its latest checkpoint, with other
+    episodes. Ctrl-C ends it after the running step and saves a checkpoint.
+
+    Args:
+        setup: the training configuration.
+        folder: folder of all results.
+        evaluations: number of evaluations of the policy, always on the same episodes; none of them is held out.
+        checkpoints: number of checkpoints; the last two are kept.
+        native: whether all copies are stepped in one call.
+        tensorboard: whether to write logs for TensorBoard.
+        on_progress: called after each step of the envs.
+
+    Raises:
+        ValueError: if the folder contains something else, or a checkpoint in it is damaged.
+    """
+    folder = Path(folder)
+    start = _start(folder, setup)
+    seeds = training_seeds(setup.seed, VALIDATION_EPISODES + setup.num_envs)
+    envs = make_environments(setup, seeds[VALIDATION_EPISODES:], native=native)
+    validation = make_environments(setup, seeds[:VALIDATION_EPISODES])
+    model = _model(setup, envs, start, folder / "tensorboard" if tensorboard else None)
+    # A model seeds its envs again, by its own seed; and a continued training has had the first episodes.
+    seed_episodes(envs, _episodes_after(setup, model.num_timesteps))
+    evaluation = _Evaluation(
+        setup, folder, validation, seeds[:VALIDATION_EPISODES], evaluations, model.num_timesteps
+    )
+    before = model.num_timesteps
+    remaining = setup.steps - before
+    if remaining > 0 and start == folder / FINAL:
+        reopen(folder, before)
+    if not (folder / FINAL).exists():
+        write_whole(folder / SETUP, setup.as_json())
+    began = time.perf_counter()
+    with stop_on_interrupt() as interrupted, learning(model):
+        watch = _Watch(setup, folder, checkpoints, evaluation, interrupted, on_progress)
+        if remaining > 0:
+            model.learn(remaining, [evaluation, watch], tb_log_name=setup.observe, reset_num_timesteps=False)
+        stopped = interrupted()
+    if stopped:
+        watch.save()
+    elif not (folder / FINAL).exists():
+        save(folder / FINAL, setup, model)
+    curve = list(zip(evaluation.evaluations_timesteps, evaluation.returns, strict=True))
+    seconds = time.perf_counter() - began
+    idle = _Idle(envs.action_space)
+    envs.close()
+    validation.close()
+    zero = score(idle, setup, seeds[:VALIDATION_EPISODES]).returns.mean() if curve else math.nan
+    return Trained(folder, model.num_timesteps, model.num_timesteps - before, seconds, curve, stopped, float(zero))
+
+
+class _Idle:
+    """Actions of zero: planes and thrust held in the middle or, with a controller, that controller alone."""
+
+    def __init__(self, space):
+        """Take the space of an env's actions."""
+        self._shape = space.shape
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, p) of zero."""
+        return np.zeros((len(observation), *self._shape), dtype=np.float32), state
+
+
+def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:
+    """The saved policy to continue from, if any."""
+    mend(folder)
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return None
+    if not (folder / SETUP).is_file():
+        raise ValueError(f"the folder must be new, empty or that of a training, but {folder} contains other files")
+    differences = read_configuration(folder).differences(setup)
+    if differences:
+        rule = f"{folder} must contain a training of the same configuration to continue, but differs in"
+        raise ValueError(f"{rule} {', '.join(differences)}: give another folder")
+    latest = latest_checkpoint(folder)
+    return folder / FINAL if (folder / FINAL / POLICY).is_file() else latest
+
+
+def _episodes_after(setup: TrainingConfiguration, steps: int) -> list[int]:
+    """Seeds of the first episodes of every copy of a training that starts, or continues, after some steps."""
+    first = VALIDATION_EPISODES + steps % (SEEDS_APART // 4)  # far from held-out seeds
+    return list(training_seeds(setup.seed, first + setup.num_envs)[first:])
+
+
+def _model(
+    setup: TrainingConfiguration, envs: VecEnv, start: Path | None, tensorboard: Path | None
+) -> BaseAlgorithm:
+    if start is None:
+        return new_model(setup, envs, tensorboard)
+    model = load(start, envs, training=True).model
+    model.tensorboard_log = None if tensorboard is None else str(tensorboard)
+    return model
+
+
+def _evaluations_in(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as file:
+        return {name: file[name] for name in ("timesteps", "results", "ep_lengths")}
+
+
+class _Evaluation(EvalCallback):
+    """Evaluate on the same episodes each time, keep the best policy, continue earlier evaluations."""
+
+    def __init__(self, setup: TrainingConfiguration, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
+        self._seeds, self._setup, self._best = seeds, setup, folder / BEST
+        self.returns: list[float] = []
+        normalised = VecNormalize(envs, training=False, norm_reward=False)
+        every = max(1, setup.steps // (count * setup.num_envs))
+        super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
+        path = self._path = folder / f"{EVALUATIONS}.npz"
+        self.log_path = str(
+            path.with_name(f".{EVALUATIONS}")
+        )  # under another name: a full disk then destroys no earlier ones
+        if steps and path.is_file():
+            before = whole(path, _evaluations_in)
+            kept = before["timesteps"] <= steps
+            self.evaluations_timesteps = before["timesteps"][kept].tolist()
+            self.evaluations_results = before["results"][kept].tolist()
+            self.evaluations_length = before["ep_lengths"][kept].tolist()
+            self.returns = [float(np.mean(row)) for row in self.evaluations_results]
+            self.best_mean_reward = max(self.returns, default=-np.inf)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.eval_freq:
+            return True
+        best = self.best_mean_reward
+        seed_episodes(self.eval_env, self._seeds)
+        goes_on = super()._on_step()
+        os.replace(f"{self.log_path}.npz", self._path)
+        self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
+        if self.best_mean_reward > best:
+            save(self._best, self._setup, self.model)
+        return goes_on
+
+
+class _Watch(BaseCallback):
+    """Report progress, save checkpoints, and end on Ctrl-C."""
+
+    def __init__(
+        self,
+        setup: TrainingConfiguration,
+        folder: Path,
+        count: int,
+        evaluation: _Evaluation,
+        interrupted,
+        on_progress,
+    ):
+        super().__init__()
+        self._setup, self._folder = setup, folder / CHECKPOINTS
+        self._every = max(1, setup.steps // (count * setup.num_envs))
+        self._evaluation, self._interrupted, self._on_progress = evaluation, interrupted, on_progress
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self._every == 0:
+            self.save()
+        returns = self._evaluation.returns
+        self._on_progress(self.num_timesteps, returns[-1] if returns else float("nan"))
+        return not self._interrupted()
+
+    def save(self) -> None:
+        """Save a checkpoint, and remove those before the last ones."""
+        save(self._folder / f"{self.model.num_timesteps:09d}", self._setup, self.model, replay=True)
+        for old in sorted(path for path in self._folder.glob("*") if path.name.isdigit())[:-KEPT]:
+            remove(old)

@@ -1,0 +1,191 @@
+"""Saved policies: a folder with the network, the normalisation of its observations, and the configuration.
+
+    setup.json  policy.zip  normalisation.pkl  [replay.pkl]
+
+Such a folder is written under another name and then renamed, so that a reader never finds a part of it. Files left
+by a killed process have names that begin with a dot; `mend` removes them. Do not load files of unknown origin:
+Stable-Baselines3 and this module use pickle.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from tuning.policies.algorithms import find_algorithm
+from tuning.policies.setup import TrainingConfiguration, configuration_from_json
+from tuning.policies.spaces import box_of
+
+SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
+FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"
+EVALUATIONS = "evaluations"
+# Names of what is being written: the final one, and what `tempfile` and others put behind it.
+ASIDE = re.compile(rf"\.({re.escape(SETUP)}|{EVALUATIONS}|{FINAL}|{BEST}|\d+)\.(.+)")
+REPLACED, REMOVED = "old", "gone"  # how they end where something is replaced or removed
+
+
+class SavedPolicy(NamedTuple):
+    """A saved policy, which acts on observations of the env."""
+
+    setup: TrainingConfiguration
+    model: BaseAlgorithm
+    normalisation: VecNormalize
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, 1) in [-1, 1] for observations (n, d), and the policy's state."""
+        seen = self.normalisation.normalize_obs(np.asarray(observation))
+        return self.model.predict(seen, state, episode_start, deterministic)
+
+
+def save(folder: Path, setup: TrainingConfiguration, model: BaseAlgorithm, replay: bool = False) -> None:
+    """Save a model with normalisation and training configuration; with `replay` the replay buffer, too."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        aside.chmod(0o755)
+        (aside / SETUP).write_text(setup.as_json(), encoding="utf-8")
+        model.save(aside / POLICY)
+        normalisation = model.get_vec_normalize_env()
+        if normalisation is None:
+            raise ValueError("a policy must be saved with the normalisation of its envs, but its model has none")
+        normalisation.save(str(aside / NORMALISATION))
+        if replay and hasattr(model, "save_replay_buffer"):
+            model.save_replay_buffer(aside / REPLAY)
+        if folder.exists():
+            old = folder.with_name(f".{folder.name}.{REPLACED}")
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(folder, old)
+            os.replace(aside, folder)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            os.replace(aside, folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def remove(folder: Path) -> None:
+    """Remove a saved policy; it disappears in one step."""
+    gone = folder.with_name(f".{folder.name}.{REMOVED}")
+    shutil.rmtree(gone, ignore_errors=True)
+    os.replace(folder, gone)
+    shutil.rmtree(gone)
+
+
+def mend(folder: Path) -> None:
+    """Remove the incomplete files of a killed process from a training's folder; anything else stays as it is.
+
+    A policy that was about to be replaced is restored if its successor is missing.
+    """
+    if not folder.is_dir():
+        return
+    ours = (folder / SETUP).is_file() or all(ASIDE.fullmatch(path.name) for path in folder.iterdir())
+    for path in [*folder.iterdir(), *(folder / CHECKPOINTS).glob(".*")] if ours else []:
+        match = ASIDE.fullmatch(path.name)
+        if match is None:
+            continue
+        name, end = match.groups()
+        if end == REPLACED and not path.with_name(name).exists():
+            os.replace(path, path.with_name(name))
+        elif path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
+def find_saved(path: str | Path) -> Path:
+    """The folder of a saved policy: the given one, or a training's final policy, else its latest checkpoint.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    folder = Path(path)
+    for candidate in (folder, folder / FINAL, latest_checkpoint(folder)):
+        if candidate is not None and (candidate / POLICY).is_file():
+            return candidate
+    raise ValueError(f"a policy must be a folder that `thruster train` made, but {folder} holds none")
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint with the most steps in a training's folder."""
+    found = [path for path in (folder / CHECKPOINTS).glob("*") if path.name.isdigit()]
+    return max(found, key=lambda path: int(path.name), default=None)
+
+
+def reopen(folder: Path, steps: int) -> None:
+    """Make the final policy of a training its latest checkpoint, at its number of steps, to continue from it."""
+    checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
+    checkpoint.parent.mkdir(exist_ok=True)
+    if checkpoint.exists():  # the same policy, perhaps with its replay buffer
+        remove(folder / FINAL)
+    else:
+        os.replace(folder / FINAL, checkpoint)
+
+
+def read_configuration(folder: Path) -> TrainingConfiguration:
+    """The training configuration in a folder; raises ValueError if there is none, or it is damaged."""
+    path = folder / SETUP
+    try:
+        return configuration_from_json(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"a policy must come with its training configuration, but {path} is not readable: {error}"
+        ) from None
+
+
+def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
+    """Load a saved policy for envs with the observations of its training.
+
+    Args:
+        folder: from `find_saved`.
+        venv: the envs.
+        training: whether training continues; the model then gets the envs, normalised.
+
+    Raises:
+        ValueError: if a file is damaged, or was made with other observations or actions.
+    """
+    setup = read_configuration(folder)
+    kind = find_algorithm(setup.algo).load_class()
+    normalisation: VecNormalize = whole(folder / NORMALISATION, _normalisation)
+    shape, given = box_of(normalisation.observation_space).shape, box_of(venv.observation_space).shape
+    if shape != given:
+        rule = f"a policy trained on observe={setup.observe!r} must see {shape[0]} numbers"
+        raise ValueError(f"{rule}, but the env shows {given[0]}")
+    normalisation.set_venv(venv)
+    normalisation.training, normalisation.norm_reward = training, training
+    model = whole(
+        folder / POLICY, lambda path: kind.load(path, env=normalisation if training else None, device="cpu")
+    )
+    if model.observation_space.shape != shape or model.action_space.shape != venv.action_space.shape:
+        raise ValueError(f"policy and normalisation must belong together, but those of {folder} differ in size")
+    if training and (folder / REPLAY).is_file():
+        whole(folder / REPLAY, model.load_replay_buffer)
+    return SavedPolicy(setup, model, normalisation)
+
+
+def _normalisation(path: Path) -> VecNormalize:
+    """As `VecNormalize.load`, but without envs, since their observations may differ."""
+    found = pickle.loads(path.read_bytes())
+    if not isinstance(found, VecNormalize):
+        raise ValueError(f"it holds {type(found).__name__}")
+    return found
+
+
+def whole(path: Path, read: Callable[[Path], Any]) -> Any:
+    """The result of `read` for a file; ValueError for any error of a damaged one."""
+    try:
+        return read(path)
+    except FileNotFoundError:
+        raise ValueError(f"a saved policy must have a {path.name}, but {path} is missing") from None
+    except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None
