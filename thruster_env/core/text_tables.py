@@ -72,7 +72,7 @@ def _keep_words_whole(out: Table) -> None:
     minimal widths wider than the terminal, and cut it.
     """
     columns = [[column.header, *column.cells] for column in out.columns]
-    longest = [max((len(word) for cell in cells for word in str(cell).split()), default=1) for cells in columns]
+    longest = [max((_longest_word(str(cell)) for cell in cells), default=1) for cells in columns]
     taken = 2 * len(longest)  # by padding, frame and gaps
     if sum(longest) + taken > console.width:
         out.padding, taken = 0, len(longest) + 1
@@ -87,6 +87,15 @@ def _keep_words_whole(out: Table) -> None:
         return
     for column, width in zip(out.columns, longest, strict=True):
         column.min_width = width
+
+
+def _longest_word(cell: str) -> int:
+    """The length of the longest word of a cell; the first one of a line has its indentation."""
+    lines = [line.rstrip() for line in cell.split("\n")]
+    words = [
+        [len(line) - len(line.lstrip()) + len(line.split()[0]), *map(len, line.split())] for line in lines if line
+    ]
+    return max((length for lengths in words for length in lengths), default=1)
 
 
 def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str:
