@@ -60,11 +60,11 @@ CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
 def forget_functions():
     """Empty the caches of all makers, which do not know of limits that a test has changed."""
     for name, module in list(sys.modules.items()):
-        if name.startswith(("thruster_env.core", "thruster_env.model", "filters")):
+        if name.startswith(("thruster_env.core", "thruster_env.graphs", "thruster_env.model", "filters")):
             for value in list(vars(module).values()):
                 getattr(value, "cache_clear", lambda: None)()
-    equal_functions._first.clear()  # a maker's functions of equal arguments are equal there
-    equal_functions._known.clear()
+    for known in (equal_functions._first, equal_functions._used, equal_functions._copied):
+        known.clear()  # a maker's functions of equal arguments are equal there
 
 
 @contextmanager

@@ -135,7 +135,7 @@ def test_a_number_has_neither_truth_nor_hash():
 
 DIGESTS = """
 from filters.differentiated import recursion
-from filters.algebra import programs
+from thruster_env.graphs import programs
 from thruster_env.thruster.model import thruster_model
 model = thruster_model()
 recursion.recursion_of(model.functions, model.shape, recursion.Wanted(True, True, True))
