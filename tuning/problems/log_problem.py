@@ -205,9 +205,11 @@ class LogProblem(AssumedProblem):
     def run_label(self, seed: int) -> str:
         """The log of a block, and the times of its scored rows by the log's own clock."""
         block = self.parts.blocks[seed]
-        log = self.recorded[block.run]
+        log, times = self.recorded[block.run], self.recorded[block.run].times
+        if self._in_steps:  # whose rows have step ratios, and may stand between two stamps
+            times = log.dt * np.append(0.0, np.cumsum(self.logs[block.run].inputs[:, -1]))
         first, last = block.first + self.parts.lead, block.first + block.rows - 1
-        start, end = (log.start + log.times[row] for row in (first, last))
+        start, end = (log.start + times[row] for row in (first, last))
         return f"{log.name} from {start:.6g} to {end:.6g} s"
 
     @property
