@@ -19,7 +19,7 @@ FILES = [path for floor in FLOORS for path in sorted((ROOT / floor).rglob("*.py"
 ROOMS = {  # of thruster_env, and the rooms that each knows
     "core": set(),
     "graphs": {"core"},
-    "model": {"core"},
+    "model": {"core", "graphs"},
     "effects": {"core"},
     "render": {"core"},
     "logs": {"core", "model"},

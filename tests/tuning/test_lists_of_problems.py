@@ -3,6 +3,7 @@
 import numpy as np
 import optuna
 import pytest
+from optuna.trial import TrialState
 
 import tuning
 from filters.tuned_file import read_tuned_file
@@ -78,7 +79,8 @@ def test_what_is_reported_to_the_pruner_is_an_equal_share_of_each_problem(proble
 @pytest.mark.slow
 def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_path):
     found = tuning.tune(list(problems), "ekf", trials=14, consistent=False, progress=False)
-    best = min((trial for trial in found.trials if trial.values), key=lambda trial: trial.values[0])
+    complete = (trial for trial in found.trials if trial.state == TrialState.COMPLETE)
+    best = min(complete, key=lambda trial: trial.values[0])
     choice = choice_of("ekf", best.params, problems[0])
     data = Plan("ekf", problems).training_data()
     pairs = zip(problems, data, strict=True)

@@ -119,11 +119,13 @@ def test_runs_are_left_out_one_by_one_also_of_the_worst_problem(name):
 
 
 @pytest.mark.slow
-def test_where_the_model_is_wrong_the_log_score_earns_a_covariance_and_costs_error():
+def test_where_the_model_is_wrong_a_study_of_the_score_has_a_covariance_as_good_as_that_of_the_log_score():
     quiet_optuna()
-    found = pair("mismatch", seed=1, trials=16)
-    assert found.log_score.log_score.low > found.score.log_score.high and found.ratio.low > 1.0
-    assert nees_ratio(found.log_score) < 3.0 < 8.0 < nees_ratio(found.score)
+    found = pair(
+        "mismatch", seed=1, trials=16
+    )  # at the end the log score decides among filters of the least error
+    assert found.score.log_score.value == pytest.approx(found.log_score.log_score.value, abs=0.1)
+    assert max(nees_ratio(found.log_score), nees_ratio(found.score)) < 3.0
 
 
 @pytest.mark.slow

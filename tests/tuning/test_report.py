@@ -115,7 +115,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
     assert "held-out seeds 500000 to 500005" in words and "14, " in words
     assert str(folder) not in text
     tables = report.tables.read_text()
-    assert report.advice in tables and all(
+    assert report.advice in tables.replace("\\", "") and all(
         f"| {name} | " in tables for name in ("rule of thumb", "scaled default", "oracle")
     )
     assert "upper end of its 95 % interval" in words and "250000 to 250099" in text

@@ -12,8 +12,8 @@ import numpy as np
 from thruster_env.core.checks import as_floats, short_repr
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.modules import said
-from thruster_env.core.python_floats import with_floats
 from thruster_env.core.sources import as_value, is_array
+from thruster_env.graphs.python_floats import with_floats
 
 
 def checked_constants(given) -> tuple:

@@ -14,9 +14,9 @@ from thruster_env.core.checks import at_least, covariance, covariance_root, one_
 from thruster_env.core.derivatives import by_complex_step, complex_step
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.pickling import as_function, as_made
-from thruster_env.core.python_floats import with_python_floats
 from thruster_env.core.results import array_valued
 from thruster_env.core.sources import is_array
+from thruster_env.graphs.python_floats import with_python_floats
 from thruster_env.model.model_check import check_functions, checked_constants
 from thruster_env.model.model_digest import digest_of
 from thruster_env.model.positions import Positions

@@ -113,9 +113,10 @@ def validate(
 ) -> Validation | None:
     """Let the best trials and the baselines meet, and choose.
 
-    The best baseline is the one with the least objective. The best trial is the one with the best log score of
-    the true states among those within 5 % of the least error; without truth it is the one with the least
-    objective among the consistent ones, if these cost at most 5 % more than the best of all. The
+    The best baseline is the one with the least objective; numbers that the user gave remain it until another one
+    passes the test of trials below. The best trial is the one with the best log score of the true states among
+    those within 5 % of the least error; without truth it is the one with the least objective among the consistent
+    ones, if these cost at most 5 % more than the best of all. The
     maximum-likelihood trials are always among those that meet. A trial can be taken if
 
     - it is significantly better than the best baseline, by Student's 95 % interval of the jackknife, or by
@@ -217,9 +218,17 @@ class Choosing:
         """Find the best baseline and the best trial; see `validate`."""
         self.plan, self.ratio = plan, plan.objectives[0] not in PROPER
         self.baselines, self.trials = dict(baselines), dict(trials)
-        self.baseline = min(baselines, key=lambda name: baselines[name].value)
+        self.baseline = self._best_baseline()
         best, self.price = _best_of(plan, self.trials, self.ratio, self.baselines[self.baseline])
         self.best = best or ""
+
+    def _best_baseline(self) -> str:
+        """The baseline with the least objective; what was given, unless that one could be taken instead of it."""
+        by_value = sorted(self.baselines, key=lambda name: self.baselines[name].value)
+        if GIVEN not in self.baselines:
+            return by_value[0]
+        self.baseline = GIVEN
+        return next((name for name in by_value[: by_value.index(GIVEN)] if self.wins(name)), GIVEN)
 
     def order(self) -> Iterator[str]:
         """The best trial, then of the others those that can be taken, the best first."""

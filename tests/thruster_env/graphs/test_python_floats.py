@@ -11,9 +11,9 @@ import filters
 from filters import StateSpaceModel, make_filter, run
 from filters.c.programs import programs_of
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.python_floats import Floats, with_python_floats
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.user_functions import caught, functions_in, inverts, needs_floats, needs_python
+from thruster_env.graphs.python_floats import Floats, with_python_floats
 
 Z = np.array([0.3, 0.2, 0.5, 0.1])[None, :, None]
 
