@@ -8,7 +8,7 @@ import pytest
 
 from thruster_env.core.modules import as_module, object_named, safe_paths
 
-TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes tuning.cli multiprocessing".split()
+TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes multiprocessing".split()
 PROBLEM = """
 from tuning.cli.templates.env import SpringEnv, model
 from tuning.problems.env_problem import EnvProblem
@@ -53,7 +53,7 @@ def test_workers_run_no_file_beside_the_data(folder):
 
 @pytest.mark.slow
 def test_the_command_as_a_module_runs_no_file_beside_the_data_either(folder):
-    (folder / "tuning.cli.py").unlink()  # which is what Python itself would run
+    (folder / "tuning.py").unlink()  # which is what Python itself would run
     done = started(folder, sys.executable, "-m", "tuning.cli", "evaluate", "--filter", "ekf", "--seeds", "2",
                    "--problem", "my_problem:problem")  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -76,7 +77,9 @@ def command(
 def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
     """A study of the filter type and its parameters, within the budget, on the same runs."""
     plan = plan._replace(filter=AUTO, budget=BUDGET)
-    return tune(plan, trials, storage=storage, out=out / f"{AUTO}-{SCENARIO}-seed{plan.seed}.json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # few trials: a demo is short
+        return tune(plan, trials, storage=storage, out=out / f"{AUTO}-{SCENARIO}-seed{plan.seed}.json")
 
 
 def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) -> list[str | Table]:
