@@ -38,6 +38,7 @@ MULTIPLES = {
     "degF": ("K", 5.0 / 9.0),
 }
 OFFSET = {"K": (1.0, 0.0), "degC": (1.0, 273.15), "degF": (5.0 / 9.0, 459.67 * 5.0 / 9.0)}  # factor, and K of 0
+OFFSET |= {f"{prefix}K": (factor, 0.0) for prefix, factor in PREFIXES.items()}
 TURNING = ("1/s", "1/min", "1/h", "s^-1", "min^-1", "h^-1")  # of turns, or of radians: nobody knows
 WRITTEN = {"Nm": "N*m", "°C": "degC", "°F": "degF", "°": "deg"}  # as pint reads them
 WRITTEN |= {**dict.fromkeys(("m/s/s", "m/s2", "m/s²", "m/s**2"), "m/s^2"), **dict.fromkeys(("g0", "gn"), "g_0")}

@@ -149,3 +149,9 @@ def test_brackets_without_a_unit_say_none():
         np.testing.assert_array_equal(log.measurements[:, 0], rows)
     with pytest.raises(ValueError, match="must be one that"):
         read_log({"time": rows, "voltage [-]": rows % 2, "duty": rows}, model)
+
+
+@pytest.mark.parametrize("unit, value", [("mK", 307353.0), ("K", 307.353), ("degF", 93.5654), ("uK", 307353e3)])
+def test_a_temperature_of_any_prefix_has_the_zero_of_the_other(unit, value):
+    assert converted(np.array([value]), unit, "degC", "z")[0] == pytest.approx(34.203, abs=1e-9)
+    assert converted(np.array([34.203]), "degC", unit, "z")[0] == pytest.approx(value, rel=1e-9)
