@@ -149,8 +149,9 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     problem = LogProblem(logs_of(1500, 1500), GUESS)
     plan = Plan("kf", (problem,), objectives=("likelihood",))
     result = run_study(open_study("logs", plan), plan, 22)
-    found = result.choice.model
-    assert found["process_noise_cov"][0] == pytest.approx(Q, rel=0.4)  # the scaled default is as good as any trial
+    met = result.validation.met  # of which the scaled default is taken: no trial is significantly better
+    found = min((one for one in met if one.name.startswith("trial")), key=lambda one: one.value).choice.model
+    assert found["process_noise_cov"][0] == pytest.approx(Q, rel=0.3)
     assert found["measurement_noise_cov"] == pytest.approx(R, rel=0.15)
     comparison = evaluate_held_out(result.choice, problem, 0)
     assert comparison.seeds == problem.parts.held_out and not comparison.tuned.has_truth

@@ -32,9 +32,7 @@ CATCHING = {"CHECK_EXC_MATCH", "CHECK_EG_MATCH"}  # instructions of `except Kind
 
 def functions_in(*values: Any) -> Iterator[types.FunctionType]:
     """A user's functions among some values, and all that these may call: by name, in closures, of objects."""
-    waiting: list[tuple[Any, tuple[str, ...]]] = [
-        (value, CALL) for value in values
-    ]  # and names that are read of it
+    waiting: list[tuple[Any, tuple[str, ...]]] = [(value, CALL) for value in values]  # with names read of it
     seen: dict[int, Any] = {}  # the objects, too, so that no new one gets an id
     while waiting:
         value, names = waiting.pop()
@@ -48,9 +46,8 @@ def functions_in(*values: Any) -> Iterator[types.FunctionType]:
                 yield value
             read = (*names_read(value.__code__), *CALL)
             parts = [cell.cell_contents for cell in value.__closure__ or () if not _is_empty(cell)]
-            if (
-                not ours or value.__module__ == WRITTEN_OUT
-            ):  # others of ours have a user's functions in closures alone
+            # Other functions of ours have a user's in closures alone.
+            if not ours or value.__module__ == WRITTEN_OUT:
                 parts += [value.__globals__[name] for name in read if name in value.__globals__]
             waiting += [(part, read) for part in (*parts, *(value.__defaults__ or ()))]
         elif isinstance(value, types.MethodType):
