@@ -91,6 +91,7 @@ def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_pa
     held_out = {name: one for name, one in read_tuned_file(file)["held_out"].items() if name == "runs"}
     assert verify(file, problems).holds and held_out["runs"]["seeds"] == [13, 19]
     page = found.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"{data[0].seeds[0]} to {data[0].seeds[-1]}; {data[1].seeds[0]} to " in page
     assert "held-out runs 13 to 18" in page and "held-out seeds 500000 to 500199" in page
 
 
