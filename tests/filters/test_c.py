@@ -1,6 +1,7 @@
 """Filters in C: compiled without a warning, and the numbers of `run`."""
 
 import dataclasses
+import itertools
 import math
 import re
 import shutil
@@ -167,15 +168,14 @@ def assert_same(found, expected, accuracy):
         np.testing.assert_allclose(one, other, rtol=0, atol=accuracy * abs(other).max())
 
 
-CLANG = pytest.param(
-    *("thruster", "clang"),
-    marks=pytest.mark.skipif(shutil.which("clang") is None, reason="there is no clang to compile with"),
-)
-
-
-def of_gcc(which):
-    """One model is quick; the other ones have sizes and angles of their own."""
-    return pytest.param(which, "gcc", marks=() if which == "pendulum" else pytest.mark.slow)
+NAMES = [*OWN, *ENSEMBLES]
+# Every filter has the pendulum, with angles and two channels; the second model changes from filter to filter.
+ALTERNATING = [
+    pytest.param(name, which, "gcc", marks=pytest.mark.slow)
+    for name, which in zip(NAMES, itertools.cycle(["thruster", "affine", "no input"]), strict=False)
+]
+CLANG = pytest.mark.skipif(shutil.which("clang") is None, reason="there is no clang to compile with")
+OF_CLANG = "kf ud", "iekf", "ukf square-root", "vb", "letkf", "ienkf"
 
 
 def made(name, model):
@@ -185,9 +185,15 @@ def made(name, model):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
-@pytest.mark.parametrize(("which", "compiler"), [*map(of_gcc, MODELS), CLANG])
-def test_steps_are_those_of_run(which, compiler, name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "which", "compiler"),
+    [
+        *((name, "pendulum", "gcc") for name in NAMES),
+        *ALTERNATING,
+        *(pytest.param(name, "thruster", "clang", marks=CLANG) for name in OF_CLANG),
+    ],
+)
+def test_steps_are_those_of_run(name, which, compiler, tmp_path):
     model = MODELS[which]()
     inputs, z = simulated(model, 200 if which == "thruster" else 60, level=1.0, missing=0.2)
     filter_ = made(name, model)
@@ -241,7 +247,7 @@ def test_a_vehicle_and_many_states(name, tmp_path):
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
-@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name, tmp_path):
     filter_, inputs, z = diverging(name.split()[0])
     own = OWN[name] if name in OWN else {"ensemble_size": 13, **ENSEMBLES[name]}
@@ -255,7 +261,7 @@ def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", slow_but([*OWN, *ENSEMBLES], ("ekf", "kf square-root", "etkf")))
+@pytest.mark.parametrize("name", slow_but(NAMES, ("ekf", "kf square-root", "etkf")))
 def test_single_precision(name, tmp_path):
     for which in ("thruster", "pendulum") if name in ("ekf", "ukf", "etkf") else ("pendulum",):
         model = MODELS[which]()

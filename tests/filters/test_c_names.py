@@ -33,11 +33,10 @@ def test_names_of_the_tests_are_taken_only_where_there_are_some():
 ODD = ["exp", "a*/b", "a/*b", "what??/", 'q"uote', "R", "%d", "back\\slash", "naïve"]
 
 
-@pytest.mark.skipif(not shutil.which("g++"), reason="needs gcc")
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FREE)
-def test_a_free_name_and_any_names_of_quantities_compile_in_c_and_cpp(name, tmp_path):
-    model = StateSpaceModel(
+def of_odd_names():
+    """A model whose states and channels have odd names."""
+    names = [(name, f"s{k}", "") for k, name in enumerate(ODD)]
+    return StateSpaceModel(
         transition=lambda x, u, c: x,
         observe=lambda x, c: x,
         process_noise_cov=[1.0] * len(ODD),
@@ -45,10 +44,16 @@ def test_a_free_name_and_any_names_of_quantities_compile_in_c_and_cpp(name, tmp_
         prior_mean=[0.0] * len(ODD),
         prior_cov=[1.0] * len(ODD),
         inputs=0,
-        states=[(one, f"s{k}", "") for k, one in enumerate(ODD)],
-        measurements=[(one, f"s{k}", "") for k, one in enumerate(ODD)],
+        states=names,
+        measurements=names,
     )
-    write_project(make_filter("ekf", model), tmp_path, name)
+
+
+@pytest.mark.skipif(not shutil.which("g++"), reason="needs gcc")
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "make"), [*((name, scalar_model) for name in FREE), ("odd", of_odd_names)])
+def test_a_free_name_and_any_names_of_quantities_compile_in_c_and_cpp(name, make, tmp_path):
+    write_project(make_filter("ekf", make()), tmp_path, name)
     strict = ["-Wall", "-Wextra", "-Werror"]
     (tmp_path / "use.cpp").write_text(
         f'#include <cmath>\n#include <cstdlib>\n#include "{name}.hpp"\nint main() {{ return 0; }}\n'
