@@ -135,6 +135,7 @@ def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     assert (gain.mean(axis=0) > 1.96 * gain.std(axis=0, ddof=1) / math.sqrt(runs)).all()
 
 
+@pytest.mark.usefixtures("as_python")
 def test_a_wrapper_runs_on_it_and_draws_its_estimate():
     model = augmented_model(thruster_model(), {"ambient_velocity": Unknown(std=0.5)})
     env = EstimateState(gym.make("BowThruster-v0", render_mode="rgb_array"), filter="ekf", model=model)

@@ -21,6 +21,7 @@ def make(name, wrapped):
     return EstimateState(env, filter="ekf") if wrapped else env
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["BowThrusterTracking-v0", "BowThrusterLinear-v0"])
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_every_value_of_info_has_a_dtype_and_the_same_at_reset_and_step(name, wrapped):

@@ -70,6 +70,7 @@ def linear(columns):
     return model, own, f, h
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("columns", [True, False])
 def test_its_linear_filter_leaves_out_missing_channels_as_ours(columns):
     model, own, f, h = linear(columns)

@@ -126,12 +126,11 @@ def test_a_model_that_branches_runs_as_a_program_on_tensors_and_in_c():
 @pytest.mark.slow
 def test_machine_code_has_the_numbers_of_python():
     inputs, z = data()
-    for name in ("ekf", "ukf"):
-        for called in (False, True):
-            filter_ = make_filter(name, body(5e6, called=called))
-            found = run(filter_, KEYS, inputs, z).means
-            with interpreted():
-                np.testing.assert_allclose(found, run(filter_, KEYS, inputs, z).means, rtol=0, atol=1e-6)
+    for name, called in (("ekf", True), ("ukf", False)):
+        filter_ = make_filter(name, body(5e6, called=called))
+        found = run(filter_, KEYS, inputs, z).means
+        with interpreted():
+            np.testing.assert_allclose(found, run(filter_, KEYS, inputs, z).means, rtol=0, atol=1e-6)
 
 
 def flow(x, u, c):
