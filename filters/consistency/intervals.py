@@ -35,7 +35,7 @@ def slightly(ratio: Interval) -> str:
     return f"{percent:.1g} %" if percent >= 1e-4 else "less than 0.0001 %"
 
 
-def span(value: Interval, digits: int, unit: str = "") -> str:
+def span(value: Interval, digits: int, unit: str = "", sign: str = "") -> str:
     """A value with its 95 % interval in brackets, such as "26 % [25, 27]".
 
     Where both ends would be the same number it has up to three more digits, and beyond these no brackets.
@@ -44,12 +44,13 @@ def span(value: Interval, digits: int, unit: str = "") -> str:
         value: with its ends.
         digits: decimals.
         unit: after the value, with its space.
+        sign: "+" for signs before positive numbers, too.
     """
     for places in range(digits, digits + MORE_DIGITS + 1):
-        middle, low, high = (f"{round(part, places) + 0.0:.{places}f}" for part in value)  # no -0.00
+        middle, low, high = (f"{round(part, places) + 0.0:{sign}.{places}f}" for part in value)  # no -0.00
         if low != high:
             return f"{middle}{unit} [{low}, {high}]"
-    return f"{value.value:.{digits}f}{unit}"
+    return f"{value.value:{sign}.{digits}f}{unit}"
 
 
 def interval(value: float, resampled: np.ndarray) -> Interval:

@@ -11,6 +11,7 @@ from thruster_env.thruster.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.problems.data import checked_first_scored_step
 from tuning.search.enqueued import RESCALED
 from tuning.search.parameters import PRIOR_FACTORS
 from tuning.search.plan import Plan
@@ -64,6 +65,11 @@ def test_errors_count_from_the_scenario_s_first_scored_step_on():
     for wrong in (-1, 500):
         with pytest.raises(ValueError, match="first_scored_step must be "):
             STARTUP.replace(first_scored_step=wrong)
+    with pytest.raises(
+        ValueError, match="at most 499 in runs of 500 steps, but got 500: pass first_scored_step=0 "
+    ):
+        checked_first_scored_step(500, 500)
+    assert checked_first_scored_step(499, 500) == 499
 
 
 def test_p0_is_searched_there_and_only_there():

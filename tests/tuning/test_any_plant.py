@@ -107,12 +107,13 @@ def test_without_truth_the_innovations_stay(comparisons):
     assert said["rmse"] == [None] * 3 and said["score"] is said["nees"] is None and said["nis"] is not None
     gain = likelihood_gain(blind.true, blind.untuned)
     assert 0 < gain.low < gain.value == pytest.approx(without.log_likelihood - blind.untuned.log_likelihood)
-    assert worth(blind).startswith("raises the log-likelihood of a run by ")
+    assert worth(blind).startswith("changes the log-likelihood of a run by +")
     worse = blind._replace(tuned=blind.untuned, untuned=blind.tuned)
     loss = worse.likelihood_gains["rule of thumb"]
     assert loss.low < loss.high < 0
     size = f"{-loss.value:.2f} [{-loss.high:.2f}, {-loss.low:.2f}]"
-    assert worth(worse).startswith(f"lowers the log-likelihood of a run by {size} against the rule of thumb")
+    signed = f"{loss.value:.2f} [{loss.low:.2f}, {loss.high:.2f}]"
+    assert worth(worse).startswith(f"changes the log-likelihood of a run by {signed} against the rule of thumb")
     assert f"{size} below that of the rule of thumb" in " ".join(gains(worse, "runs"))
 
 
@@ -181,8 +182,9 @@ def test_a_leaderboard_ranks_without_truth_by_the_likelihood():
     blind, many = boards
     assert [row.verdict for row in blind.rows] == ["tie", "better", "unknown"]
     said = printed(*leaderboard.report(blind))
-    assert "has no truth: filters are compared by" in said and "nan" not in said
-    assert "by the log-likelihood: better: ekf; not to be told: low-pass." in " ".join(said.split())
+    assert "has no true states, so filters are compared by" in said and "nan" not in said
+    assert "By the log-likelihood on " in (words := " ".join(said.split()))
+    assert ", ekf is better than kf; low-pass is without a likelihood to compare with that of kf." in words
     said = printed(*leaderboard.report(many))
     assert "q_8 [K]" in said and "start-up" in said and max(map(len, said.splitlines())) <= 80
     content = leaderboard.as_json(boards)
@@ -273,7 +275,9 @@ def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
     )
     said, table, memory = held_out_section(None, Subject("s", plan, choice, None, 8, True), [comparison]).parts
     assert memory.sentences[0].startswith("Time constants of the gain: ")
-    assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
+    assert said.sentences[0].startswith(
+        "linear-3 has no true states, so filters are compared by how well they predict"
+    )
     assert table == errors_table(problem, comparison)
     assert ensemble_sizes(oracle_choice("enkf", problem), plan, []) == []
 

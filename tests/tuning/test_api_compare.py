@@ -58,7 +58,7 @@ def test_compare_is_the_command_in_one_call(as_json):  # noqa: F811
 
 def test_a_comparison_shows_itself(comparison):
     assert repr(comparison).startswith("FilterComparison(short: ekf ") and comparison.ranked() == ["ekf", "kf"]
-    assert comparison.sentences() == ["On short, against kf by the score: better: ekf."]
+    assert comparison.sentences() == ["By the score on short, ekf is better than kf."]
     table = comparison.to_frame()
     rows = comparison.boards[0].rows
     assert table["filter"].tolist() == ["kf", "ekf"] and table["verdict"].tolist() == ["", rows[1].verdict]

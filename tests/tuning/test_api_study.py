@@ -77,7 +77,9 @@ def test_what_is_printed_are_the_tables_of_the_command_line(study):
     found = study.held_out
     lines = str(found).splitlines()
     printed = report(study.tuning)
-    assert printed[0].startswith(lines[0]) and lines[0].startswith("Trial 4 rescaled is taken by the log score")
+    assert printed[0].startswith(lines[0]) and lines[0].startswith(
+        "The study returns trial 4 rescaled for its log score"
+    )
     assert any(line.startswith("RMSE on held-out seeds") for line in lines) and "\x1b" not in str(found)
     assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
     assert f"{found.evaluation.rmse[0].value:.3f}" in str(found) and "Score of the tuned filter" in str(found)

@@ -53,8 +53,8 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
     comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
     assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
     assert list(comparison.ratios)[0] == GIVEN and comparison.ratios[RULE] == (1.0, 1.0, 1.0)
-    assert " against the given numbers" in worth(comparison).partition(" and ")[0]
-    assert "that of the given numbers, x " in gains(comparison, "seeds")[0]
+    assert " against the given filter" in worth(comparison).partition(" and ")[0]
+    assert " times that of the given filter, " in gains(comparison, "seeds")[0]
 
 
 def test_a_model_with_the_noise_of_its_plant_is_given_and_the_oracle_and_competes_with_no_trial():

@@ -98,18 +98,19 @@ def scored(mean_squares, first=None):
 @pytest.mark.parametrize(
     ("squares", "said"),
     [
-        (np.full(30, 1.0004), "worse: b by 0.02 % (practically equal)."),
-        (np.full(30, 0.9), "better: b."),
+        (np.full(30, 1.0004), "b (by 0.02 %: practically equal) is worse than a."),
+        (np.full(30, 0.9), "b is better than a."),
         (
             [1e4, *np.full(29, 0.5)],
-            "no different: b (undecided: few runs dominate; the median ratio of a run is 0.71).",
+            "b (undecided: few runs dominate; the median ratio of a run is 0.71) is not significantly different "
+            "from a.",
         ),
     ],
 )
 def test_a_verdict_says_how_much_it_is_worth(squares, said):
     first = scored(np.ones(30))
     board = Leaderboard(NOMINAL, range(30), np.ones(1), [first, scored(squares, first)])
-    assert winners(board) == f"On nominal, against a by the score: {said}"
+    assert winners(board) == f"By the score on nominal, {said}"
 
 
 def test_a_size_is_for_filters_that_have_an_ensemble():
@@ -180,7 +181,7 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
     assert code == 0
     for word in ("one measured thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
         assert word in out
-    assert "On outliers, against ekf by the score: better: ekf-robust." in out
+    assert "By the score on outliers, ekf-robust is better than ekf." in out
     assert "Q and R: the plant's own (oracle; --knows true)." in out
     content = json.loads((tmp_path / "board.json").read_text())
     assert content["seeds"] == [500000, 500008] and set(content["scenarios"]) == {"outliers", "nominal"}

@@ -161,7 +161,7 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     said = scaling_sentence(comparison)
     assert "The scaled default is the given Q and R with this Q times" in said
     assert "give the model state_low and state_high" in said  # for the model has no ranges
-    assert "against the given numbers" in worth(comparison) and "rule of thumb" not in worth(comparison)
+    assert "against the given filter" in worth(comparison) and "rule of thumb" not in worth(comparison)
     assert [row[0] for row in errors_table(problem, comparison).rows][:2] == ["given", "scaled default"]
     assert "given" in numbers_table(result.choice, problem, 0, comparison.default).columns
 

@@ -31,11 +31,33 @@ def test_variances_that_are_the_same_share_a_row_and_correlations_stand_where_q_
     tied[0, 1] = tied[1, 0] = 0.5
     tied = Choice("ekf", {"process_noise_cov": tuple(map(tuple, tied.tolist()))}, {})
     found = {row[0]: row[1:] for row in number_rows([tied, equal, silent], "ekf", problem, str)}
-    assert found["correlation 12"] == ["0.5", "0.0", "None"]
-    assert found["correlation 13 to correlation 45"] == ["0.0", "0.0", "None"]
+    assert found["largest of 10 Q correlations"] == ["0.5", "0.0", "None"]
 
 
-def test_correlations_of_more_than_five_states_are_one_row_and_two_digits_stand_apart():
+@pytest.mark.parametrize(("m", "labels"), [(3, ["R correlation 12", "R correlation 13", "R correlation 23"]),
+                                           (4, ["largest of 6 R correlations"])])  # fmt: skip
+def test_correlations_of_r_of_four_channels_are_one_row_like_those_of_q(m, labels):
+    model = affine_model(
+        a=0.5 * np.eye(m),
+        b=np.zeros((m, 1)),
+        c=np.eye(m),
+        process_noise_cov=np.ones(m),
+        measurement_noise_cov=np.ones(m),
+        prior_mean=np.zeros(m),
+        prior_cov=np.ones(m),
+    )
+    problem = ModelProblem(model, inputs=[0.0] * 60, scale=np.ones(m))
+    r = np.eye(m)
+    r[0, 1] = r[1, 0] = 0.5
+    r[0, 2] = r[2, 0] = -0.6
+    choice = Choice("ekf", {"measurement_noise_cov": tuple(map(tuple, r.tolist()))}, {})
+    found = {row[0]: row[1:] for row in number_rows([choice], "ekf", problem, lambda v: f"{v:.2f}")}
+    assert [label for label in found if "correlation" in label] == labels
+    if m == 4:
+        assert found[labels[0]] == ["-0.60"]
+
+
+def test_correlations_of_many_states_are_one_row_and_two_digits_stand_apart():
     n = 11
     model = affine_model(
         a=0.5 * np.eye(n),

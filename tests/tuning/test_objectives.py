@@ -2,15 +2,20 @@
 
 import numpy as np
 import pytest
+from optuna.trial import create_trial
 from scipy.stats import chi2, multivariate_normal
 
 from filters import run
 from pages.tuning_objectives import pair
 from tests.linear_problem import LinearProblem
+from tuning.cli.tuning_report import _band_sentence
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.runs import RunMetrics, variance_ratios
+from tuning.reporting.alternatives import of_front, of_history
+from tuning.reporting.figures import draw_history
+from tuning.search.filter_types import TypeResult
 from tuning.search.measures import measured
-from tuning.search.objectives import find_objective, nees_ratio
+from tuning.search.objectives import find_objective, nees_ratio, reported, reported_about, reported_name
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, quiet_optuna, run_study
@@ -19,6 +24,40 @@ from tuning.search.trials import measure
 PROBLEM = LinearProblem(scale=(0.2, np.inf, 0.4))
 DATA = PROBLEM.data(range(8))
 CHOICE = untuned_choice("kf", PROBLEM)
+
+
+@pytest.mark.parametrize(
+    ("objective", "name", "said"),
+    [
+        (
+            "likelihood",
+            "log L",
+            "costs 3 of log L on the training blocks: the best trial of all has -56, the best in",
+        ),
+        ("log-score", "log score", "costs 3 of log score on the training blocks: the best trial of all has -56, "),
+        (
+            "score",
+            "score",
+            "costs 5.4 % of score on the training blocks: the best trial of all has 56, the best in ",
+        ),
+    ],
+)
+def test_reports_have_log_l_and_not_its_negative(objective, name, said):
+    assert reported_name(objective) == name and "negative" not in reported_about(objective)
+    assert reported(objective, 59.0) == (59.0 if objective == "score" else -59.0)
+    assert said in _band_sentence(objective, 56.0, 59.0, "blocks")  # 59 = -log L is worse than 56
+    trials = [create_trial(value=value) for value in (70.0, 56.0)]
+    assert f"{name} of 2 trials" in of_history(trials, objective)
+    axis = draw_history(trials, "a study", name, objective).axes[0]
+    (best,) = [line for line in axis.lines if line.get_label() == "best so far"]
+    values = [70.0, 56.0] if objective == "score" else [-70.0, -56.0]
+    assert best.get_ydata().tolist() == values and f"has {values[1]:g}." in of_history(trials, objective)
+    low, high = axis.get_ylim()
+    assert low < min(values) < max(values) < high
+    assert of_front([create_trial(values=[56.0, 2.0])], (objective, "nis")).endswith(
+        f"to {name} {values[1]:g} and nis 2."
+    )
+    assert TypeResult("ekf", 2, 0, 0, 56.0, True, None).best(objective) == f"{values[1]:g}"
 
 
 @pytest.fixture(scope="module")

@@ -120,17 +120,17 @@ def test_three_baselines_stand_with_commas_and_a_verb_is_said_once():
     given, default, rule = Interval(1.0, 0.9, 1.1), Interval(0.74, 0.7386, 0.7414), Interval(0.5, 0.5, 0.5)
     ratios = {RULE: rule, SCALED: default, GIVEN: given}
     assert worth(comparison._replace(stored_ratios=ratios)) == (
-        "makes no significant difference on 2 seeds against the given numbers, lowers the score by 26.0 % "
+        "makes no significant difference on 2 seeds against the given filter, lowers the score by 26.0 % "
         "[25.9, 26.1] against the scaled default and by 50 % against the rule of thumb"
     )
     said = worth(comparison._replace(stored_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
     many = "by 20 % [10, 30] against the"
-    assert said == f"lowers the score {many} given numbers, {many} scaled default and {many} rule of thumb"
+    assert said == f"lowers the score {many} given filter, {many} scaled default and {many} rule of thumb"
     blind = comparison._replace(tuned=found._replace(mean_squares=np.full((2, 2), np.nan)))
     gains = {GIVEN: Interval(1.0, 0.5, 1.5), SCALED: Interval(0.0, 0.0, 0.0), RULE: Interval(-2.0, -3.0, -1.0)}
     assert worth(blind._replace(stored_gains=gains)) == (
-        "raises the log-likelihood of a run by 1.00 [0.50, 1.50] against the given numbers, by 0.00 against the "
-        "scaled default and lowers the log-likelihood of a run by 2.00 [1.00, 3.00] against the rule of thumb"
+        "changes the log-likelihood of a run by +1.00 [+0.50, +1.50] against the given filter, by +0.00 against "
+        "the scaled default and by -2.00 [-3.00, -1.00] against the rule of thumb"
     )
 
 

@@ -170,8 +170,8 @@ def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
     given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(nees=2.35, state_nees=3.5)
     met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, by_error="trial 3")
     (said,) = choice_sentences(json.loads(json.dumps(as_data(met))), plan)
-    assert met.gave_way and said.startswith("The given numbers are taken by the log score")
-    assert "1.042 times the score" in said and "that of trial 3 54845 times" in said
+    assert met.gave_way and said.startswith("The study returns the given filter for its log score")
+    assert "1.042 times the score" in said and "that of trial 3 is 54845 times" in said
     assert "NEES is 2.35 times its expected value (3.5 times in the farthest state)" in said
 
 
@@ -209,10 +209,16 @@ def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
     trial = _met("trial 3", 1.01, 0.99, 1.02)
     meeting = Validation((7, 8), True, (_met(GIVEN, 1.0, 1.0, 1.0), trial), GIVEN, "trial 3", GIVEN, None)
     (said,) = choice_sentences(as_data(meeting), plan)
-    assert said.startswith("Tuning gave way to the given numbers: on 2 validation seeds no trial is significantly")
+    assert said.startswith(
+        "The study returns the given filter: on 2 validation seeds no trial is significantly better (the score of "
+        "trial 3 is 1.010 [0.990, 1.020] times as large)."
+    )
     paid = meeting._replace(met=(*meeting.met, _met("trial 4", 0.4, 0.3, 0.5, False, 5.0)), candidate="trial 4")
     said = choice_sentences(as_data(paid._replace(chosen="trial 4", price=1.742)), plan)
-    assert "Trial 4 is taken: on 2 validation seeds it has 0.400 [0.300, 0.500] times the score" in said[0]
+    assert (
+        "The study returns trial 4: on 2 validation seeds its score is 0.400 [0.300, 0.500] times that of"
+        in said[0]
+    )
     assert "would cost 174 % of the score" in said[1] and "where 2 is right" in said[1]
     assert choice_sentences(None, plan) == []
 
@@ -232,15 +238,14 @@ def test_candidates_stay_within_own_parameters_and_a_full_q_is_an_option_that_th
     met, said = result.validation, " ".join(choice_sentences(as_data(result.validation), plan))
     if full:
         assert met.chosen == FULL_Q and len(result.choice.model["process_noise_cov"]) == 3 and met.full is None
-        assert said.startswith("The noise estimation with a full Q is taken")
+        assert said.startswith("The study returns the noise estimation with a full Q")
     else:
         assert all(set(one.choice.model) == {"q"} for one in met.met) and set(result.choice.model) == {"q"}
         tried = {trial.user_attrs.get(BASELINE) for trial in result.trials}
         assert {SCALED, NOISE} <= {one.name for one in met.met} & tried
         assert met.full.name == FULL_Q and met.full.over.high < 1.0
-        assert (
-            f"{100 * (1 - met.full.over.value):.1f} % [" in said and "(--full-q), on 100 validation seeds." in said
-        )
+        assert f"it would be {100 * (1 - met.full.over.value):.1f} % [" in said
+        assert "] better on 100 validation seeds (--full-q)." in said
 
 
 def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_not():
@@ -251,16 +256,19 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
     meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", "trial 3", None)
     meeting = meeting._replace(tested=GIVEN, failures=(failure,), failed=1, runs=48)
     assert choice_sentences(as_data(meeting), plan) == [
-        "Trial 3 is taken: on 2 validation seeds it has +610 [-523, +1.74e+03] beside the log-likelihood of a run "
-        "of the best baseline, the given numbers, and is better in most of them (Wilcoxon's signed ranks, p = "
-        "0.004).",
-        "The given numbers fail in 1 of 48 seeds, run2.csv from 12 to 13.5 s with a mean NIS of 17.8 (trial 3: "
-        "2.8), where 2 is right.",
+        "The study returns trial 3: on 2 validation seeds its log-likelihood of a run is 610 [-523, 1740] above "
+        "that of the best baseline, the given filter, and it is better in most of them (Wilcoxon's signed ranks, "
+        "p = 0.004).",
+        "The given filter fails in 1 of 48 seeds, in run2.csv from 12 to 13.5 s (mean NIS 17.8; trial 3: 2.8); a "
+        "mean NIS of 2 is right.",
     ]
     lost = trial._replace(worse_in=("run1.csv",))
     said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
-    assert "no trial is significantly better and in no log worse (trial 3 has" in said[0]
-    assert said[0].endswith("and is worse in run1.csv).")
+    assert (
+        "no trial is significantly better without being worse in a log (the log-likelihood of a run of tr"
+        in said[0]
+    )
+    assert said[0].endswith("trial 3 is 610 [-523, 1740] higher, but it is worse in run1.csv).")
 
 
 def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
@@ -277,7 +285,7 @@ def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
         assert name == "run1" and float(start) <= first + 4.0 and float(end) >= first and one.nis > 2.0
     likely = {f"trial {one.number + 1}" for one in study.trials if MAXIMUM_LIKELIHOOD in one.user_attrs}
     assert likely and likely <= {*finalists_of(study.tuning.plan, study.trials)}
-    assert any("The given numbers fail in" in sentence for sentence in study.tuning.chosen)
+    assert any("The given filter fails in" in sentence for sentence in study.tuning.chosen)
     assert met.met[0].name == GIVEN
 
 
@@ -292,7 +300,8 @@ def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_sa
         as_data(Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)), plan
     )
     assert said[1].startswith(
-        "Your own parameters cannot express its Q and R; in trial 3 they are sigma_a = 0.25, "
+        "Your own parameters cannot express the Q and R of the noise estimation with a full Q; those of trial 3 "
+        "are sigma_a = 0.25, "
     )
     meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None)
     assert len(choice_sentences(as_data(meeting), plan)) == 1

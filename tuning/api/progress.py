@@ -114,14 +114,15 @@ def trial_bar(
 
 def _best(trials: Sequence[FrozenTrial], plan: Plan) -> str:
     """The first objective of the best trial, of a likelihood log L itself; a dash before there is one."""
-    from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
+    from tuning.search.objectives import PROPER, reported, reported_name
     from tuning.search.outcome import best_trial
 
     best = best_trial(trials)
     if best is None:
         return "-"
-    name = {LIKELIHOOD: "log L ", LOG_SCORE: "log score "}.get(plan.objectives[0], "")
-    return f"{name}{-best.values[0] if name else best.values[0]:.4g}"
+    objective = plan.objectives[0]
+    name = f"{reported_name(objective)} " if objective in PROPER else ""
+    return f"{name}{reported(objective, best.values[0]):.4g}"
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import worth
 from tuning.problems.problem import Problem, score_label
+from tuning.search.objectives import reported, reported_name
 from tuning.search.outcome import is_consistent
 from tuning.search.space import Choice
 
@@ -133,7 +134,8 @@ class Study:
         columns: dict[str, list] = {"trial": [trial.number + 1 for trial in self.trials]}
         columns["state"] = [trial.state.name.lower() for trial in self.trials]
         for place, objective in enumerate(objectives):
-            columns[objective] = [_value(trial, place) for trial in self.trials]
+            values = [_value(trial, place) for trial in self.trials]
+            columns[reported_name(objective)] = [v if v is None else reported(objective, v) for v in values]
         columns["consistent"] = [is_consistent(trial) for trial in self.trials]
         columns["seconds"] = [_seconds(trial) for trial in self.trials]
         for name in names:
@@ -145,8 +147,8 @@ class Study:
         from tuning.reporting.figures import draw_history
 
         objective = self.tuning.plan.objectives[0]
-        label = score_label(self.tuning.plan.scenarios) if objective == "score" else objective
-        return drawn(draw_history(self.trials, f"Study {self.name}", label))
+        label = score_label(self.tuning.plan.scenarios) if objective == "score" else reported_name(objective)
+        return drawn(draw_history(self.trials, f"Study {self.name}", label, objective))
 
     def plot_errors(self) -> Figure:
         """RMSE before and after on held-out seeds, with 95 % intervals and the bound.

@@ -12,7 +12,7 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
 from tuning.search.filter_types import TypeResult
-from tuning.search.objectives import LIKELIHOOD
+from tuning.search.objectives import LIKELIHOOD, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -38,14 +38,15 @@ def front_table(plan: Plan, front: Sequence) -> Table:
     """The Pareto front of trials, the best in the first objective first."""
     names = list(dict.fromkeys(name for trial in front for name in trial.params))
     rows = [
-        [str(trial.number + 1), *(f"{v:.4g}" for v in trial.values)]
+        [str(trial.number + 1)]
+        + [f"{reported(*pair):.4g}" for pair in zip(plan.objectives, trial.values, strict=True)]
         + [_number(trial.params.get(name, "")) for name in names]
         for trial in sorted(front, key=lambda trial: trial.values)
     ]
     caption = "No other trial is better in both objectives. The first one is the tuned filter."
     return table(
         f"Pareto front on the training {plan.scenarios[0].seed_word}",
-        ["trial", *plan.objectives, *names],
+        ["trial", *map(reported_name, plan.objectives), *names],
         rows,
         caption=caption,
     )
@@ -53,22 +54,19 @@ def front_table(plan: Plan, front: Sequence) -> Table:
 
 def kinds_table(kinds: Sequence[TypeResult], plan: Plan) -> Table:
     """Filter types that a study tried, the best first."""
+    objective = plan.objectives[0]
     rows = [
-        [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), _best(kind)]
+        [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), kind.best(objective)]
         + ["" if kind.microseconds is None else f"{kind.microseconds:.3g}"]
         for kind in kinds
     ]
-    columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
+    columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{reported_name(objective)}", "us/step"]
     caption = (
         "us/step: time of the best trial, or of the fastest if none is complete. *: mean NIS outside its band."
     )
     best = [0] if len(rows) > 1 else []
     title = f"Filters that were tried, on the training {plan.scenarios[0].seed_word}"
     return table(title, columns, rows, caption=caption, best=best)
-
-
-def _best(kind: TypeResult) -> str:
-    return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 
 MOST_FACTORS = 4  # of a start, that fit into a caption
@@ -85,9 +83,12 @@ def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
         values = [f"{optimum.parameters[i]:.4g}" for optimum in found.optima]
         name = index_pairs(one.name) + (f" [{one.unit}]" if one.unit else "")
         rows.append([name, *values, of_factor if one.log else f"± {error:.2g}"])
-    levels = [f"{level:{'.2f' if likeliest else '.6g'}}" for level in (one.level for one in found.optima)]
-    rows.append(["log L" if likeliest else found.objective, *levels, ""])
+    levels = [one.level if likeliest else reported(found.objective, one.level) for one in found.optima]
+    rows.append(
+        [reported_name(found.objective), *(f"{one:{'.2f' if likeliest else '.6g'}}" for one in levels), ""]
+    )
     rows.append(["evaluations", *(str(one.evaluations) for one in found.optima), ""])
-    what = "Maximum of the innovations' likelihood" if likeliest else f"Minimum of {found.objective}"
+    what = f"{'Maximum' if found.objective in PROPER else 'Minimum'} of {reported_name(found.objective)}"
+    what = "Maximum of the innovations' likelihood" if likeliest else what
     titles = [f"start {i + 1}" for i in range(len(found.starts))]
     return table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)

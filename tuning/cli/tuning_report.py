@@ -31,7 +31,7 @@ from tuning.reporting.residual_words import consistency_sentence, model_doubts, 
 from tuning.reporting.units import apart
 from tuning.search.filter_parameters import size_ladder
 from tuning.search.filter_types import filter_types_tried
-from tuning.search.objectives import LIKELIHOOD, NIS_BAND
+from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
 from tuning.search.ranges import at_ends, range_words
@@ -149,30 +149,41 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
     met = result.validation
     in_band = met is None or (not met.gave_way and met.named(met.chosen).consistent)
     if result.consistent is not False and result.free_value is not None and in_band:
-        price = 100 * (result.best_value / result.free_value - 1)
-        free, held = apart(result.free_value, result.best_value)
-        shown.append(
-            f"Consistency, a mean NIS (normalised innovation squared) in its band, costs {price:.1f} % of the "
-            f"score on the training {word}: the best trial has {free} with any NIS, {held} with the NIS in "
-            "its band."
-        )
+        shown.append(_band_sentence(plan.objectives[0], result.free_value, result.best_value, word))
     if plan.objectives == ("score",):  # which needs truth
         found = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
         trained, proved = apart(result.best_value, found)
         shown.append(
-            f"Optimism, the bias of the score on the {word} that chose the filter: the tuned filter has "
-            f"{trained} on the training {word}, {proved} on the held-out ones."
+            f"Optimism: the score of the tuned filter is {trained} on the training {word}, which chose it, and "
+            f"{proved} on the held-out {word}."
         )
     if result.front:
         shown.append(front_table(plan, result.front))
     return shown
 
 
+def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
+    """What a mean NIS in its band costs on the training runs: a part of an error, a difference of a logarithm."""
+    name, levels = reported_name(objective), [reported(objective, value) for value in (free, best)]
+    price = (
+        f"{levels[0] - levels[1]:.3g} of {name}"
+        if objective in PROPER
+        else f"{100 * (best / free - 1):.1f} % of {name}"
+    )
+    with_any, within = apart(*levels)
+    return (
+        f"A mean NIS (normalised innovation squared) in its band costs {price} on the training {word}: the best "
+        f"trial of all has {with_any}, the best in the band {within}."
+    )
+
+
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
     word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
     found = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
     low, high = (channels * end for end in NIS_BAND)
-    which = "the baseline above" if gave_way(result) else f"the trial with the least {plan.objectives[0]}"
+    end = "largest" if plan.objectives[0] in PROPER else "smallest"
+    best = f"the trial with the {end} {reported_name(plan.objectives[0])}"
+    which = "the baseline above" if gave_way(result) else best
     return (
         f"No trial was consistent: a mean NIS must lie between {low:g} and {high:g}, where {channels} is right, "
         f"but the tuned filter's is {' and '.join(found)} on the training {word}. It is {which}; do not rely on "
@@ -189,7 +200,7 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
     ours, theirs = tuning.comparison.tuned, rival.tuned
     loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
     words = []
-    optimum, optima = ("maximum", "maxima") if gradient.objective == LIKELIHOOD else ("minimum", "minima")
+    optimum, optima = ("maximum", "maxima") if gradient.objective in PROPER else ("minimum", "minima")
     if loose:
         words.append(
             f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten (or half of "

@@ -48,7 +48,7 @@ class Scaled(NamedTuple):
 
 def called(name: str) -> str:
     """A baseline in a sentence, after "the"."""
-    return "given numbers" if name == GIVEN else name
+    return "given filter" if name == GIVEN else name
 
 
 def rule_of_thumb(name: str, scenario: Problem) -> Choice:

@@ -38,7 +38,12 @@ from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice
 
-VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
+VERDICTS = {  # in sentences
+    "better": "better than",
+    "worse": "worse than",
+    "tie": "not significantly different from",
+    "unknown": "without a likelihood to compare with that of",
+}
 WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
@@ -123,16 +128,17 @@ def winners(board: Leaderboard) -> str:
     said = []
     for verdict, words in VERDICTS.items():
         names = [f"{row.label}{_doubt(row, first)}" for row in others if row.verdict == verdict]
-        said += [f"{words}: {', '.join(names)}"] if names else []
+        if names:
+            said.append(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {words} {first.label}")
     by = "score" if first.evaluation.has_truth else "log-likelihood"
-    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}."
+    return f"By the {by} on {board.scenario.name}, {'; '.join(said)}."
 
 
 def _doubt(row: Row, first: Row) -> str:
     """What has to be said beside a verdict: the difference is hardly one, or a few runs make the ratio."""
     ratio = row.score_ratio
     if slight := slightly(ratio):
-        return f" by {slight} (practically equal)"
+        return f" (by {slight}: practically equal)"
     if row.verdict == "tie" and ratio.high - ratio.low > WIDE * ratio.value:
         median = median_score_ratio(row.evaluation, first.evaluation)
         return f" (undecided: few runs dominate; the median ratio of a run is {median:.2f})"

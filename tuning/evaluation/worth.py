@@ -23,8 +23,8 @@ HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this ord
 def without_truth(name: str) -> str:
     """A sentence on the comparison if a problem, called `name`, has no truth."""
     return (
-        f"{name} has no truth: filters are compared by how well they predict the measurements, the log-likelihood "
-        "and the NIS of their innovations."
+        f"{name} has no true states, so filters are compared by how well they predict the measurements: by the "
+        "log-likelihood and the NIS of their innovations."
     )
 
 
@@ -98,12 +98,11 @@ def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
     states = problem.model().states
     some, more = found.steps[:MOST_TIMES], len(found.steps) - MOST_TIMES
     rest = f" and {more} shorter ones" if more > 0 else ""
-    said = (
-        f"Time constants of the gain: {_times(some, problem)}{rest}, the longest of {states[found.slowest].symbol}"
-    )
+    slowest = states[found.slowest].symbol
+    said = f"Time constants of the gain: {_times(some, problem)}{rest}; the longest is of {slowest}"
     if found.unobservable:
         names = ", ".join(states[place].symbol for place in found.unobservable)
-        said += f"; of {names} the measurements tell nothing by themselves, whatever the gain"
+        said += f"; the measurements alone do not determine {names}, whatever the gain"
     return f"{said}."
 
 
@@ -134,10 +133,7 @@ def all_warnings(comparisons: Sequence[Comparison], problems: Sequence[Problem])
 def _likelihood_worth(comparison: Comparison) -> str:
     gains = {name: gained for name, gained in comparison.likelihood_gains.items() if name in HEADLINE}
     parts = [
-        (
-            f"{'raises' if gained.value >= 0 else 'lowers'} the log-likelihood of a run",
-            f"by {span(sized(gained), 2)} against the {called(name)}",
-        )
+        ("changes the log-likelihood of a run", f"by {span(gained, 2, sign='+')} against the {called(name)}")
         for name, gained in gains.items()
         if not isnan(gained.value)
     ]

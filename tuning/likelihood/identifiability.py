@@ -246,7 +246,7 @@ def sentences(found: Identifiability) -> list[str]:
         trade = f" Least determined is a change of several together: {_listed(parts)}." if len(parts) > 1 else ""
         said.append(
             f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
-            f"the most likely value lies at the end of the range.{trade}"
+            f"the maximum of the likelihood lies at the end of the range.{trade}"
         )
     return list(map(index_pairs, said))
 

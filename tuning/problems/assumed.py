@@ -19,7 +19,7 @@ from thruster_env.core.checks import at_least, positive, short_repr
 from thruster_env.core.modules import said
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import check_data
-from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import GIVEN, SPREAD, Problem
 
@@ -65,11 +65,7 @@ class AssumedProblem(Problem):
         """Check the arguments; see the class."""
         self.name, self.about = name, about
         self.steps = at_least("steps", steps, 2, MOST_STEPS)
-        self.first_scored_step = at_least("first_scored_step", first_scored_step, 0)
-        if self.first_scored_step >= self.steps:
-            raise ValueError(
-                f"first_scored_step must be below the number of steps, {self.steps}, but got {first_scored_step}"
-            )
+        self.first_scored_step = checked_first_scored_step(first_scored_step, self.steps)
         self._assumed, self._scale = assumed, None if scale is None else tuple(map(float, scale))
         self._untuned, self._true = _mapping("untuned", untuned), _mapping("true", true)
         self._parameters = with_defaults(_checked_parameters(parameters), assumed, self._untuned or {})

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.checks import at_least
+
 FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately
 
 
@@ -140,6 +142,17 @@ class Data(NamedTuple):
             if array is not None:
                 array.setflags(write=False)
         return self
+
+
+def checked_first_scored_step(value: Any, steps: int) -> int:
+    """The first scored step of runs of `steps` steps; ValueError if no step would be scored."""
+    first = at_least("first_scored_step", value, 0)
+    if first >= steps:
+        raise ValueError(
+            f"first_scored_step must be at most {steps - 1} in runs of {steps} steps, but got {first}: pass "
+            f"first_scored_step=0 to score every step, or longer runs"
+        )
+    return first
 
 
 def runs_of(data: Data, count: int = 2) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -12,7 +12,7 @@ from thruster_env.core.checks import as_floats, short_repr
 from thruster_env.logs.columns import STATE
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems.data import FIRST_SCORED_STEP
+from tuning.problems.data import FIRST_SCORED_STEP, checked_first_scored_step
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.parameter import Parameter
 
@@ -67,7 +67,7 @@ class RunsProblem(LogProblem):
         super().__init__(
             logs,
             model,
-            lead=first_scored_step,
+            lead=checked_first_scored_step(first_scored_step, max(log.steps for log in logs)),
             blocks=1,
             held_out=None if held_out is None else [f"run {place}" for place in held_out],
             shortest=1,

@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from thruster_env.core.checks import at_least, short_repr, vector
 from thruster_env.env.env import as_json
-from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.excitation import Excitation, Steps, excitation_of
 from tuning.problems.plain import frozen, plain
 from tuning.problems.problem import Problem
@@ -61,13 +61,8 @@ class BaseScenario(Problem):
                 raise ValueError(f"{name} must be {called}, but got {short_repr(getattr(self, name))}")
         checked = self.own_checks() | {
             "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
-            "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),
         }
-        if checked["first_scored_step"] >= checked["steps"]:
-            raise ValueError(
-                f"first_scored_step must be below the number of steps, {self.steps}, "
-                f"but got {self.first_scored_step}"
-            )
+        checked["first_scored_step"] = checked_first_scored_step(self.first_scored_step, checked["steps"])
         for entry in fields(self):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
 

@@ -14,23 +14,25 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.reporting.time_figures import one_run
+from tuning.search.objectives import reported, reported_name
 from tuning.search.outcome import best_trial
 
 NO_TRIALS = "No trial was finished."
 TWO_SIDED = 1.96
 
 
-def of_history(trials: Sequence[FrozenTrial]) -> str:
+def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:
     """First and best trial of a study, and how many were pruned."""
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     best = best_trial(done) if done else None
     if best is None:
         return NO_TRIALS
     early = sum(trial.state == TrialState.PRUNED for trial in trials)
-    first, last = done[0], best
+    first, last = (
+        f"trial {one.number + 1} has {reported(objective, one.values[0]):.4g}" for one in (done[0], best)
+    )
     return (
-        f"Objective over {len(trials)} trials, {early} of them pruned: trial {first.number + 1} has "
-        f"{first.values[0]:.4g}, the best, trial {last.number + 1}, {last.values[0]:.4g}."
+        f"{reported_name(objective)} of {len(trials)} trials, {early} of them pruned: {first}; the best, {last}."
     )
 
 
@@ -67,7 +69,11 @@ def of_front(front: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     """Both ends of a Pareto front."""
     ends = sorted(trial.values for trial in front)
     told = [
-        " and ".join(f"{name} {value:.3g}" for name, value in zip(objectives, end, strict=True)) for end in ends
+        " and ".join(
+            f"{reported_name(name)} {reported(name, value):.3g}"
+            for name, value in zip(objectives, end, strict=True)
+        )
+        for end in ends
     ]
     return f"Pareto front of {len(front)} trials, from {told[0]} to {told[-1]}."
 

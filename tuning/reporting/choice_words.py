@@ -13,6 +13,7 @@ from typing import Any
 from filters.consistency.intervals import Interval, span
 from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, called
+from tuning.evaluation.worth import sized
 from tuning.search.measures import LEVEL
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, PROPER
 from tuning.search.validation import choice_from
@@ -32,36 +33,39 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     met = {one["name"]: one for one in found["met"]}
     candidate, baseline, chosen = found["candidate"], found["baseline"], found["chosen"]
     likely = plan.objectives[0] in PROPER
-    over, what = _over(met[candidate]["over"], likely), _what(plan)
+    over, what = met[candidate]["over"], _what(plan)
     where = f"{len(_range(found['seeds']))} validation {plan.scenarios[0].seed_word}"
     if not found["own_seeds"]:
         where = f"the training {plan.scenarios[0].seed_word}, because there are too few to set some aside"
     best = f"the best baseline, the {called(baseline)}"
     if candidate == baseline:
-        said = [f"The {called(baseline)} {_verb(baseline)} taken: every trial is the same filter as a baseline."]
+        said = [f"The study returns the {called(baseline)}: every trial is the same filter as a baseline."]
     elif found.get("by_error") and found["by_error"] != chosen:
         said = [_log_score_sentence(met[chosen], met[found["by_error"]], where, what)]
     elif found["gave_way"]:
         lost = met[candidate].get("worse_in")
-        but = f", and is worse in {_listed(lost)}" if lost else ""
+        without, but = "", ""
+        if lost:
+            without, but = " without being worse in a log", f", but it is worse in {_listed(lost)}"
         said = [
-            f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better{_also(lost)} "
-            f"({candidate} has {over} its {what}{but})."
+            f"The study returns the {called(baseline)}: on {where} no trial is significantly better{without} "
+            f"(the {what} of {candidate} is {_over(over, likely)}{but})."
         ]
-    elif _is_even(met[candidate]["over"], likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
+    elif _is_even(over, likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
         said = [
-            f"{_capital(candidate)} is taken: on {where} it has {over} the {what} of {best}, and is better in "
-            f"most of them (Wilcoxon's signed ranks, p = {met[candidate]['chance']:.2g})."
+            f"The study returns {candidate}: on {where} its {what} is {_over(over, likely, best)}, and it is "
+            f"better in most of them (Wilcoxon's signed ranks, p = {met[candidate]['chance']:.2g})."
         ]
-    elif _is_even(met[candidate]["over"], likely):
+    elif _is_even(over, likely):
         said = [
-            f"{_capital(candidate)} is taken: it has the same {what} as {best}, on {where}, and is consistent."
+            f"The study returns {candidate}: on {where} it has the same {what} as {best}, whose mean NIS is "
+            "outside its band."
         ]
     else:
-        said = [f"{_capital(candidate)} is taken: on {where} it has {over} the {what} of {best}."]
+        said = [f"The study returns {candidate}: on {where} its {what} is {_over(over, likely, best)}."]
     if candidate != chosen and chosen in FULL_NOISE:
         said.append(
-            f"Your own parameters cannot express its Q and R; in {candidate} they are "
+            f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {candidate} are "
             f"{_own(met[candidate], plan)}."
         )
     channels = len(plan.scenarios[0].quantities.measurements)
@@ -80,12 +84,12 @@ def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool)
     matrices = full["name"].removeprefix("noise estimation with ")
     value, low, high = full["over"]
     ends = sorted(-100 * (part - 1.0) for part in (low, high))
-    gained = f"{_over(full['over'], likely)} its {what}"
-    if not likely:
-        gained = f"{span(Interval(100 * (1.0 - value), *ends), 1, ' %')} better by the {what}"
+    gained = f"it would be {span(Interval(100 * (1.0 - value), *ends), 1, ' %')} better"
+    if likely:
+        gained = f"its {what} would be {_over(full['over'], likely)}"
     return (
-        f"It would be {gained} with {matrices} of noise estimation, which your own parameters cannot express "
-        f"({option}), on {where}."
+        f"With {matrices} of noise estimation, which your own parameters cannot express, {gained} on {where} "
+        f"({option})."
     )
 
 
@@ -95,9 +99,9 @@ def _log_score_sentence(taken: Mapping, by_error: Mapping, where: str, what: str
     ratio, gained = taken["value"] / by_error["value"], taken["proper"] - by_error["proper"]
     nees = [_nees_words(one) for one in (taken, by_error)]
     return (
-        f"{_capital(names[0])} {_verb(taken['name'])} taken by the log score, the log density at the true state: "
-        f"on {where} it is {gained:.3g} a step above that of {names[1]}, at {ratio:.3f} times the {what}. The "
-        f"mean NEES is {nees[0]}, that of {names[1]} {nees[1]}."
+        f"The study returns {names[0]} for its log score, the log density of the true state: on {where} that is "
+        f"{gained:.3g} a step above that of {names[1]}, at {ratio:.3f} times the {what}. Its mean NEES is "
+        f"{nees[0]}; that of {names[1]} is {nees[1]}."
     )
 
 
@@ -114,20 +118,15 @@ def _the(name: str) -> str:
 def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
     """Where what was given fails, and how the best trial does there."""
     failed, runs = found["failed_runs"]
-    named = [
-        f"{one['run']} with a mean NIS of {rounded(channels * one['nis'])}"
-        + (
-            ""
-            if found["candidate"] == found["tested"]
-            else f" ({found['candidate']}: {rounded(channels * one['candidate'])})"
-        )
-        for one in found["failures"]
-    ]
-    most = "" if failed == len(named) else "most of all in "
-    tested = found["tested"]
+    candidate, tested = found["candidate"], found["tested"]
+    named = []
+    for one in found["failures"]:
+        other = "" if candidate == tested else f"; {candidate}: {rounded(channels * one['candidate'])}"
+        named.append(f"{one['run']} (mean NIS {rounded(channels * one['nis'])}{other})")
+    worst = "" if failed == len(named) else "worst "
     return (
-        f"The {called(tested)} {'fail' if _verb(tested) == 'are' else 'fails'} in {failed} of {runs} {word}, "
-        f"{most}{_listed(named)}, where {channels} is right."
+        f"The {called(tested)} fails in {failed} of {runs} {word}, {worst}in {_listed(named)}; a mean NIS "
+        f"of {channels} is right."
     )
 
 
@@ -135,22 +134,31 @@ def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) ->
     """The price of the band, with both sides of the choice."""
     inside = [one for one in found["met"] if one["consistent"] and one["name"].startswith("trial ")]
     best = min(inside, key=lambda one: one["value"])
-    nis = rounded(channels * best["nis"]), rounded(channels * taken["nis"])
+    has = [
+        f"has a {what} of {rounded(one['value'])} and a mean NIS of {rounded(channels * one['nis'])}"
+        for one in (best, taken)
+    ]
     return (
-        f"A mean NIS within its band would cost {100 * found['price']:.3g} % of the {what}, which is too much: "
-        f"{best['name']} has {rounded(best['value'])} with a mean NIS of {nis[0]}. Of the trials within "
-        f"{100 * MOST_PRICE:g} % of the best, {taken['name']} has the best log score: {rounded(taken['value'])} "
-        f"with a mean NIS of {nis[1]}, where {channels} is right."
+        f"A mean NIS in its band would cost {100 * found['price']:.3g} % of the {what}, more than the "
+        f"{100 * MOST_PRICE:g} % allowed: {best['name']}, the best in the band, {has[0]}. Of the trials within "
+        f"{100 * MOST_PRICE:g} % of the best, {taken['name']} has the best log score; it {has[1]}, where "
+        f"{channels} is right."
     )
 
 
-def _over(given: Sequence[float], likely: bool) -> str:
+def _over(given: Sequence[float], likely: bool, other: str = "") -> str:
+    """A ratio of errors, or a difference of log-likelihoods, in words: over those of `other` if that is named."""
     value, low, high = given
+    if likely:
+        value, low, high = sized(Interval(-value, -high, -low))
+    known = isfinite(low + high)
     if not likely:
-        return f"{span(Interval(value, low, high), 3) if isfinite(low + high) else format(value, '.3f')} times"
-    gained = [f"{-part:+.3g}" for part in (value, high, low)]
-    known = isfinite(low + high) and gained[1] != gained[2]
-    return f"{gained[0]} [{gained[1]}, {gained[2]}] beside" if known else f"{gained[0]} beside"
+        times = f"{span(Interval(value, low, high), 3) if known else format(value, '.3f')} times"
+        return f"{times} that of {other}" if other else f"{times} as large"
+    ends = [rounded(part) for part in (value, low, high)]
+    much = f"{ends[0]} [{ends[1]}, {ends[2]}]" if known and ends[1] != ends[2] else ends[0]
+    words = ("above", "higher") if -given[0] >= 0.0 else ("below", "lower")
+    return f"{much} {words[0]} that of {other}" if other else f"{much} {words[1]}"
 
 
 def _own(found: Mapping[str, Any], plan: Any) -> str:
@@ -174,21 +182,9 @@ def _what(plan: Any) -> str:
     return named.get(plan.objectives[0], "error")
 
 
-def _also(lost: Sequence[str] | None) -> str:
-    return " and in no log worse" if lost else ""
-
-
 def _listed(parts: Sequence[str]) -> str:
     return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
 
 
 def _range(ends: Sequence[int]) -> range:
     return range(*ends)
-
-
-def _verb(name: str) -> str:
-    return "are" if called(name).endswith("s") else "is"
-
-
-def _capital(words: str) -> str:
-    return words[:1].upper() + words[1:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from thruster_env.core.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, plotted_states
+from tuning.search.objectives import SCORE, reported
 from tuning.search.outcome import is_consistent
 
 if TYPE_CHECKING:
@@ -24,12 +26,14 @@ if TYPE_CHECKING:
 COLOURS = {GIVEN: RUST, RULE: PALE, SCALED: GREY, NOISE: MUSTARD, ORACLE: GREEN}
 
 
-def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str) -> Path:
+def history_figure(
+    path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str, objective: str = SCORE
+) -> Path:
     """Save what `draw_history` draws."""
-    return save_figure(draw_history(trials, title, label), path)
+    return save_figure(draw_history(trials, title, label, objective), path)
 
 
-def draw_history(trials: Sequence[FrozenTrial], title: str, label: str) -> Figure:
+def draw_history(trials: Sequence[FrozenTrial], title: str, label: str, objective: str = SCORE) -> Figure:
     """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
 
     Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.
@@ -38,25 +42,27 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str) -> Figur
     figure, (axis,) = panels(1, 1, (6.4, 4.4))
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     values = [trial.values[0] for trial in done]
-    early = early_trials(trials)
+    early, plotted = early_trials(trials), partial(reported, objective)
     if early:
-        x, y = [trial.number + 1 for trial, _ in early], [value for _, value in early]
+        x, y = [trial.number + 1 for trial, _ in early], [plotted(value) for _, value in early]
         axis.plot(x, y, "x", color=GREY, markersize=4, label="pruned: mean of its seeds")
     for inside, face, name in ((True, GREY, "trial"), (False, "none", "NIS outside its band")):
         some = [trial for trial in done[1:] if is_consistent(trial) == inside]
         if some:
-            x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
+            x, y = [trial.number + 1 for trial in some], [plotted(trial.values[0]) for trial in some]
             axis.plot(x, y, "o", color=GREY, markerfacecolor=face, markersize=4, label=name)
     if done:
-        axis.plot(done[0].number + 1, values[0], "s", color=RUST, markersize=7, label="first trial")
+        axis.plot(done[0].number + 1, plotted(values[0]), "s", color=RUST, markersize=7, label="first trial")
         kept = [is_consistent(trial) for trial in done]
         counted = np.where(kept, values, np.inf) if any(kept) else values
         best = np.minimum.accumulate(counted)
         best[np.isinf(best)] = np.nan
-        axis.step([t.number + 1 for t in done], best, where="post", color=BLUE, label="best so far")
-        beyond = limit_values(axis, values + [value for _, value in early])
+        axis.step(
+            [t.number + 1 for t in done], [*map(plotted, best)], where="post", color=BLUE, label="best so far"
+        )
+        beyond = limit_values(axis, values + [value for _, value in early], objective)
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
+    above = f" ({beyond} of {len(done) + len(early)} lie beyond the axis)" if done and beyond else ""
     axis.set_xlabel(f"trial{above}")
     axis.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
     axis.set_ylabel(verbatim(label))
@@ -70,12 +76,12 @@ def early_trials(trials: Sequence[FrozenTrial]) -> list[tuple[FrozenTrial, float
     return [(trial, float(np.mean(list(trial.intermediate_values.values())))) for trial in early]
 
 
-def limit_values(axis, values: list[float]) -> int:
-    """Limit an axis of objective values to the good ones and the first; return how many lie above it."""
+def limit_values(axis, values: list[float], objective: str = SCORE) -> int:
+    """Limit an axis of an objective to the good values and the first; return how many of them lie beyond it."""
     low, spread = min(values), max(values) - min(values)
     room = 0.1 * abs(low) or 0.1 * spread or 1.0
     top = max(low + 3 * room, values[0] + 1.5 * room)
-    axis.set_ylim(low - room, top)
+    axis.set_ylim(*sorted(reported(objective, end) for end in (low - room, top)))
     return sum(value > top for value in values)
 
 

@@ -9,7 +9,9 @@ from tuning.evaluation.baselines import TUNED, called
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.worth import scaling_sentence, sized, without_truth
 
-GIVEN_IS_ORACLE = "The given Q and R are the plant's own, those of the oracle: no trial of a study has them."
+GIVEN_IS_ORACLE = (
+    "The given Q and R are the plant's own, as the oracle's are; no trial of a study starts from them."
+)
 
 
 def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
@@ -17,7 +19,7 @@ def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str
     if not comparison.tuned.has_truth:
         return _likelihood_gains(comparison, seed_word, name)
     ratios = comparison.ratios
-    parts = [f"x {span(ratio, 3)} that of the {called(name)}" for name, ratio in ratios.items()]
+    parts = [f"{span(ratio, 3)} times that of the {called(name)}" for name, ratio in ratios.items()]
     first, place = next(iter(ratios)), f"{len(comparison.seeds)} held-out {seed_word}"
     said = f"Score of the {_filter(name)} on {place}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(comparison)

@@ -34,7 +34,7 @@ from tuning.reporting.sketchbook import Sketchbook
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table
 from tuning.search.filter_types import filter_types_tried, trials_of_type
-from tuning.search.objectives import find_objective
+from tuning.search.objectives import reported_about, reported_name
 from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import AUTO, Choice
 
@@ -95,24 +95,27 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     labels = [
         score_label(subject.plan.scenarios)
         if name == "score"
-        else fill(f"{name}: {find_objective(name).about}", 34)
+        else fill(f"{reported_name(name)}: {reported_about(name)}", 34)
         for name in objectives
     ]
     word = subject.plan.scenarios[0].seed_word
     caption = f"First objective of each trial on the training {word}, and the best so far."
-    picture = draw_history(trials, f"Study {subject.name}", labels[0])
-    parts: list[Part] = [book.picture(picture, caption, of_history(trials)), _importance_part(book, study, word)]
+    picture = draw_history(trials, f"Study {subject.name}", labels[0], objectives[0])
+    parts: list[Part] = [
+        book.picture(picture, caption, of_history(trials, objectives[0])),
+        _importance_part(book, study, word),
+    ]
     caption = (
         "First objective against each parameter; dashed is the best trial. Hollow: mean NIS outside its band. "
         f"Crosses: pruned, at the mean of the {word} seen."
     )
     of_kind = trials_of_type(trials, subject.choice.name)
-    parts.append(book.picture(draw_slices(of_kind, labels[0]), caption, of_slices(of_kind)))
+    parts.append(book.picture(draw_slices(of_kind, labels[0], objectives[0]), caption, of_slices(of_kind)))
     if subject.plan.filter == AUTO:
         parts.append(_kinds_table(trials, objectives[0]))
     if len(objectives) > 1:
         caption = "Trials by both objectives; no trial is better than those of the Pareto front in both."
-        picture = draw_front(trials, study.best_trials, labels)
+        picture = draw_front(trials, study.best_trials, labels, objectives)
         parts.append(book.picture(picture, caption, of_front(study.best_trials, objectives)))
     return Section(title, parts)
 
@@ -134,10 +137,10 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
 
 def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
     """Filter types that the trials chose, the best first."""
-    columns = ["filter", "trials", "pruned", "over budget", f"best {objective}", "µs/step"]
+    columns = ["filter", "trials", "pruned", "over budget", f"best {reported_name(objective)}", "µs/step"]
     rows = [
         [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
-        + ["" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"]
+        + [kind.best(objective)]
         + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
         for kind in filter_types_tried(trials)
     ]

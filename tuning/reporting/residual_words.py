@@ -34,13 +34,13 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     parts = [f"{what} {', '.join(some)}" for what, some in (("w of", w), ("v of", v)) if some]
     if not parts:
         return [
-            "Residuals of the true states, w = x' - f(x, u) and v = z - h(x), have neither a mean nor a memory "
-            f"above {SMALL:g}: nothing speaks against the model."
+            "The residuals of the true states, w = x' - f(x, u) and v = z - h(x), look like white noise: each "
+            f"mean over its standard deviation and each correlation with the next step is below {SMALL:g}."
         ]
     return [
-        f"Residuals of the true states, w = x' - f(x, u) and v = z - h(x), are no white noise about zero: "
-        f"{'; '.join(parts)} (mean over deviation; correlation with the next step). No Q or R can stand for that: "
-        "the model is wrong there."
+        f"The residuals of the true states, w = x' - f(x, u) and v = z - h(x), are not zero-mean white noise: "
+        f"{'; '.join(parts)} (mean over standard deviation; correlation with the next step). The model is wrong "
+        "there, and no Q and R make up for it."
     ]
 
 

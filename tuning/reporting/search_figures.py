@@ -15,6 +15,7 @@ from thruster_env.core.plots import BLUE, GREY, RUST, grid_of, new_figure, panel
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import early_trials, limit_values
 from tuning.reporting.panels import COLUMNS, plotted_states
+from tuning.search.objectives import SCORE, reported
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.space import FILTER_TYPE
 
@@ -81,7 +82,7 @@ def draw_importance(found: Mapping[str, float]) -> Figure:
     return figure
 
 
-def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
+def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCORE) -> Figure:
     """First objective against each parameter, a panel per parameter; dashed is the best trial.
 
     Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
@@ -94,8 +95,17 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes, names, strict=True):
         places = [trial.params[name] for trial in done]
-        axis.scatter(places, values, s=16, facecolors=faces, edgecolors=BLUE, linewidths=0.8, alpha=0.7)
-        axis.plot([trial.params[name] for trial, _ in early], [value for _, value in early], "x", **CROSS)
+        axis.scatter(
+            places,
+            [reported(objective, one) for one in values],
+            s=16,
+            facecolors=faces,
+            edgecolors=BLUE,
+            linewidths=0.8,
+            alpha=0.7,
+        )
+        crosses = [trial.params[name] for trial, _ in early], [reported(objective, value) for _, value in early]
+        axis.plot(*crosses, "x", **CROSS)
         axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
         if getattr(best.distributions[name], "log", False):
             if len({*places, *(trial.params[name] for trial, _ in early)}) == 1:
@@ -104,28 +114,40 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
         if name == "N" or name.endswith(" N"):
             _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
         axis.set_xlabel(verbatim(words(name)))
-    limit_values(axes[0], values)
+    limit_values(axes[0], values, objective)
     for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
         axis.set_ylabel(verbatim(label), fontsize=9)
     return figure
 
 
-def draw_front(trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str]) -> Figure:
+def draw_front(
+    trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str], objectives: Sequence[str]
+) -> Figure:
     """Trials by their two objectives, and the Pareto front."""
     figure = new_figure((6.4, 4.4))
     axis = figure.subplots()
     tidy([axis])
     done = np.array([trial.values for trial in trials if trial.state == TrialState.COMPLETE])
     best = np.array(sorted(trial.values for trial in front))
-    axis.plot(*done.T, "o", color=GREY, markersize=4, label="trial")
-    axis.plot(*best.T, "o-", color=BLUE, markersize=6, linewidth=1, drawstyle="steps-post", label="Pareto front")
-    axis.plot(*best[0], "s", color=RUST, markersize=8, label="best in the first objective")
+    signs = np.array([reported(name, 1.0) for name in objectives])
+    axis.plot(*(signs * done).T, "o", color=GREY, markersize=4, label="trial")
+    axis.plot(
+        *(signs * best).T,
+        "o-",
+        color=BLUE,
+        markersize=6,
+        linewidth=1,
+        drawstyle="steps-post",
+        label="Pareto front",
+    )
+    axis.plot(*(signs * best[0]), "s", color=RUST, markersize=8, label="best in the first objective")
     for axis_name, column in (("x", 0), ("y", 1)):
         low, high = best[:, column].min(), best[:, column].max()
         room = 0.5 * (high - low) or 0.2 * abs(low) or 1.0
         shown = done[done[:, column] <= high + room, column]
         pad = 0.08 * (shown.max() - low) or room
-        getattr(axis, f"set_{axis_name}lim")(low - pad, shown.max() + pad)
+        ends = signs[column] * np.array([low - pad, shown.max() + pad])
+        getattr(axis, f"set_{axis_name}lim")(*sorted(ends))
     axis.set_xlabel(verbatim(labels[0]))
     axis.set_ylabel(verbatim(labels[1]))
     axis.legend(frameon=False)

@@ -12,7 +12,7 @@ from tuning.search.space import Choice, everything_of, neutral, parameters, para
 
 SMALL, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-MOST_CORRELATIONS = 10  # of five states: more are one row with the largest
+MOST_CORRELATIONS = 3  # of three states or channels: more are one row with the largest
 ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
 

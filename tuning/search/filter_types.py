@@ -8,6 +8,7 @@ from typing import NamedTuple
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.search.cost import COST
+from tuning.search.objectives import reported
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.space import FILTER_TYPE
 
@@ -22,6 +23,12 @@ class TypeResult(NamedTuple):
     value: float | None  # first objective of its best trial; None if none is complete
     consistent: bool  # whether that trial's mean NIS (normalised innovation squared) is within its band
     microseconds: float | None  # us/step of that trial or, if none is complete, of the cheapest one
+
+    def best(self, objective: str) -> str:
+        """The first objective of the best trial in words; a star if its mean NIS is outside its band."""
+        if self.value is None:
+            return ""
+        return f"{reported(objective, self.value):.4g}{'' if self.consistent else '*'}"
 
 
 def filter_types_tried(trials: Sequence[FrozenTrial]) -> list[TypeResult]:

@@ -114,6 +114,21 @@ def find_objective(name: str) -> Objective:
     return OBJECTIVES[one_of("objective", name, (*OBJECTIVES, f"{OUTPUT}SYMBOL"))]
 
 
+def reported(name: str, value: float) -> float:
+    """The value of an objective in reports: log L and the log score themselves, not the minimised negative."""
+    return -value if name in PROPER else value
+
+
+def reported_name(name: str) -> str:
+    """The name of what `reported` returns."""
+    return {LIKELIHOOD: "log L", LOG_SCORE: "log score"}.get(name, name)
+
+
+def reported_about(name: str) -> str:
+    """One line on what `reported` returns, with its unit."""
+    return find_objective(name).about.removeprefix("negative ").replace(", -log N", ", log N")
+
+
 def check_objectives(names: Iterable[str], problem: Problem) -> None:
     """Raise ValueError if an objective needs the truth, or a derived output, that a problem does not have."""
     for name in names:
