@@ -1,5 +1,7 @@
 """What residuals of true states say of a model."""
 
+from types import SimpleNamespace
+
 import numpy as np
 from scipy.stats import norm
 
@@ -28,6 +30,10 @@ def test_a_model_that_is_right_has_white_residuals_and_one_that_is_wrong_has_not
     (said,) = residual_sentences(find_problem("mismatch"))
     assert "w of omega_m (" in said and "v of thrust (" in said and "The model is wrong there" in said
     assert residual_sentences(LinearProblem(truth=False)) == []
+    comparison = SimpleNamespace(tuned=SimpleNamespace(has_truth=True), given=None, over_regression=None)
+    assert model_doubts(find_problem("nominal"), comparison) == []
+    (said,) = model_doubts(find_problem("mismatch"), comparison)
+    assert "correlate with the next step: +0.85 (w of omega_m), +0.84 (v of thrust), where 0 is right" in said
 
 
 def test_the_numbers_are_those_of_the_residuals():

@@ -17,7 +17,18 @@ from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
 from tests.tuning.test_log_problem import MODEL, logs_of
 from tuning.api.user_choice import user_choice
-from tuning.evaluation.baselines import FULL_Q, GIVEN, NOISE, ORACLE, RULE, SCALED
+from tuning.evaluation.baselines import (
+    FULL_Q,
+    GIVEN,
+    NOISE,
+    ORACLE,
+    RULE,
+    SCALED,
+    baseline_size,
+    oracle,
+    scaled,
+    scaled_default,
+)
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
@@ -25,19 +36,21 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.units import apart
+from tuning.search import validation
 from tuning.search.enqueued import BASELINE
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.local import is_local, near
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
-from tuning.search.ranges import at_ends, range_words
-from tuning.search.space import untuned_choice
-from tuning.search.study import open_study, run_study
+from tuning.search.ranges import at_ends, range_warning, range_words
+from tuning.search.space import Choice, untuned_choice
+from tuning.search.study import StudyResult, answered_by, open_study, run_study
 from tuning.search.validation import (
     Failure,
     Met,
     Validation,
+    _baselines_of,
     _best_of,
     _by_log_score,
     _rescaled,
@@ -164,6 +177,61 @@ def test_a_rescaled_trial_has_the_estimates_of_the_trial_and_the_right_nees():
     assert _rescaled({"trial 1": trial}, plan._replace(hold_r=True), data) == {}
 
 
+def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_so_are_baselines():
+    problem, size = LinearProblem(2, 1, steps=30), 60
+    plan, data = Plan("enkf", (problem,)), [problem.data(range(16))]
+    values = {"Q11": 1e-3, "Q22": 1e-3, "R": 1e-2, "N": 6, "inflation": 1.2, "relaxation": 0.0}
+    trials = [
+        optuna.trial.create_trial(values=[1.0 + i], params={**values, "N": 6 + i}, distributions=plan.space())
+        for i in range(2)
+    ]
+    asked = []
+    finalists = finalists_of(plan, trials, lambda one, _: asked.append(one) or one.with_size(size))
+    assert {one.numbers["ensemble_size"] for one in finalists.values()} == {size} and len(asked) == 1
+    first, rescaled = next(iter(finalists.values())), _rescaled(finalists, plan, data)
+    assert measured(next(iter(rescaled.values())), plan, data).nees == pytest.approx(1.0, rel=0.3)
+    assert measured(first, plan, data).nees > 3.0
+    found = _baselines_of(plan, first, data)
+    assert {one.numbers["ensemble_size"] for one in found.values()} == {size}
+    assert (
+        found[SCALED] == scaled_default("enkf", problem, 0, size).choice != scaled_default("enkf", problem).choice
+    )
+    assert (baseline_size(first), baseline_size(first.with_size(6))) == (size, 30)
+    assert baseline_size(untuned_choice("kf", problem)) is None
+
+
+def test_the_report_says_with_how_many_members_filters_met_and_which_a_baseline_is_taken_with():
+    def of_size(name, value, size):
+        met = _met(name, value, value - 0.01, value + 0.01)
+        return met._replace(choice=Choice("enkf", {}, {"ensemble_size": size}))
+
+    plan = Plan("enkf", (LinearProblem(),))
+    pair = of_size(GIVEN, 1.0, 200), of_size("trial 3", 1.01, 200)
+    meeting = Validation((7, 8), True, pair, GIVEN, "trial 3", GIVEN, None)
+    first, second = choice_sentences(as_data(meeting), plan)
+    assert first.startswith("The study returns the given filter with N = 200 members: on 2 validation seeds no ")
+    assert second == "Trials and baselines have N = 200 members here."
+    small = meeting._replace(met=(of_size(GIVEN, 1.0, 30), of_size("trial 3", 0.9, 14)), chosen="trial 3")
+    assert choice_sentences(as_data(small), plan)[1] == "Trials have N = 14 members here, baselines 30."
+
+
+def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypatch):
+    problem = LinearProblem(2, 1, steps=30)
+    plan, result = Plan("kf", (problem,)), StudyResult(untuned_choice("kf", problem), 1.0, [], [], 0.0, False)
+    bad = scaled(oracle("kf", problem), 1e4)
+    found = answered_by(result, plan, "optimum of the likelihood", bad)
+    met = found.validation
+    assert met.gave_way and found.choice == met.named(met.baseline).choice != bad
+    (said, *_) = choice_sentences(as_data(met), plan)
+    assert said.startswith("The study returns the noise estimation: on 100 validation seeds the optimum of the ")
+    assert "is not significantly better (the score of the optimum " in said
+    assert found.best_value < measured(bad, plan, plan.training_data()).value
+    monkeypatch.setattr(validation, "competing_baselines", lambda *_: {GIVEN: bad})
+    found = answered_by(result, plan, "optimum of the likelihood", oracle("kf", problem))
+    assert found.choice == oracle("kf", problem) and found.validation.chosen == "optimum of the likelihood"
+    assert [one.name for one in found.validation.met] == [GIVEN, "optimum of the likelihood"]  # none is rescaled
+
+
 def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
     plan, trial = Plan("kf", (LinearProblem(),)), _met("trial 3", 0.96, 0.95, 0.97, True, -1e5)
     trial = trial._replace(nees=54845.0, state_nees=2.5)
@@ -201,7 +269,7 @@ def test_an_objective_without_a_run_is_that_of_the_other_runs():
 def test_no_trial_no_meeting_and_none_for_objectives_that_runs_have_not_each():
     plan = Plan("kf", (LinearProblem(),), objectives=("nis",))
     result = run_study(open_study("nis", plan), plan, 2)
-    assert result.validation is None and validate(plan, [], plan.training_data(), lambda one, _: one) is None
+    assert result.validation is None and validate(plan, {}, plan.training_data()) is None
 
 
 def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
@@ -284,7 +352,7 @@ def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
         name, _, start, _, end, _ = one.run.split()
         assert name == "run1" and float(start) <= first + 4.0 and float(end) >= first and one.nis > 2.0
     likely = {f"trial {one.number + 1}" for one in study.trials if MAXIMUM_LIKELIHOOD in one.user_attrs}
-    assert likely and likely <= {*finalists_of(study.tuning.plan, study.trials)}
+    assert likely and likely <= {*finalists_of(study.tuning.plan, study.trials, lambda one, _: one)}
     assert any("The given filter fails in" in sentence for sentence in study.tuning.chosen)
     assert met.met[0].name == GIVEN
 
@@ -318,6 +386,18 @@ def test_ranges_are_wide_hold_what_was_given_and_flag_what_ends_at_an_end():
     assert at_ends(choice, plan) == []
     (said,) = at_ends(second.set(choice, second.low), plan)
     assert said.startswith("Q22 = ") and "ended at the lower end of its range" in said and "zero" in said
+    assert range_warning(second.set(choice, second.low), plan) == []
+    ended = second.set(choice, second.high)
+    (said,) = at_ends(ended, plan)
+    assert said.index("widen the range (--where 'Q22 = ") < said.index("the model lacks something")
+    (said,) = range_warning(ended, plan)
+    option = said.partition("--where '")[2].partition("'")[0]
+    assert said.startswith("Q22 ended at the upper end of its range, ") and "Before you doubt the model" in said
+    assert (
+        at_ends(ended, plan._replace(where=(option,)))
+        == range_warning(ended, plan._replace(where=(option,)))
+        == []
+    )
     own = altitude_problem.problem()
     choice = untuned_choice("ekf", own)._replace(model={**altitude_problem.GIVEN, "sigma_a": 100.0})
     (said,) = at_ends(choice, Plan("ekf", (own,)))

@@ -126,7 +126,14 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     found, refused = answer["choice"], answer.get("refused")
     choice = plan.forgetting(Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"])))
     value = measured(choice, plan, plan.training_data()).value
-    nothing: dict[str, Any] = {"consistent": None, "nis": (), "validation": None, "sizes": [], "free_value": None}
+    nothing: dict[str, Any] = {
+        "consistent": None,
+        "nis": (),
+        "validation": None,
+        "sizes": [],
+        "sized": None,
+        "free_value": None,
+    }
     return (
         result._replace(choice=choice, best_value=value, **nothing),
         Followed(name, choice, answer["runs"], answer["seconds"], refused and Refused(*refused)),

@@ -16,7 +16,7 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import plain_text
 from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
-from tuning.evaluation.baselines import RULE, TUNED, baselines
+from tuning.evaluation.baselines import RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
@@ -77,10 +77,9 @@ class HeldOut:
     @property
     def choices(self) -> dict[str, Choice]:
         """The parameters of each filter."""
-        found = {
-            self.name: self.choice,
-            **baselines(self.choice.name, self.problem, self.seed, self.comparison.default),
-        }
+        choice, default = self.choice, self.comparison.default
+        known = baselines(choice.name, self.problem, self.seed, default, baseline_size(choice))
+        found = {self.name: choice, **known}
         return {name: found[name] for name in self.evaluations}
 
     @property
@@ -205,7 +204,7 @@ class HeldOut:
         restarts.append(memory_sentence(self.evaluation, self.problem))
         if self.is_tuned:
             said = gains(self.comparison, self.problem.seed_word, self.name)
-            return [*said, *model_doubts(self.problem, self.comparison), *restarts]
+            return [*said, *model_doubts(self.problem, self.comparison, self.seed), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.comparison), *restarts]
 

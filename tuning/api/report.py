@@ -107,7 +107,7 @@ def _of_value(study: Study, folder: Path) -> Source:
     kept = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
     kept.set_user_attr("identity", plan.identity)
     if sizes:
-        kept.set_user_attr(SIZES, sizes_as_data(sizes, study.choice, plan))
+        kept.set_user_attr(SIZES, sizes_as_data(sizes, tuning.result.sized or study.choice, plan))
     kept.add_trials(study.trials)
     file = folder / f"{study.name}.json"
     tuning.write(file)

@@ -32,9 +32,19 @@ from tuning.search.compiling import compile_filters
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.quiet import quiet_optuna
+from tuning.search.ranges import range_warning
 from tuning.search.space import AUTO
 from tuning.search.storage import open_storage
-from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
+from tuning.search.study import (
+    FINISHED,
+    StudyResult,
+    answered_by,
+    checked,
+    finished_trials,
+    open_study,
+    run_study,
+    run_trials,
+)
 from tuning.search.validation import as_data
 from tuning.search.workers import run_in_workers
 
@@ -44,6 +54,7 @@ DIGITS = 6  # of a digest in the name of a study
 METHODS = ("optuna", "gradient")
 DEFAULT_BUDGET = 2.5  # us/step of one core over the square of the number of states
 FEWEST_A_TYPE = 5  # trials of a study among filter types, over the number of types
+OPTIMUM = "optimum of the {}"  # the gradient's answer among those that meet, by its objective
 COST = "cost"  # the objective that needs no budget
 
 
@@ -76,14 +87,13 @@ class Tuning(NamedTuple):
         warned = self.warnings
         if self.way is not None:
             return (way_sentence(self.way, self.scenario.seed_word), *warned)
-        if self.gradient is not None:
-            return warned
         return (*choice_sentences(as_data(self.result.validation), self.plan), *warned)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to beware of in the tuned filter, on all scenarios: a covariance that is far off."""
-        return tuple(all_warnings(self.comparisons, self.plan.scenarios))
+        """What to beware of in the tuned filter: a covariance that is far off, and where the search ended."""
+        found = all_warnings(self.comparisons, self.plan.scenarios)
+        return (*found, *range_warning(self.result.choice, self.plan))
 
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
@@ -112,7 +122,8 @@ def run_tuning(
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        by_gradient: the objective whose gradient determines the choice, beside a study; None if the study does.
+        by_gradient: the objective whose gradient determines the choice, beside a study, if no baseline is as good;
+            None if the study does.
         way: the way of tuning that determines the choice, one of `tuning.ways.registry.WAYS`; None for a study.
         workers: processes that share the study.
 
@@ -168,7 +179,8 @@ def run_tuning(
             data, options = plan.training_data(), plan.options
             gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=by_gradient, options=options)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
-        result = result._replace(choice=plan.forgetting(gradient.choice), consistent=None, nis=())
+        with working(f"comparing it with the baselines on validation {plan.scenarios[0].seed_word}", console):
+            result = answered_by(result, plan, OPTIMUM.format(by_gradient), plan.forgetting(gradient.choice))
     try:
         with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
             comparisons = tuple(

@@ -11,7 +11,18 @@ from filters.consistency.intervals import slightly, span
 from thruster_env.core.modules import is_code
 from tuning.api.run import Tuning
 from tuning.cli.tables import choice_table, front_table, gradient_table, kinds_table
-from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED, baselines
+from tuning.evaluation.baselines import (
+    GIVEN,
+    NOISE,
+    ORACLE,
+    RULE,
+    SCALED,
+    TUNED,
+    baseline_size,
+    baselines,
+    called,
+    same_filter,
+)
 from tuning.evaluation.blow_up import blow_up_on
 from tuning.evaluation.evaluate import likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
@@ -33,10 +44,14 @@ from tuning.search.filter_parameters import size_ladder
 from tuning.search.filter_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.outcome import is_over_budget
+from tuning.search.parameters import index_pairs
 from tuning.search.plan import Plan
 from tuning.search.ranges import at_ends, range_words
+from tuning.search.space import parameters_of
 from tuning.search.study import StudyResult
 from tuning.search.validation import as_data as as_data_of_choice
+
+MOST_VALUES = 8  # of a baseline, in a sentence
 
 
 def report(tuning: Tuning) -> list[RenderableType]:
@@ -46,13 +61,14 @@ def report(tuning: Tuning) -> list[RenderableType]:
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
         first, *others = gains(comparison, scenario.seed_word)
-        shown += [f"{where}{first}", *others, *model_doubts(scenario, comparison)]
+        shown += [f"{where}{first}", *others, *model_doubts(scenario, comparison, plan.seed)]
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
     shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
     shown += [one for scenario in plan.scenarios for one in scenario.remarks]
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
-        found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
+        choice, size = result.choice, baseline_size(result.choice)
+        found = {TUNED: choice, **baselines(choice.name, scenario, plan.seed, comparison.default, size)}
         evaluations = comparison.evaluations
         choices = {name: found[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
@@ -82,12 +98,9 @@ def blown_up(tuning: Tuning) -> list[str]:
 
 
 def way_out(tuning: Tuning) -> list[str]:
-    """Advice if the tuned filter is worse than the best baseline; empty otherwise."""
-    ratios = [
-        next(iter(comparison.ratios.items())) for comparison in tuning.comparisons if comparison.tuned.has_truth
-    ]
-    worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
-    if not worse:
+    """Advice if the tuned filter is significantly worse than a baseline but the oracle; empty otherwise."""
+    better = [name for one in tuning.comparisons if (name := _best_instead(one))]
+    if not better:
         return []
     if tuning.plan.forget is not None:
         return [
@@ -97,15 +110,35 @@ def way_out(tuning: Tuning) -> list[str]:
     if tuning.gradient is not None or tuning.way is not None:
         option = "--way" if tuning.way is not None else "--method gradient"
         return [
-            f"What to take: the {worse[0]}, whose Q and R are in the table. The same command without {option} "
-            "runs a study, which ends with the best baseline if no trial is better."
+            f"What to take: the {called(better[0])}{_noise_words(tuning, better[0])}. The same command without "
+            f"{option} runs a study, which ends with the best baseline if no trial is better."
         ]
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
     pruning += ", or maximum likelihood (--method gradient)" if has_gradient(tuning.plan.filter) else ""
     return [
         f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below still "
-        f"contains the tuned filter; Q and R of the {worse[0]} are in the table."
+        f"contains the tuned filter; Q and R of the {called(better[0])} are in the table."
     ]
+
+
+def _best_instead(comparison: Comparison) -> str:
+    """The best baseline but the oracle that is significantly better than the tuned filter; empty without one."""
+    if comparison.tuned.has_truth:
+        found = {name: one.value for name, one in comparison.ratios.items() if one.low > 1 and not slightly(one)}
+    else:
+        found = {name: -one.value for name, one in comparison.likelihood_gains.items() if one.high < 0}
+    found.pop(ORACLE, None)
+    return max(found, key=lambda name: found[name], default="")
+
+
+def _noise_words(tuning: Tuning, name: str) -> str:
+    """The values of a baseline, after its name; of many where they are."""
+    choice, plan = tuning.result.choice, tuning.plan
+    found = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
+    values = parameters_of(found[name]) if name in found else {}
+    if not 0 < len(values) <= MOST_VALUES:
+        return ", whose Q and R are in the table"
+    return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
 
 
 def next_steps(tuning: Tuning) -> list[str]:
@@ -142,7 +175,7 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
             f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
         )
         shown.append(
-            f"Score relative to the best, by ensemble size, on separate {word}, with the "
+            f"Score relative to the best, by ensemble size{_sized_trial(result)}, on separate {word}, with the "
             f"upper end of its 95 % interval: {ratios}. "
             f"{_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
         )
@@ -212,10 +245,12 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
         else f"Starts reach different {optima}: the best is kept."
     )
     over = (
-        f"Score over Optuna's on the held-out {tuning.scenario.seed_word}: {span(score_ratio(ours, theirs), 3)}."
+        f"Score of the tuned filter over Optuna's on the held-out {tuning.scenario.seed_word}: "
+        f"{span(score_ratio(ours, theirs), 3)}."
     )
     if not ours.has_truth:
-        over = f"Log-likelihood of a held-out run above Optuna's: {span(likelihood_gain(ours, theirs), 2)}."
+        gained = span(likelihood_gain(ours, theirs), 2)
+        over = f"Log-likelihood of a held-out run of the tuned filter above Optuna's: {gained}."
     words.append(
         f"{agree} It took {gradient.seconds:.1f} s; {tuning.result.finished} trials of Optuna took "
         f"{tuning.result.seconds:.1f} s in this run. {over}"
@@ -231,7 +266,7 @@ def as_json(tuning: Tuning) -> dict:
             **metrics(comparison),
             **ratios_as_json(comparison),
             "likelihood_over_regression": numbers(comparison.over_regression),
-            "doubts": model_doubts(scenario, comparison),
+            "doubts": model_doubts(scenario, comparison, plan.seed),
         }
         for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
     }
@@ -304,10 +339,16 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
         some = f"N = {', '.join(map(str, without))}"
         among = f" among those whose mean NIS is in its band (that of {some} is not)"
     if gave_way(result):
-        return f"N = {kept} is the larger of the baseline's and the smallest sufficient one{among}."
+        return f"N = {kept} is the larger of the rule of thumb's and the smallest sufficient one{among}."
     if ends[kept] < 1 + SIZE_TOLERANCE:
         return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
     return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
+
+
+def _sized_trial(result: StudyResult) -> str:
+    """Which filter the sizes are of, if it is not the tuned one with another N."""
+    same = result.sized is None or same_filter(result.sized, result.choice)
+    return "" if same else " of the best trial"
 
 
 def _seeds_sentence(result: StudyResult, word: str) -> str:

@@ -19,6 +19,7 @@ from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
 from tuning.problems.coordinates import Coordinates
 from tuning.problems.problem import Problem
+from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import Choice, given_choice, oracle_choice, untuned_choice
@@ -157,8 +158,20 @@ def oracle(name: str, scenario: Problem) -> Choice | None:
     return oracle_choice(name, scenario)
 
 
+def baseline_size(choice: Choice) -> int | None:
+    """N of the baselines beside a choice: its own, or that of the rule of thumb if that is larger; None without.
+
+    With fewer members than the choice a baseline would lose by their number alone.
+    """
+    kind = filter_type(choice.name)
+    if not kind.has_ensemble:
+        return None
+    usual = ensemble_sizes_of(kind).untuned
+    return max(usual, choice.numbers.get("ensemble_size", usual))
+
+
 @lru_cache(maxsize=64)
-def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
+def scaled_default(name: str, scenario: Problem, seed: int = 0, ensemble_size: int | None = None) -> Scaled:
     """The rule of thumb with one factor on its Q, so that the mean NIS on the training runs is as expected.
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
@@ -170,6 +183,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
         name: name of the filter.
         scenario: generates the training runs, and defines the model that the filter assumes.
         seed: seed of the study.
+        ensemble_size: with which the factor is found; that of the rule of thumb if None.
 
     Returns:
         The choice with its factor and mean NIS; or the reason why there is none: the filter has no NIS, or no
@@ -178,7 +192,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
     data = data_of(scenario, scenario.training_seeds(seed, TRAINING_SEEDS))
-    rule = rule_of_thumb(name, scenario)
+    rule = _with_size(rule_of_thumb(name, scenario), ensemble_size)
 
     def nis_at(factor: float) -> float:
         ratio = nis_ratio(values_of(scaled_rule(rule, scenario, factor).filter(scenario), data, scenario.scale))
@@ -240,26 +254,44 @@ def _with_noise(choice: Choice, scenario: Problem) -> Choice:
     return choice._replace(model={**choice.model, "process_noise_cov": q, "measurement_noise_cov": r})
 
 
-def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
+def _with_size(choice: Choice, ensemble_size: int | None) -> Choice:
+    return choice if ensemble_size is None else choice.with_size(ensemble_size)
+
+
+def baselines(
+    name: str,
+    scenario: Problem,
+    seed: int = 0,
+    default: Scaled | None = None,
+    ensemble_size: int | None = None,
+) -> dict[str, Choice]:
     """All existing baselines of a filter by name, the most important one first.
 
-    The scaled default is computed for the study's seed, unless it is given. If the model's given values are the
-    rule of thumb, there is one baseline for both, called "given".
+    If the model's given values are the rule of thumb, there is one baseline for both, called "given".
+
+    Args:
+        name: name of the filter.
+        scenario: the problem.
+        seed: of the study.
+        default: the scaled default with this seed and N; computed if None.
+        ensemble_size: N of all of them, `baseline_size` beside a choice; that of the rule of thumb if None.
     """
-    scaled = (scaled_default(name, scenario, seed) if default is None else default).choice
+    scaled = (scaled_default(name, scenario, seed, ensemble_size) if default is None else default).choice
     found = {GIVEN: given(name, scenario), SCALED: scaled, RULE: rule_of_thumb(name, scenario)}
     if found[GIVEN] is not None and rule_label(scenario) == GIVEN:
         del found[RULE]
     found |= {NOISE: noise_estimated(name, scenario, seed), ORACLE: oracle(name, scenario)}
-    return {key: choice for key, choice in found.items() if choice is not None}
+    return {key: _with_size(choice, ensemble_size) for key, choice in found.items() if choice is not None}
 
 
-def competing_baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
+def competing_baselines(
+    name: str, scenario: Problem, seed: int = 0, ensemble_size: int | None = None
+) -> dict[str, Choice]:
     """The baselines that trials compete with: all but the oracle, whether it is called so or "given".
 
     A model that came with the plant's own Q and R is compared with, held out, but a study does not know them.
     """
-    found = baselines(name, scenario, seed)
+    found = baselines(name, scenario, seed, ensemble_size=ensemble_size)
     known = found.pop(ORACLE, None)
     if known is not None and RULE in found and GIVEN in found and same_filter(found[GIVEN], known):
         del found[GIVEN]

@@ -18,11 +18,9 @@ from tuning.evaluation.baselines import (
     SCALED,
     TUNED,
     Scaled,
-    given,
-    noise_estimated,
-    oracle,
+    baseline_size,
+    baselines,
     rule_label,
-    rule_of_thumb,
     same_filter,
     scaled_default,
 )
@@ -103,6 +101,8 @@ class Comparison(NamedTuple):
 def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
     """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
 
+    Baselines of an ensemble filter have as many members as the choice, or more: `baseline_size`.
+
     Args:
         choice: of a study.
         scenario: the problem.
@@ -111,15 +111,16 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     """
     seeds = scenario.held_out_seeds(seed, count)
     data = data_of(scenario, seeds)
-    default = scaled_default(choice.name, scenario, seed)
-    kind = choice.name
+    size = baseline_size(choice)
+    default = scaled_default(choice.name, scenario, seed, size)
+    known = baselines(choice.name, scenario, seed, default, size)
     choices = {
-        "untuned": rule_of_thumb(kind, scenario),
+        "untuned": known.get(RULE, known.get(GIVEN)),  # which may be the same
         "tuned": choice,
-        "true": oracle(kind, scenario),
-        "scaled": default.choice,
-        "given": given(kind, scenario),
-        "noise": noise_estimated(kind, scenario, seed),
+        "true": known.get(ORACLE),
+        "scaled": known.get(SCALED),
+        "given": known.get(GIVEN),
+        "noise": known.get(NOISE),
     }
     done: list[tuple[Choice, Evaluation]] = []
     for one in told("filters on held-out seeds", list(choices.values())):

@@ -95,7 +95,7 @@ def known(
             return _named("true", name, problem, seed, trials, ensemble_size)
         studied = _studied(name, problem, seed, trials, ensemble_size)
         return studied._replace(note=f"Model and plant differ: {error}.") if studied.source else studied
-    found = scaled_default(name, problem, seed)
+    found = scaled_default(name, problem, seed, ensemble_size)
     if found.choice is not None:
         return Known(found.choice, "scaled")
     others = {"given": given(name, problem), "noise": noise_estimated(name, problem, seed)}
@@ -113,7 +113,7 @@ def _named(knows: str, name: Any, problem: Problem, seed: int, trials: int, ense
     if knows == "untuned":
         return Known(rule_of_thumb(name, problem), knows)
     if knows == "scaled":
-        found = scaled_default(name, problem, seed)
+        found = scaled_default(name, problem, seed, ensemble_size)
         if found.choice is None:
             raise ValueError(f"{name} must have a scaled default on {problem.name}, but {found.reason}")
         return Known(found.choice, knows)
@@ -147,9 +147,7 @@ def _studied(name: Any, problem: Problem, seed: int, trials: int, ensemble_size:
         study = open_study(STUDY, plan)
         if run_trials(study, plan, data, trials):
             raise KeyboardInterrupt
-    found = {OF_BASELINE[key]: one for key, one in competing_baselines(name, problem, seed).items()}
-    if size is not None:
-        found = {key: one.with_size(size) for key, one in found.items()}
+    found = {OF_BASELINE[key]: one for key, one in competing_baselines(name, problem, seed, size).items()}
     best = best_trial(study.trials)
     if best is not None:
         found[STUDY] = plan.choice_of(best.params)

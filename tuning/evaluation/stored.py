@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tuning.evaluation.baselines import Scaled, rule_label, rule_of_thumb, scaled_rule
+from tuning.evaluation.baselines import Scaled, baseline_size, rule_label, rule_of_thumb, scaled_rule
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
@@ -115,7 +115,9 @@ def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Com
         default = Scaled(None, None, None, reason)
         if scaling["factor"] is not None:
             factor, nis = float(scaling["factor"]), float(scaling["mean_nis"])
-            default = Scaled(scaled_rule(rule_of_thumb(choice.name, problem), problem, factor), factor, nis)
+            scaled = scaled_rule(rule_of_thumb(choice.name, problem), problem, factor)
+            size = baseline_size(choice)
+            default = Scaled(scaled if size is None else scaled.with_size(size), factor, nis)
         first, beyond = map(int, held_out["seeds"])
         return Comparison(
             untuned,

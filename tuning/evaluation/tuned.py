@@ -102,7 +102,7 @@ def write_tuned(
         "comparisons": {problem.name: comparison_as_data(one) for problem, one in pairs},
         "monitor": _monitor_of(choice, plan),
         "choice": as_data(result.validation),
-        "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
+        "ensemble_sizes": sizes_as_data(result.sizes, result.sized or choice, plan) if result.sizes else None,
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 

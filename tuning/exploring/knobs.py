@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from thruster_env.core.checks import at_least, between, one_of
-from tuning.evaluation.baselines import TUNED, baselines
+from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.exploring.disturbed import disturbances_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
@@ -39,9 +39,11 @@ class Knob(NamedTuple):
 
 def marks_of(name: str, problem: Problem, tuned: Choice | None = None, seed: int = 0) -> dict[str, dict]:
     """The values of knobs, by name, of a filter's baselines and of a tuned filter."""
-    found = {label: one for label, one in baselines(name, problem, seed).items() if label in KNOWN}
-    if tuned is not None and tuned.name == name:
-        found[TUNED] = tuned
+    same = tuned if tuned is not None and tuned.name == name else None
+    known = baselines(name, problem, seed, ensemble_size=None if same is None else baseline_size(same))
+    found = {label: one for label, one in known.items() if label in KNOWN}
+    if same is not None:
+        found[TUNED] = same
     return {label: parameters_of(choice) for label, choice in found.items()}
 
 

@@ -37,7 +37,7 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
     where = f"{len(_range(found['seeds']))} validation {plan.scenarios[0].seed_word}"
     if not found["own_seeds"]:
         where = f"the training {plan.scenarios[0].seed_word}, because there are too few to set some aside"
-    best = f"the best baseline, the {called(baseline)}"
+    best, the, members = f"the best baseline, the {called(baseline)}", _the(candidate), _members(met[chosen])
     if candidate == baseline:
         said = [f"The study returns the {called(baseline)}: every trial is the same filter as a baseline."]
     elif found.get("by_error") and found["by_error"] != chosen:
@@ -47,25 +47,27 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
         without, but = "", ""
         if lost:
             without, but = " without being worse in a log", f", but it is worse in {_listed(lost)}"
+        none_is = "no trial is" if _is_trial(candidate) else f"{the} is not"
         said = [
-            f"The study returns the {called(baseline)}: on {where} no trial is significantly better{without} "
-            f"(the {what} of {candidate} is {_over(over, likely)}{but})."
+            f"The study returns the {called(baseline)}{members}: on {where} {none_is} significantly better"
+            f"{without} (the {what} of {the} is {_over(over, likely)}{but})."
         ]
     elif _is_even(over, likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
         said = [
-            f"The study returns {candidate}: on {where} its {what} is {_over(over, likely, best)}, and it is "
+            f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}, and it is "
             f"better in most of them (Wilcoxon's signed ranks, p = {met[candidate]['chance']:.2g})."
         ]
     elif _is_even(over, likely):
         said = [
-            f"The study returns {candidate}: on {where} it has the same {what} as {best}, whose mean NIS is "
+            f"The study returns {the}: on {where} it has the same {what} as {best}, whose mean NIS is "
             "outside its band."
         ]
     else:
-        said = [f"The study returns {candidate}: on {where} its {what} is {_over(over, likely, best)}."]
+        said = [f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}."]
+    said += _sizes_sentence(met, chosen)
     if candidate != chosen and chosen in FULL_NOISE:
         said.append(
-            f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {candidate} are "
+            f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {the} are "
             f"{_own(met[candidate], plan)}."
         )
     channels = len(plan.scenarios[0].quantities.measurements)
@@ -111,8 +113,35 @@ def _nees_words(met: Mapping) -> str:
     return f"{rounded(joint)} times its expected value ({rounded(single)} times in the farthest state)"
 
 
+def _is_trial(name: str) -> bool:
+    return name.startswith("trial ")
+
+
 def _the(name: str) -> str:
-    return name if name.startswith("trial ") else f"the {called(name)}"
+    return name if _is_trial(name) else f"the {called(name)}"
+
+
+def _size(met: Mapping) -> int | None:
+    """The ensemble size of one of those that met; None without an ensemble."""
+    return met["choice"]["numbers"].get("ensemble_size")
+
+
+def _members(met: Mapping) -> str:
+    """The ensemble size of one of those that met, after its name; empty without an ensemble."""
+    size = _size(met)
+    return "" if size is None else f" with N = {size} members"
+
+
+def _sizes_sentence(met: Mapping[str, Mapping], chosen: str) -> list[str]:
+    """The ensemble sizes of the filters of the chosen type that met, in a list; empty without an ensemble."""
+    kind = met[chosen]["choice"]["name"]
+    same = {name: size for name, one in met.items() if one["choice"]["name"] == kind and (size := _size(one))}
+    trials, others = ({size for name, size in same.items() if _is_trial(name) == part} for part in (True, False))
+    if len(trials | others) == 1:
+        return [f"Trials and baselines have N = {min(trials | others)} members here."]
+    if len(trials) == len(others) == 1:
+        return [f"Trials have N = {min(trials)} members here, baselines {min(others)}."]
+    return []
 
 
 def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
@@ -121,7 +150,7 @@ def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
     candidate, tested = found["candidate"], found["tested"]
     named = []
     for one in found["failures"]:
-        other = "" if candidate == tested else f"; {candidate}: {rounded(channels * one['candidate'])}"
+        other = "" if candidate == tested else f"; {_the(candidate)}: {rounded(channels * one['candidate'])}"
         named.append(f"{one['run']} (mean NIS {rounded(channels * one['nis'])}{other})")
     worst = "" if failed == len(named) else "worst "
     return (

@@ -36,6 +36,7 @@ from tuning.reporting.tables import errors_table
 from tuning.search.filter_types import filter_types_tried, trials_of_type
 from tuning.search.objectives import reported_about, reported_name
 from tuning.search.plan import SIZE_SEEDS, Plan
+from tuning.search.ranges import range_warning
 from tuning.search.space import AUTO, Choice
 
 MANY_TRIALS = 50
@@ -60,7 +61,8 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
         ]
         parts.append(f"the covariance is {' and '.join(found)}")
     warned = all_warnings(comparisons, plan.scenarios)
-    doubts = [model_doubts(*pair) for pair in zip(plan.scenarios, comparisons, strict=True)]
+    warned += range_warning(choice, plan)
+    doubts = [model_doubts(*pair, plan.seed) for pair in zip(plan.scenarios, comparisons, strict=True)]
     return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])
 
 

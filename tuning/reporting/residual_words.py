@@ -15,6 +15,7 @@ from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Problem
 
 SMALL = 0.1  # of a mean over its deviation, or of a correlation: what is below says little of a model
+STRONG = 0.5  # correlation of residuals with the next step, above which a headline says that the model is wrong
 LARGE_NIS = 3.0  # mean NIS of the given Q and R over its expected value, above which the model is in doubt
 MADE_UP = "made consistent by Q and R, not by the model"
 
@@ -55,15 +56,21 @@ def _told(
     return [f"{one.symbol} ({a:+.2g}; {b:+.2g})" for one, a, b in rows if max(abs(a), abs(b)) > SMALL]
 
 
-def model_doubts(problem: Problem, comparison: Comparison) -> list[str]:
-    """A question about the model of logs without truth, in a list; empty if nothing speaks against it.
+def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> list[str]:
+    """Strong evidence against a model, in a list; empty if there is none.
 
-    Its given Q and R have a mean NIS above three times the expected one, or the tuned filter predicts held-out
-    measurements far worse than a linear regression, `tuning.evaluation.regression`.
+    With truth, residuals of the training runs correlate by more than 0.5 with the next step. Without truth it is a
+    question: the given Q and R have a mean NIS above three times the expected one, or the tuned filter predicts
+    held-out measurements far worse than a linear regression, `tuning.evaluation.regression`.
+
+    Args:
+        problem: has the model.
+        comparison: of the tuned filter on it.
+        seed: of the study, whose training runs have the residuals.
     """
     given, over, reasons = comparison.given, comparison.over_regression, []
     if comparison.tuned.has_truth:
-        return []
+        return _correlation_doubt(problem, seed)
     if given is not None and given.nis.value > LARGE_NIS * given.expected_nis:
         reasons.append(
             f"with its own Q and R the mean NIS is {given.nis.value:.3g} where {given.expected_nis:.3g} is right"
@@ -75,6 +82,30 @@ def model_doubts(problem: Problem, comparison: Comparison) -> list[str]:
         )
     said = "; ".join(reasons)
     return [f"Is {_model_of(problem)}? {said[:1].upper()}{said[1:]}."] if said else []
+
+
+def _correlation_doubt(problem: Problem, seed: int) -> list[str]:
+    """Residuals of the true states that strongly correlate with the next step, in a sentence in a list."""
+    found, model = noise_estimation(problem, seed), problem.quantities
+    if found.process_correlation is None or found.measurement_correlation is None:
+        return []
+    parts = (
+        ("w of", model.states, found.process_correlation),
+        ("v of", model.measurements, found.measurement_correlation),
+    )
+    strong = [
+        f"{r:+.2g} ({what} {one.symbol})"
+        for what, quantities, correlation in parts
+        for one, r in zip(quantities, correlation.tolist(), strict=True)
+        if abs(r) > STRONG
+    ]
+    if not strong:
+        return []
+    return [
+        f"The residuals of the true states correlate with the next step: {', '.join(strong)}, where 0 is right. "
+        "The model is wrong there or lacks a state, and no Q and R make up for it: correct it, or estimate a "
+        "constant (--augment NAME)."
+    ]
 
 
 def _model_of(problem: Problem) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from filters.consistency.verdicts import sentences
 from filters.registry import filter_type
 from thruster_env.core.sources import is_array
-from tuning.evaluation.baselines import TUNED, baselines
+from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.alternatives import of_estimates, of_series
@@ -29,7 +29,9 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
     """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
     choice, scenario = subject.choice, subject.plan.scenarios[0]
     data, tuned = scenario.data(comparison.seeds), choice.filter(scenario)
-    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, comparison.default).items()))
+    size = baseline_size(choice)
+    known = baselines(choice.name, scenario, subject.plan.seed, comparison.default, size)
+    name, before = next(iter(known.items()))
     pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
     where = f"{scenario.name}, held-out {word} {comparison.seeds.start}"

@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from tuning.evaluation.baselines import TUNED, Scaled, baselines
+from tuning.evaluation.baselines import TUNED, Scaled, baseline_size, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
@@ -101,7 +101,7 @@ def _innovations_table(comparison: Comparison, where: str) -> Table:
 
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
     """The parameters of a tuned filter and of its baselines; the scaled default is computed unless given."""
-    found = baselines(choice.name, scenario, seed, default)
+    found = baselines(choice.name, scenario, seed, default, baseline_size(choice))
     choices, usual = {TUNED: choice, **found}, next(iter(found.values())).numbers
     whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import log
+from typing import NamedTuple
 
 from filters.tuned_file import NOISE
 from tuning.problems.parameter import Argument, Parameter
@@ -11,6 +12,8 @@ from tuning.search.parameters import MeasurementVariance, ProcessVariance, index
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
+MOST_OPTIONS = 3  # in a sentence
+WIDER = 1e4  # factor by which a range is widened, on the advice of a report
 NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has ended there
 
 
@@ -28,25 +31,67 @@ def range_words(plan: Plan) -> str:
     return "; ".join(parts)
 
 
+class Ended(NamedTuple):
+    """A parameter of a choice at an end of its range."""
+
+    name: str
+    parameter: Parameter
+    value: float
+    low: bool  # whether it is the lower end
+
+    @property
+    def wider(self) -> str:
+        """The option that widens the range at that end."""
+        one = self.parameter
+        ends = (one.low / WIDER, one.high) if self.low else (one.low, one.high * WIDER)
+        return f"--where '{self.name} = {ends[0]:.3g}..{ends[1]:.3g}'"
+
+
 def at_ends(choice: Choice, plan: Plan) -> list[str]:
-    """A sentence for each parameter of a choice at an end of its range, with advice.
+    """A sentence for each parameter of a choice at an end of its range, with advice."""
+    said = []
+    for found in _ended(choice, plan):
+        one, end = found.parameter, "lower" if found.low else "upper"
+        ends = f"{one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
+        ended = f"{index_pairs(found.name)} = {found.value:.3g} ended at the {end} end of its range, {ends}"
+        said.append(f"{ended}: {_advice(found)}.")
+    return said
+
+
+def _ended(choice: Choice, plan: Plan) -> list[Ended]:
+    """The parameters of a choice at an end of their range.
 
     Given values are not ends, nor are parameters that do not determine the choice's Q and R.
     """
     given: Mapping = plan.scenarios[0].given or {}
     own_noise = plan.scenarios[0].parameters is not None and bool(set(NOISE) & set(choice.model))
-    said = []
+    found = []
     for name, one in model_ranges(plan).items():
         value = one.get(choice)
         if value is None or own_noise or value <= 0 < one.low or value == _given_value(one, choice, given):
             continue
-        place = _place(value, one)
-        if not NEAR_END < place < 1.0 - NEAR_END:
-            end, low = ("lower", True) if place <= NEAR_END else ("upper", False)
-            told = f"{one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
-            ended = f"{index_pairs(name)} = {value:.3g} ended at the {end} end of its range, {told}"
-            said.append(f"{ended}: {_advice(one, low)}.")
-    return said
+        part = _part(value, one)
+        if not NEAR_END < part < 1.0 - NEAR_END:
+            found.append(Ended(name, one, value, part <= NEAR_END))
+    return found
+
+
+def range_warning(choice: Choice, plan: Plan) -> list[str]:
+    """The end of the search in a sentence, in a list, if Q or R of a choice is as large as its range allows.
+
+    If the Q and R from which the ranges follow are far too small, the filter looks as if its model were wrong.
+    """
+    high = [one for one in _ended(choice, plan) if not one.low and not isinstance(one.parameter.place, Argument)]
+    if not high:
+        return []
+    names, more = [index_pairs(one.name) for one in high], len(high) - MOST_OPTIONS
+    options = " ".join(one.wider for one in high[:MOST_OPTIONS]) + (f" and {more} more" if more > 0 else "")
+    listed = " and ".join([*([", ".join(names[:-1])] if names[:-1] else []), names[-1]])
+    ends = "the upper end of its range" if len(names) == 1 else "the upper ends of their ranges"
+    return [
+        f"{listed} ended at {ends}, given by the Q and R with which the study began. Before you doubt the model, "
+        f"widen the range: {options}."
+    ]
 
 
 def _is_of_model(one: Parameter) -> bool:
@@ -57,21 +102,24 @@ def _given_value(one: Parameter, choice: Choice, given: Mapping) -> float | None
     return one.get(choice._replace(model=dict(given))) if given else None
 
 
-def _place(value: float, one: Parameter) -> float:
+def _part(value: float, one: Parameter) -> float:
     """Where a value lies in its range, from 0 to 1 on the range's scale."""
     if one.log:
         return (log(value) - log(one.low)) / (log(one.high) - log(one.low))
     return (value - one.low) / (one.high - one.low)
 
 
-def _advice(one: Parameter, low: bool) -> str:
-    """What to do about a number at an end of its range."""
-    if isinstance(one.place, ProcessVariance):
+def _advice(found: Ended) -> str:
+    """What to do about a parameter at an end of its range."""
+    place, low = found.parameter.place, found.low
+    if isinstance(place, Argument):
+        return f"give its Parameter a {'lower low' if low else 'higher high'}, if that has a meaning"
+    if isinstance(place, ProcessVariance):
         if low:
             return "the data do not require this noise, and it may be zero"
-        return "the model lacks something there; repair it, or estimate a constant (--augment NAME)"
-    if isinstance(one.place, MeasurementVariance):
-        if low:
-            return "the sensor is better than its data sheet, or its readings are smoothed; keep R with --hold-r"
-        return "the sensor is far worse than its sheet, or stuck, or its model is wrong; look at its readings"
-    return f"give its Parameter a {'lower low' if low else 'higher high'}, if that has a meaning"
+        cause = "the model lacks something there: repair it, or estimate a constant (--augment NAME)"
+    elif low:
+        cause = "the sensor is better than its data sheet, or its readings are smoothed: keep R with --hold-r"
+    else:
+        cause = "the sensor is far worse than its sheet, or stuck, or its model is wrong: look at its readings"
+    return f"widen the range ({found.wider}). If it ends at the new end, too, {cause}"

@@ -27,7 +27,7 @@ from tuning.search.sizing import sized, sizes_of
 from tuning.search.space import Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
 from tuning.search.trials import cost_of, make_pruner, measure, run_trial
-from tuning.search.validation import Validation, as_data, validate
+from tuning.search.validation import Validation, as_data, finalists_of, validate
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
@@ -57,6 +57,7 @@ class StudyResult(NamedTuple):
     consistent: bool | None = None  # whether any trial's mean NIS is within its band; None without a constraint
     nis: tuple[float, ...] = ()  # NIS of the choice over the number of channels, on each scenario's training seeds
     validation: Validation | None = None  # how the best trials met the baselines; None where they did not
+    sized: Choice | None = None  # the trial of which `sizes` is the table; None without an ensemble
 
     @property
     def finished(self) -> int:
@@ -194,26 +195,23 @@ def run_study(
         )
     if study.user_attrs.get(BEST) != best.number:  # another worker may have written an older one last
         study.set_user_attr(BEST, best.number)
-    sizes: list[SizeRow] = []
+    tables: dict[str, tuple[Choice, list[SizeRow]]] = {}
 
     def resize(choice: Choice, consistent: bool) -> Choice:
-        sizes[:] = sizes_of(study, choice, plan, data, consistent)
-        return sized(choice, plan, data, sizes, consistent)
+        sizes = sizes_of(study, choice, plan, data, consistent)
+        choice = sized(choice, plan, data, sizes, consistent)
+        tables[choice.name] = choice, sizes
+        return choice
 
-    consistent = plan.is_constrained and is_consistent(best)
-    validation, value = validate(plan, present, data, resize), best.values[0]
+    finalists = finalists_of(plan, present, resize)
+    validation, value = validate(plan, finalists, data), best.values[0]
     if validation is None:
-        choice = resize(plan.choice_of(best.params), consistent)
+        choice = next(iter(finalists.values()))
     else:
-        chosen = validation.named(validation.chosen)
-        choice = chosen.choice
-        if validation.gave_way:  # a larger ensemble is no worse, a smaller one may be
-            larger = resize(choice, plan.is_constrained and chosen.consistent)
-            choice = max(choice, larger, key=lambda one: one.numbers.get("ensemble_size", 0))
+        choice = validation.named(validation.chosen).choice
         value = measured(choice, plan, data).value
-        met = [one._replace(choice=choice) if one is chosen else one for one in validation.met]
-        written = as_data(validation._replace(met=tuple(met)))
-        study.set_user_attr(CHOSEN, {"trials": len(present), **(written or {})})
+        study.set_user_attr(CHOSEN, {"trials": len(present), **(as_data(validation) or {})})
+    sized_choice, sizes = tables.get(choice.name, (None, []))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,
@@ -229,6 +227,25 @@ def run_study(
         is_consistent(best) if plan.is_constrained else None,
         tuple(map(nis_ratio, measure(choice, plan, data))) if plan.is_constrained else (),
         validation,
+        sized_choice,
+    )
+
+
+def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> StudyResult:
+    """The result with the answer of another method, which meets the baselines as trials do, and may give way."""
+    data = plan.training_data()
+    validation = validate(plan, {name: choice}, data, rescales=False)
+    if validation is not None:
+        choice = validation.named(validation.chosen).choice
+    return result._replace(
+        choice=choice,
+        best_value=measured(choice, plan, data).value,
+        validation=validation,
+        free_value=None,
+        consistent=None,
+        nis=(),
+        sizes=[],
+        sized=None,
     )
 
 

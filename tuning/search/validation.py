@@ -6,7 +6,8 @@ NIS is the normalised innovation squared.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import isfinite, nan
+from math import isfinite, isnan, nan
+from statistics import geometric_mean
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,15 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.intervals import Interval, slightly
 from filters.registry import filter_type
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
-from tuning.evaluation.baselines import FULL_Q, FULL_QR, GIVEN, competing_baselines, full_noise, same_filter
+from tuning.evaluation.baselines import (
+    FULL_Q,
+    FULL_QR,
+    GIVEN,
+    baseline_size,
+    competing_baselines,
+    full_noise,
+    same_filter,
+)
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
@@ -109,15 +118,14 @@ def is_validated(plan: Plan) -> bool:
 
 
 def validate(
-    plan: Plan, trials: Sequence[FrozenTrial], training: Sequence[Data], resize: Callable[[Choice, bool], Choice]
+    plan: Plan, finalists: Mapping[str, Choice], training: Sequence[Data], *, rescales: bool = True
 ) -> Validation | None:
     """Let the best trials and the baselines meet, and choose.
 
     The best baseline is the one with the least objective; numbers that the user gave remain it until another one
     passes the test of trials below. The best trial is the one with the best log score of the true states among
     those within 5 % of the least error; without truth it is the one with the least objective among the consistent
-    ones, if these cost at most 5 % more than the best of all. The
-    maximum-likelihood trials are always among those that meet. A trial can be taken if
+    ones, if these cost at most 5 % more than the best of all. A trial can be taken if
 
     - it is significantly better than the best baseline, by Student's 95 % interval of the jackknife, or by
       Wilcoxon's signed ranks of the runs if it is also better as a whole: one run in which a baseline fails makes
@@ -133,19 +141,19 @@ def validate(
 
     Args:
         plan: of the study.
-        trials: its trials.
+        finalists: the filters that meet the baselines, by name, with the ensemble size that they end with: of
+            `finalists_of`, or the answer of a method. Baselines have at least the size of the first one.
         training: its training data, by which the cost of a baseline is measured.
-        resize: gives the best trial its ensemble size before it is compared; called with whether it is consistent.
+        rescales: whether the first two also compete with Q and R times their mean NEES over n.
 
     Returns:
-        What came of it; None for a plan whose objective cannot be compared, and where no trial is complete.
+        The meeting; None for a plan whose objective cannot be compared, without finalists, and if no baseline is
+        within the budget.
     """
-    finalists = finalists_of(plan, trials)
     if not is_validated(plan) or not finalists:
         return None
-    data = plan.validation_data()
-    of_kind = next(iter(finalists.values())).name
-    before = _baselines_of(plan, of_kind, training)
+    first = next(iter(finalists.values()))
+    before = _baselines_of(plan, first, training)
     if not before:  # all are over the budget
         return None
     finalists = {
@@ -153,18 +161,12 @@ def validate(
         for name, choice in finalists.items()
         if not any(same_filter(choice, one) for one in before.values())
     }
-    finalists |= _rescaled(finalists, plan, training)
-    everyone = {**before, **finalists}
+    if rescales:
+        finalists |= _rescaled(finalists, plan, training)
+    everyone, data = {**before, **finalists}, plan.validation_data()
     found = {name: measured(one, plan, data) for name, one in everyone.items()}
     choosing = Choosing(plan, {name: found[name] for name in before}, {name: found[name] for name in finalists})
-    for candidate in choosing.order():
-        sized = resize(finalists[candidate], _is_consistent(found[candidate], plan))
-        if not same_filter(sized, finalists[candidate]):
-            everyone[candidate], choosing.trials[candidate] = sized, measured(sized, plan, data)
-        if choosing.wins(candidate):
-            break
-    else:
-        candidate = choosing.best
+    candidate = next(filter(choosing.wins, choosing.order()), choosing.best)
     wins = bool(candidate) and choosing.wins(candidate)
     met = tuple(choosing.met(name, choice) for name, choice in everyone.items())
     seeds, baseline = data[0].seeds, choosing.baseline
@@ -172,21 +174,20 @@ def validate(
     validation = Validation(
         seeds, own, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
     )
-    all_measured = {**choosing.baselines, **choosing.trials}
     chosen = validation.chosen
-    if choosing.ratio and plan.consistent and all_measured[chosen].log_scores:
-        decided = {name: all_measured[name] for name in (*before, *([candidate] if candidate else []))}
+    if choosing.ratio and plan.consistent and found[chosen].log_scores:
+        decided = {name: found[name] for name in (*before, *([candidate] if candidate else []))}
         validation = validation._replace(chosen=_by_log_score(decided, chosen, baseline), by_error=chosen)
-    full = _better_with_full_noise(plan, all_measured[validation.chosen], of_kind, training)
-    return _with_failures(validation._replace(full=full), plan, training, all_measured, data)
+    full = _better_with_full_noise(plan, found[validation.chosen], first, training)
+    return _with_failures(validation._replace(full=full), plan, training, found, data)
 
 
-def _better_with_full_noise(plan: Plan, chosen: Measured, kind: str, training: Sequence[Data]) -> Met | None:
+def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, training: Sequence[Data]) -> Met | None:
     """Noise estimation's full Q, or Q and R, if it is significantly better than own parameters; else None."""
     if plan.full_q or plan.scenarios[0].parameters is None:
         return None
     ratio, data, better = plan.objectives[0] not in PROPER, plan.validation_data(), []
-    for name, choice in _full_noise(plan, kind, training).items():
+    for name, choice in _full_noise(plan, first, training).items():
         one = measured(choice, plan, data)
         gained = over(one, chosen, ratio=ratio)
         if gained.high < (1.0 if ratio else 0.0) and not (ratio and slightly(gained)):
@@ -195,9 +196,9 @@ def _better_with_full_noise(plan: Plan, chosen: Measured, kind: str, training: S
     return min(better, key=lambda one: one.value, default=None)
 
 
-def _full_noise(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
+def _full_noise(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
     """Noise estimation of own parameters with a full Q, and with a full Q and R, within the budget, by name."""
-    problem = plan.scenarios[0]
+    problem, kind, size = plan.scenarios[0], first.name, baseline_size(first)
     if not filter_type(kind).has_covariance or len({(one.model().n, one.model().m) for one in plan.scenarios}) > 1:
         return {}
     found = {
@@ -205,7 +206,7 @@ def _full_noise(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Ch
         FULL_QR: full_noise(kind, problem, plan.seed, with_r=True),
     }
     return {
-        name: one
+        name: one if size is None else one.with_size(size)
         for name, one in found.items()
         if one is not None and (plan.budget is None or cost_of(one, plan, training) <= plan.budget)
     }
@@ -290,28 +291,50 @@ def _with_failures(
     return found._replace(tested=tested.name, failures=tuple(worst), failed=len(failures), runs=count)
 
 
-def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]:
-    """The trials that meet the baselines, by name: the best, the best consistent, the maximum-likelihood ones."""
+def finalists_of(
+    plan: Plan, trials: Sequence[FrozenTrial], resize: Callable[[Choice, bool], Choice]
+) -> dict[str, Choice]:
+    """The trials that meet the baselines, by name: the best, the best consistent, the maximum-likelihood ones.
+
+    Args:
+        plan: of the study.
+        trials: its trials.
+        resize: gives the best trial of each filter type the ensemble size with which it ends; the others of that
+            type have the same. Called with whether its size must be consistent.
+    """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     complete.sort(key=lambda trial: trial.values[0])
     best = best_trial(complete)
     first = [] if best is None else [best]
     consistent = [one for one in complete if is_consistent(one)][:BY_CONSISTENCY]
     likely = [one for one in complete if MAXIMUM_LIKELIHOOD in one.user_attrs]
-    chosen = [*first, *complete[:BY_SCORE], *consistent, *likely]
-    return {f"trial {one.number + 1}": plan.choice_of(one.params) for one in chosen}
+    finalists: dict[str, Choice] = {}
+    sizes: dict[str, int] = {}
+    for trial in (*first, *complete[:BY_SCORE], *consistent, *likely):
+        choice = plan.choice_of(trial.params)
+        if filter_type(choice.name).has_ensemble:
+            if choice.name not in sizes:
+                sized = resize(choice, plan.is_constrained and is_consistent(trial))
+                sizes[choice.name] = sized.numbers["ensemble_size"]
+            choice = choice.with_size(sizes[choice.name])
+        finalists[f"trial {trial.number + 1}"] = choice
+    return finalists
 
 
 def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Data]) -> dict[str, Choice]:
     """The first two trials with Q and R multiplied by their mean NEES over n; none where that is not free.
 
     A common factor on Q and R leaves the gain of a linear filter as it is, and divides its NEES: of all factors
-    this one has the best log score. Without truth there are none.
+    this one has the best log score. Without truth those of an ensemble, which may have got another size, are
+    multiplied by their mean NIS over m, and others, of which the likelihood has found the factor, are not.
     """
     found: dict[str, Choice] = {}
     parameters = [one for one in model_parameters(plan.scenarios[0], **plan.options) if one.place.is_variance]
     for name in list(finalists)[:BY_CONSISTENCY] if plan.rescales else ():
-        choice, factor = finalists[name], measured(finalists[name], plan, training).nees
+        choice, before = finalists[name], measured(finalists[name], plan, training)
+        factor = before.nees
+        if isnan(factor) and filter_type(choice.name).has_ensemble:
+            factor = geometric_mean(before.nis) if min(before.nis) > 0.0 else nan
         if not 0.0 < factor < LARGEST:
             continue
         for one in parameters:
@@ -322,13 +345,14 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
     return found
 
 
-def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
-    """The baselines of a kind of filter but the oracle, within the budget; of several problems those of the first.
+def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
+    """The baselines of a finalist but the oracle, within the budget; of several problems those of the first.
 
-    Where R is held none of them changes it, and relations among numbers hold for all but what was given.
+    An ensemble has `baseline_size` members. Where R is held none of them changes it, and relations among numbers
+    hold for all but what was given.
     """
-    problem = plan.scenarios[0]
-    found = competing_baselines(kind, problem, plan.seed)
+    problem, kind = plan.scenarios[0], first.name
+    found = competing_baselines(kind, problem, plan.seed, baseline_size(first))
     if plan.hold_r and filter_type(kind).has_covariance:
         held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
         found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
@@ -339,7 +363,7 @@ def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, 
     if len(sizes) > 1:  # a Q or R fits problems of one size alone
         found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}
     if plan.full_q and problem.parameters is not None:
-        full = _full_noise(plan, kind, training)
+        full = _full_noise(plan, first, training)
         found |= {name: one for name, one in full.items() if plan.full_r or name == FULL_Q}
     found = {name: plan.forgetting(one) for name, one in found.items()}
     budget = plan.budget

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from filters.consistency.intervals import Interval
 from filters.registry import FILTERS
+from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.checks import any_case, meant, one_of
 from thruster_env.core.progress import listening
@@ -25,6 +26,7 @@ from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
 from tuning.cli.benchmark import fitted
 from tuning.cli.tuning_report import way_out
+from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem
 from tuning.reporting.figures import draw_history
 from tuning.search.interruption import STOPPING, stop_on_interrupt
@@ -204,9 +206,19 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     )
     (said,) = way_out(tuning)
     assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
-    by_way = SimpleNamespace(**{**vars(tuning), "way": "likelihood"})
+    problem = LinearProblem()
+    result, plan = SimpleNamespace(choice=rule_of_thumb("kf", problem)), Plan("kf", (problem,))
+    by_way = SimpleNamespace(**{**vars(tuning), "way": "likelihood", "plan": plan, "result": result})
     (said,) = way_out(by_way)
-    assert said.startswith("What to take: the scaled default, ") and "without --way runs a study" in said
+    assert said.startswith("What to take: the scaled default (Q11 = ") and "without --way runs a study" in said
+    logs = SimpleNamespace(tuned=SimpleNamespace(has_truth=False))
+    logs.likelihood_gains = {
+        "given": Interval(-20, -30, -10),
+        RULE: Interval(-50, -60, -40),
+        ORACLE: Interval(-99, -99, -99),
+    }
+    (said,) = way_out(SimpleNamespace(**{**vars(by_way), "comparisons": [logs]}))
+    assert said.startswith("What to take: the rule of thumb (Q11 = ")
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
     assert way_out(tuning) == way_out(by_way) == []
 
