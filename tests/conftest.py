@@ -65,6 +65,14 @@ def pytest_configure(config):
 
 
 @pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures of reports have their caption and text only: to draw them takes most of a page's time."""
+    monkeypatch.setattr(
+        "tuning.reporting.sketchbook.figure_svg", lambda _, name: (f'<svg data-name="{name}"></svg>', "")
+    )
+
+
+@pytest.fixture
 def as_python():
     """Nothing is compiled: exactness needs none, and that both ways agree is for the contract to test."""
     with interpreted():

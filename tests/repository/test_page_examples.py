@@ -133,6 +133,7 @@ def test_the_commands_of_a_page_lead_from_one_to_the_next(page, thruster, tmp_pa
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_one_number_of_the_page_on_problems_is_tuned_reported_and_evaluated(thruster, tmp_path, monkeypatch):
     """Its Q is singular: one acceleration drives two states."""
     others = "make_env", "runs"

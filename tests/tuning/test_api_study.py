@@ -180,6 +180,7 @@ def test_copies_and_pickles_are_the_same(study, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = study.report("mine.html")
@@ -193,9 +194,8 @@ def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, mo
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tmp_path):  # noqa: F811
-    drawn = "<svg></svg>", ""  # pictures take most of a page's time
-    monkeypatch.setattr("tuning.reporting.sketchbook.figure_svg", lambda figure, name: drawn)
     monkeypatch.setattr("tuning.reporting.report.run_sections", lambda *_: [])
     other = tuning.tune("mismatch", filter="kf", trials=1, progress=False)
     study.save("a.json")

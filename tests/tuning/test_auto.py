@@ -309,6 +309,7 @@ def test_cost_is_of_one_core_and_grows_with_the_ensemble():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:12 trials are fewer")
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)

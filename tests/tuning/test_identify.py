@@ -82,7 +82,7 @@ def test_an_end_at_zero_is_not_to_be_widened(found):
 
 @pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_estimates(found, data):
-    some = [identify(recorded(8, first=100 * i), pendulum, FREE, starts=1) for i in range(1, 9)]
+    some = [identify(recorded(8, first=100 * i), pendulum, FREE, start=TRUTH, starts=1) for i in range(1, 9)]
     for name in TRUTH:
         scatter = np.std([one.values[name] for one in some], ddof=1)
         assert 0.45 < scatter / found.standard_errors[name] < 2.0, name  # chi with 7 degrees of freedom
@@ -136,7 +136,9 @@ def test_outliers_beyond_a_gate_are_left_out(data, found):
     outliers = rng.random(spoilt.shape) < 0.02
     spoilt[outliers] += 3.0
     spoilt = data._replace(measurements=spoilt)
-    normal, gated = (identify(spoilt, pendulum, FREE, starts=1, gate=gate) for gate in (math.inf, 4.5))
+    normal, gated = (
+        identify(spoilt, pendulum, FREE, start=TRUTH, starts=1, gate=gate) for gate in (math.inf, 4.5)
+    )
     left_out = gated.objective.data.outliers
     assert (left_out & outliers).sum() > 0.97 * outliers.sum() and (left_out & ~outliers).sum() < 5
     for name in ("offset", "r"):

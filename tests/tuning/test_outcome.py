@@ -56,6 +56,7 @@ def test_the_best_trial_has_the_least_error_of_the_consistent_ones_else_of_all(t
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_path):
     code, said = thruster("tune", "--filter", "ekf", "--trials", 1, "--json", "one.json")
     assert code == 3 and "in its band" not in said

@@ -123,6 +123,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_without_its_study_a_tuned_file_still_has_a_page():
     plan = Plan("ekf", (MISMATCH,))
     tuned(plan, 2)
@@ -135,6 +136,7 @@ def test_without_its_study_a_tuned_file_still_has_a_page():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
     plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
@@ -148,6 +150,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_baseline_has_no_covariance_to_speak_of():
     tuned(Plan("low-pass", (MISMATCH,)), 3)
     report = write_report("s.json", STORAGE)
@@ -181,6 +184,7 @@ def test_importances_count_pruned_trials_where_few_are_complete(caplog, monkeypa
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_two_studies_stand_beside_each_other(folder, monkeypatch, capsys):
     tuned(Plan("ekf", (MISMATCH,)), 2)
     tuned(Plan("kf", (MISMATCH,)), 2, "t")
@@ -271,6 +275,7 @@ def test_a_mistake_is_one_clear_line(arguments, line, folder, monkeypatch, capsy
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_says_what_it_wrote(monkeypatch, capsys):
     tuned(Plan("ekf", (MISMATCH,)), 2)
     monkeypatch.setattr(

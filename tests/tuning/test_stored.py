@@ -52,6 +52,7 @@ def test_what_other_packages_made_or_what_is_bent_is_computed_anew(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_path, monkeypatch):
     path = write_untuned(tmp_path / "ekf.json")
     asked = []

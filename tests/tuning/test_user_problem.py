@@ -58,6 +58,7 @@ def tuned(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_by_the_command_line_a_module_of_one_s_own_is_tuned_evaluated_verified_and_wrapped(mine):
     done = mine(
         "tune", "--problem", NAME, "--filter", "ekf", "--trials", 3, "--method", "gradient", "--out", "t.json"

@@ -35,8 +35,8 @@ def quiet():
     optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 
-def run_with_a_kill(storage, trials, on_trial=lambda study, finished: None):
-    """A study by three workers, of which one is killed in mid-trial, and the number of that trial."""
+def run_with_a_kill(storage, trials, workers, on_trial=lambda study, finished: None):
+    """A study by several workers, of which one is killed in mid-trial, and the number of that trial."""
     study = open_study("s", PLAN, open_storage(storage))
     killed = []
 
@@ -51,22 +51,22 @@ def run_with_a_kill(storage, trials, on_trial=lambda study, finished: None):
                 killed.extend([trial.number] * in_mid_trial)
         on_trial(study, finished)
 
-    with pytest.warns(UserWarning, match=r"worker \d has died \(signal 9\), 2 go on"):
-        interrupted = run_in_workers(study, PLAN, [], trials, kill_one, storage=storage, workers=WORKERS)
+    with pytest.warns(UserWarning, match=rf"worker \d has died \(signal 9\), {workers - 1} go on"):
+        interrupted = run_in_workers(study, PLAN, [], trials, kill_one, storage=storage, workers=workers)
     assert not interrupted and len(killed) == 1
     return study, killed[0]
 
 
-def assert_nothing_is_lost(study, lost, trials):
+def assert_nothing_is_lost(study, lost, trials, workers):
     found = study.get_trials()
     assert [trial.number for trial in found] == list(range(len(found)))
-    assert trials <= finished_trials(study) < trials + WORKERS
+    assert trials <= finished_trials(study) < trials + workers
     assert [trial.number for trial in found if trial.state == TrialState.FAIL] == [lost]
     assert [t.state for t in found if t.user_attrs.get(RETRY_OF) == lost] == [TrialState.COMPLETE]
     assert not [trial for trial in found if trial.state == TrialState.RUNNING]
     complete = [trial for trial in found if trial.state == TrialState.COMPLETE]
     processes = {trial.user_attrs[PROCESS] for trial in complete}
-    assert len(processes) >= WORKERS - 1
+    assert len(processes) >= workers - 1
     sampled = [tuple(one.params.values()) for one in complete if "fixed_params" not in one.system_attrs]
     assert len(sampled) > trials // 4  # others are enqueued, near the best one
     assert len(set(sampled)) == len(sampled)  # each worker proposes what is its own
@@ -74,8 +74,8 @@ def assert_nothing_is_lost(study, lost, trials):
 
 @pytest.mark.slow
 def test_a_study_survives_the_death_of_one_of_three_workers(tmp_path):
-    study, lost = run_with_a_kill(str(tmp_path / "j"), 80)
-    assert_nothing_is_lost(study, lost, 80)
+    study, lost = run_with_a_kill(str(tmp_path / "j"), 40, WORKERS)
+    assert_nothing_is_lost(study, lost, 40, WORKERS)
 
 
 @pytest.mark.slow
@@ -84,15 +84,15 @@ def test_a_study_in_a_database_survives_an_outage_too(postgres):
     outages = []
 
     def interrupt_service(study, finished):
-        if finished >= 25 and not outages:
+        if finished >= 12 and not outages:
             postgres.stop()
             outages.append(threading.Timer(3.0, postgres.start))
             outages[0].start()
 
     with pytest.warns(UserWarning, match="no answer from the database, trying for 60 s: .*connection"):
-        study, lost = run_with_a_kill(url, 60, interrupt_service)
+        study, lost = run_with_a_kill(url, 30, 2, interrupt_service)
     outages[0].join()
-    assert_nothing_is_lost(study, lost, 60)
+    assert_nothing_is_lost(study, lost, 30, 2)
 
 
 @pytest.fixture

@@ -101,6 +101,7 @@ def test_identify_names_the_gate_and_cuts_at_gaps(folder, thruster, as_json):  #
     assert any("a gap: 40 rows" in said for said in mine.sentences())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_of_logs_and_its_page_say_what_was_found(folder, thruster):  # noqa: F811
     logs = ("--log", "gap.csv", "--log", "stuck.csv", *MODEL)
     done = thruster("tune", "--filter", "kf", *logs, "--trials", 3, "--out", "tuned.json")

@@ -131,6 +131,7 @@ def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_jso
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json, thruster, tmp_path):  # noqa: F811
     simulated("a.csv", "b.csv", "c.csv")
     for name in "abc":

@@ -86,7 +86,6 @@ def process(before, name, arguments="filters", **options):
         [
             *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "numba")),
             ("optuna.samplers", "tune --trials 1"),
-            ("tuning.cli.verify", "verify none.json"),
         ],
         [("optuna.samplers", "tune --trials 1")],
     ),
@@ -115,8 +114,8 @@ def test_ctrl_c_when_all_is_done_is_one_line():
 @pytest.mark.parametrize(
     "arguments",
     slow_but(
-        ["filters kf", "filters kf --json -", "filters --help", "study ways --help", "--help"],
-        ["filters kf", "--help"],
+        ["filters kf", "filters kf --json -", "--help"],
+        ["filters kf"],
     ),
 )
 def test_ctrl_c_while_results_are_printed_leaves_them_whole(arguments):

@@ -265,6 +265,7 @@ def test_a_study_tunes_inflation_and_nothing_else():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
     plan = Plan("ekf", (checked_problem(find_problem("tuning.experiments.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
