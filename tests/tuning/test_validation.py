@@ -224,7 +224,7 @@ def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypat
     assert met.gave_way and found.choice == met.named(met.baseline).choice != bad
     (said, *_) = choice_sentences(as_data(met), plan)
     assert said.startswith("The study returns the noise estimation: on 100 validation seeds the optimum of the ")
-    assert "is not significantly better (the score of the optimum " in said
+    assert "is not significantly better (its score is " in said
     assert found.best_value < measured(bad, plan, plan.training_data()).value
     monkeypatch.setattr(validation, "competing_baselines", lambda *_: {GIVEN: bad})
     found = answered_by(result, plan, "optimum of the likelihood", oracle("kf", problem))

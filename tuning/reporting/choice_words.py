@@ -47,10 +47,12 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
         without, but = "", ""
         if lost:
             without, but = " without being worse in a log", f", but it is worse in {_listed(lost)}"
-        none_is = "no trial is" if _is_trial(candidate) else f"{the} is not"
+        none_is, its = f"{the} is not", f"its {what}"
+        if _is_trial(candidate):
+            none_is, its = "no trial is", f"the {what} of {candidate}"
         said = [
             f"The study returns the {called(baseline)}{members}: on {where} {none_is} significantly better"
-            f"{without} (the {what} of {the} is {_over(over, likely)}{but})."
+            f"{without} ({its} is {_over(over, likely)}{but})."
         ]
     elif _is_even(over, likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
         said = [
