@@ -210,6 +210,7 @@ def test_constants_may_be_a_named_tuple():
 
 
 NUMBERS = {"stiffness": 2.0, "damping": 0.3}  # a dictionary outside the function: numba cannot read it
+TURNS = [0.1]  # a list
 
 
 def spring_step_by_dictionary(x, u, c):
@@ -217,7 +218,21 @@ def spring_step_by_dictionary(x, u, c):
 
 
 def spring_step_with_text(x, u, c):
-    assert f"{x[0]:.3f}"  # numba refuses formats before it looks at types
+    text = f"{x[0]:.3f}"  # noqa: F841 - numba refuses formats before it looks at types
+    return spring_step(x, u, c)
+
+
+def spring_step_with_catch(x, u, c):
+    try:
+        return spring_step(x, u, c)
+    except ZeroDivisionError:
+        return x
+
+
+def spring_step_with_loop(x, u, c):
+    left = {"left": x[0] - x[0] + TURNS[0]}  # numba knows no list outside, and the graph no end of the loop
+    while left["left"] > 0.0:
+        left["left"] -= abs(x[0]) + 1.0
     return spring_step(x, u, c)
 
 
@@ -233,8 +248,8 @@ class SpringStep:
     [spring_step_by_dictionary, spring_step_with_text, SpringStep()],
     ids=["dictionary", "text", "object"],
 )
+@pytest.mark.filterwarnings("error:the model runs as Python")
 class TestModelsThatNumbaRefuses:
-    @pytest.mark.filterwarnings("ignore:the model runs as Python")  # text cannot be traced
     @pytest.mark.parametrize(("name", "numbers"), [("ekf", {}), ("pf", {"ensemble_size": 5})])
     def test_a_filter_of_a_page_has_the_results_of_a_compilable_twin(self, transition, name, numbers):
         keys, inputs = episode_keys(range(3)), np.ones((3, 10, 1))
@@ -245,8 +260,23 @@ class TestModelsThatNumbaRefuses:
         for part, rescaled in zip(found, expected, strict=True):  # one of them has central differences for F
             np.testing.assert_allclose(part, rescaled, rtol=1e-8, atol=1e-8)
 
+    def test_others_and_truths_are_machine_code_of_its_graph(self, transition):
+        keys, inputs = episode_keys(range(3)), np.ones((3, 10, 1))
+        z = np.random.default_rng(0).normal(size=(3, 11, 1))
+        with interpreted():
+            expected = run(make_filter("open-loop", spring()), keys, inputs, z)
+            truth = simulate.simulate(spring(), keys, inputs)
+        found = run(make_filter("open-loop", spring(transition=transition)), keys, inputs, z)
+        for part, rescaled in zip(found, expected, strict=True):
+            np.testing.assert_allclose(part, rescaled, rtol=1e-12, atol=1e-12)
+        drawn = simulate.simulate(spring(transition=transition), keys, inputs)
+        np.testing.assert_allclose(drawn.states, truth.states, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("transition", [spring_step_with_catch, spring_step_with_loop], ids=["catch", "loop"])
+class TestModelsThatRunAsPython:
     def test_others_run_with_one_warning_and_the_results_of_a_compilable_twin(self, transition):
-        name = "open-loop"  # others have pages, and need no numba for such models
+        name = "open-loop"  # others have pages
         keys, inputs = episode_keys(range(3)), np.ones((3, 10, 1))
         z = np.random.default_rng(0).normal(size=(3, 11, 1))
         with interpreted():

@@ -109,8 +109,11 @@ def overloaded(function: Callable, teach: Callable[[Callable], None] | None = No
     return function
 
 
-def compiled_in_place_of(function: Callable, other: Callable) -> Callable:
-    """Mark a function in whose place compiled functions have another one; those that need Python run as it."""
+def compiled_in_place_of(function: Callable, other: Callable, rounded_as: Callable | None = None) -> Callable:
+    """Mark a function in whose place compiled functions have another one; those that need Python run as it.
+
+    Machine code may reorder and contract what it may of the other one, or of `rounded_as`.
+    """
     _marked.add(function)
     if other in _called:
         _called.add(function)
@@ -119,18 +122,19 @@ def compiled_in_place_of(function: Callable, other: Callable) -> Callable:
         reason = f"numba compiles plain functions, and no {type(other).__name__}"
     if reason:
         _only_python[function] = reason
-    _untaught[function] = lambda function: _teach_other(function, other)
+    options = fastmath_of(rounded_as or other)
+    _untaught[function] = lambda function: _teach_other(function, other, options)
     return stand_in(function, other)
 
 
-def _teach_other(function: Callable, other: Callable) -> None:
+def _teach_other(function: Callable, other: Callable, fastmath: set[str]) -> None:
     from numba.extending import overload
 
     plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
     options: Any = {
         "forceinline": function not in _called,
         "no_cfunc_wrapper": True,
-        "fastmath": fastmath_of(other),
+        "fastmath": fastmath,
     }
     overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 

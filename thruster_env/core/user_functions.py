@@ -10,9 +10,11 @@ import builtins
 import dis
 import functools
 import inspect
+import logging
 import math
 import sys
 import types
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -161,12 +163,30 @@ class Module:
         return self._in_place_of(self._module, name)
 
 
+class _Silent:
+    """In place of a logger or a module: whatever is called of it does nothing."""
+
+    def __getattr__(self, name: str):
+        return self
+
+    def __call__(self, *arguments, **named):
+        return None
+
+
 class Copies:
     """Copies of functions and of all plain functions that they call, which find others under some names."""
 
-    def __init__(self, in_place_of: Callable[[types.ModuleType, str], Any], names: Mapping[str, Any]):
-        """Take what copies find in MODULES, by module and name, and in place of Python's functions."""
-        self._in_place_of, self._names = in_place_of, names
+    def __init__(
+        self,
+        in_place_of: Callable[[types.ModuleType, str], Any],
+        names: Mapping[str, Any],
+        silent: bool = False,
+    ):
+        """Take what copies find in MODULES, by module and name, and in place of Python's functions.
+
+        Silent copies neither log nor warn.
+        """
+        self._in_place_of, self._names, self._silent = in_place_of, names, silent
         self._copies: dict[int, types.FunctionType] = {}
 
     def of(self, value: Any) -> Any:
@@ -174,6 +194,8 @@ class Copies:
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
         if isinstance(value, types.ModuleType) and value in MODULES:
             return Module(value, self._in_place_of)
+        if self._silent and (value is logging or value is warnings or isinstance(value, logging.Logger)):
+            return _Silent()
         name = getattr(value, "__name__", "")
         for module in MODULES:
             if callable(value) and value is getattr(module, name, None):
@@ -195,7 +217,8 @@ class Copies:
         if id(function) not in self._copies:
             cells = tuple(types.CellType() for _ in function.__closure__ or ())
             names = vars(builtins) | dict(self._names)
-            names["__builtins__"] = builtins  # which what NumPy imports late asks for
+            importing = {"__import__": lambda *which: self.of(builtins.__import__(*which))}
+            names["__builtins__"] = vars(builtins) | importing  # also for what NumPy imports late
             copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
             copy.__kwdefaults__ = function.__kwdefaults__
             self._copies[id(function)] = copy

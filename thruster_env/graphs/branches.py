@@ -7,11 +7,13 @@
 
 A condition asks its graph, which answers yes at first. Then the function is called again with the last answer
 turned round, and so on, and between the results there is a choice. A loop that decides how long it goes on has no
-end here; it raises TypeError, as what has too many outcomes does.
+end here; it raises TypeError, as what has too many outcomes does. Where a function itself raises an exception, as
+`assert` does, the result is NaN, as that of arithmetic is in machine code where Python raises.
 """
 
 from __future__ import annotations
 
+import dis
 from collections.abc import Callable
 
 import numpy as np
@@ -28,10 +30,10 @@ def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarra
     Raises:
         TypeError: if it decides too often, or its results have different shapes.
     """
-    calls = 0
+    calls, failure = 0, None
 
-    def outcome(known: dict[int, bool]) -> np.ndarray:
-        nonlocal calls
+    def outcome(known: dict[int, bool]) -> np.ndarray | None:
+        nonlocal calls, failure
         calls += 1
         if calls > MOST_OUTCOMES:
             raise TypeError(f"a function must have at most {MOST_OUTCOMES} outcomes of its decisions")
@@ -50,10 +52,21 @@ def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarra
             return answers[condition.place]
 
         graph.decide = decide
-        found = function()
+        found: np.ndarray | None = None
+        try:
+            found = function()
+        except Exception as error:
+            if not answers or not _is_raised_there(error):
+                raise
+            failure = error
         for k, condition in reversed([*enumerate(asked)]):
             before = {one.place: True for one in asked[:k]}
             other = outcome(known | before | {condition.place: False})
+            if found is None or other is None:
+                known_one = found if other is None else other
+                if known_one is None:
+                    continue
+                found, other = (np.full_like(known_one, np.nan) if one is None else one for one in (found, other))
             if other.shape != found.shape:
                 raise TypeError(f"branches must have results of one shape, but got {found.shape}, {other.shape}")
             pairs = zip(found.ravel(), other.ravel(), strict=True)
@@ -63,6 +76,19 @@ def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarra
 
     before, graph.decide = graph.decide, None
     try:
-        return outcome({})
+        found = outcome({})
     finally:
         graph.decide = before
+    if found is None:
+        raise failure or TypeError("a function must have a result")
+    return found
+
+
+def _is_raised_there(error: Exception) -> bool:
+    """Whether a statement of a traced function itself raised an exception, not something that it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None or trace.tb_frame.f_globals.get("__name__") != "builtins":  # that of copies
+        return False
+    return trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]

@@ -194,6 +194,9 @@ class Number:
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"
 
+    def __format__(self, spec: str) -> str:
+        return repr(self)  # of a message, which nobody reads: what makes a float of it raises TypeError
+
     def __bool__(self) -> bool:
         if self.graph.decide is None:
             raise TypeError("a traced value has no truth value: use where(condition, a, b)")

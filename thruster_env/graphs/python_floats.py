@@ -26,9 +26,11 @@ from thruster_env.core.user_functions import (
     functions_in,
     inverts,
     needs_python,
+    stand_in,
     takes_roots,
 )
 from thruster_env.graphs.tracing import OTHER_NAMES
+from thruster_env.graphs.written_functions import written_function
 
 WITHOUT_VALUE = ArithmeticError, ValueError, TypeError  # of 1/0, of sqrt(-1), of complex numbers that are compared
 
@@ -191,19 +193,24 @@ def _by_ieee(function: Callable, arguments: tuple) -> Any:
 
 
 @makes_functions
-def with_python_floats(function: Callable) -> Callable:
+def with_python_floats(function: Callable, arguments: str = "", sizes=(), form=0, shape=()) -> Callable:
     """Return a function that calls another one with Python's floats, and is the other one where it is compiled.
 
     Where that raises what floats alone raise (1/0 is infinite in machine code, sqrt(-1) NaN), or returns complex
     numbers, it has the value of IEEE 754, but for what the function catches. A function with a `~` gets NumPy's
     scalars, of whose truth values it is the contrary, as in machine code; one with roots gets floats of IEEE 754
     at once, as Python's root of a negative number is complex.
+
+    If its arguments are named, with what `written_function` takes, compiled functions have what numba refuses from
+    its graph.
     """
+    written = written_function(function, arguments, sizes, form, shape) if arguments else None
     inlined(function)
     codes = [one.__code__ for one in functions_in(function)]
     kind = np.float64 if any(map(inverts, codes)) else Float if any(map(takes_roots, codes)) else float
 
     def called(*arguments):
+        written  # noqa: B018 - part of the key of machine code
         failure: Exception = TypeError("a function of a model must return real numbers")
         try:
             found = function(*with_floats(kind, arguments))
@@ -220,7 +227,9 @@ def with_python_floats(function: Callable) -> Callable:
         raise failure
 
     called.__name__, called.__module__ = (getattr(function, name, "") for name in ("__name__", "__module__"))
-    return compiled_in_place_of(called, function)
+    if written is None:
+        return compiled_in_place_of(called, function)
+    return stand_in(compiled_in_place_of(called, written, rounded_as=function), function)
 
 
 def _by_numpy(function: Callable, arguments: tuple) -> Any:

@@ -183,11 +183,15 @@ class StateSpaceModel:
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
         n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
+        form, sizes = self.shape.form, (n, self.inputs, len(self.constants))
 
         def ready(function: Callable | None, arguments: str, *shape: int) -> Any:
             if function is None or by_complex_step(function):
                 return function
-            return array_valued(with_python_floats(function), arguments, *shape)
+            if is_array(max(sizes[:2])) or is_array(*shape) or constants_are_array(form):
+                return array_valued(with_python_floats(function), arguments, *shape)
+            of = sizes if "u" in arguments else (n, sizes[2])
+            return array_valued(with_python_floats(function, arguments, of, form, shape), arguments, *shape)
 
         return Functions(
             ready(first_equal(self.transition), "x, u, c", n),
