@@ -95,6 +95,7 @@ def lines_of(page):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
     fresh, page, file = (
         type(study)(study.tuning._replace(file=None)),
@@ -122,6 +123,7 @@ def test_baselines_are_filters_that_go_around_an_env(study):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
     storage = tmp_path / "studies.journal"
     options = {"storage": storage, "progress": True}

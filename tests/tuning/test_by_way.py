@@ -27,6 +27,7 @@ SHORT = find_problem("nominal").replace(steps=70, name="short")
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
     study = tuning.tune(SHORT, "ekf", way="likelihood", trials=10, progress=False)
     data = SHORT.data(SHORT.training_seeds(0, TRAINING_SEEDS))
@@ -190,7 +191,7 @@ def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, w
     )
     runs = [{"measurements": np.column_stack([rng.normal(size=20), np.full(20, np.nan)])} for _ in range(4)]
     problem = RunsProblem(runs, model, held_out=[2, 3], name="half of it")
-    task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options})
+    task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options}, budget=Budget(runs=400))
     WAYS[way].run(way, task)
     before, after = (
         np.asarray(one.filter(problem).model.measurement_noise_cov) for one in (task.start, task.best)
@@ -209,7 +210,7 @@ def test_ways_by_lags_refuse_a_filter_whose_errors_do_not_decay():
 @pytest.mark.parametrize("way", [one for one in WAYS if one not in ("nuts", "posterior")])
 def test_no_way_returns_worse_than_it_was_given(way):
     problem = singular(first_scored_step=50)
-    task = Task("kf", problem, problem.data(range(4)), budget=Budget(1000, 3.0))
+    task = Task("kf", problem, problem.data(range(4)), budget=Budget(300, 1.0))
     try:
         find_way(way).run(way, task)
     except ValueError as lacking:
