@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,10 @@ BLIND = 1e-10  # eigenvalue of the observability Gramian's correlations, below w
 DOUBLINGS = 60  # of a path, at most: then even slow covariances have settled
 SETTLED = 1e-12  # relative change of a covariance that has settled
 LARGEST = 1e100  # a transition that is larger has settled, too
-FACTORS = 40  # powers of two, up and down, within which the factor on a floor is searched
+FACTORS = 40  # powers of two, up and down, within which the factor on a floor is searched ...
+STRIDE = 4  # ... upwards by so many
 WITHIN = 1e-3  # relative tolerance of that factor
+SHARE = 0.2  # of a run: a filter with a longer time constant sleeps
 Run = tuple[np.ndarray, np.ndarray, np.ndarray]  # keys (1, 2), inputs (1, K, p), measurements (1, K + 1, m)
 
 
@@ -53,7 +55,10 @@ class TimeConstants(NamedTuple):
         uptake: steps within which updates take up 63 % of what the channel that counts most says; infinite for a
             gain of zero.
         unobservable: indices of states of which measurements tell nothing, whatever the gain.
-        length: steps of a run.
+        length: steps of a run, of the shortest one.
+        oracle: the longest one and the uptake of the same filter with the plant's own Q and R; None where nobody
+            computed them.
+        advised: a longest time constant [s] that a larger Q reaches; None where none does, or nobody asked.
     """
 
     steps: tuple[float, ...]
@@ -61,6 +66,30 @@ class TimeConstants(NamedTuple):
     uptake: float
     unobservable: tuple[int, ...]
     length: int
+    oracle: tuple[float, float] | None = None
+    advised: float | None = None
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether an error lasts for more than a fifth of a run."""
+        return bool(self.steps) and self.steps[0] > SHARE * self.length
+
+    @property
+    def has_no_gain(self) -> bool:
+        """Whether updates need more than a run to take up what is measured: the gain is practically zero."""
+        return bool(self.steps) and self.uptake > self.length
+
+
+class RaisedNoise(NamedTuple):
+    """A process noise covariance, raised so that a filter forgets sooner.
+
+    Attributes:
+        cov: Q (n, n).
+        steps: the longest time constant with it.
+    """
+
+    cov: np.ndarray
+    steps: float
 
 
 def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None:
@@ -94,16 +123,19 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
     for i, (f, h, p, s, factor) in enumerate(zip(*path, strict=True)):
         seen = h.any(axis=1)
         h, s = h[seen], s[np.ix_(seen, seen)]
-        predicted = f @ p @ f.T + factor * model.process_noise_cov
-        gain = np.linalg.solve(s, h @ predicted).T
-        closed[i] = (np.eye(n) - gain @ h) @ f
-        taken[np.ix_(seen, seen)] += h @ gain / len(closed)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a filter that has lost its state
+            predicted = f @ p @ f.T + factor * model.process_noise_cov
+            gain = np.linalg.solve(s, h @ predicted).T
+            closed[i] = (np.eye(n) - gain @ h) @ f
+            taken[np.ix_(seen, seen)] += h @ gain / len(closed)
+    if not (np.abs(closed) < LARGEST).all():
+        return None
     observable, blind = observable_part(path, scales, model.measurement_noise_cov)
     closed = observable.T @ (closed / scales[:, None] * scales) @ observable
     growth, direction = _growth(closed)
     kappa = min(float(np.linalg.eigvals(taken).real.max(initial=0.0)), 1.0)
     slowest = int(np.abs(observable @ direction).argmax()) if len(growth) else 0
-    length = max(inputs.shape[1] for _, inputs, _ in runs)
+    length = min(inputs.shape[1] for _, inputs, _ in runs)
     return TimeConstants(tuple(map(_steps_of, growth)), slowest, _steps_of(1.0 - kappa), blind, length)
 
 
@@ -154,25 +186,27 @@ def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.n
     return basis[:, count:], tuple(np.flatnonzero(outside).tolist())
 
 
-def forgetting_noise(path: Path, model: StateSpaceModel, seconds: float, dt: float = 1.0) -> np.ndarray:
-    """Q (n, n) of a model, with the least multiple of a floor for which no time constant exceeds some seconds.
+def forgetting_noise(
+    path: Path, model: StateSpaceModel, steps: float, slowest: Callable[[np.ndarray], float] | None = None
+) -> RaisedNoise:
+    """Q of a model, with the least multiple of a floor for which no time constant exceeds some steps.
 
-        Q + c (alpha^2 - 1) mean of F P F',   alpha = exp(dt / seconds)
+        Q + c (1 - alpha^-2) mean of F P F',   alpha = exp(1 / steps)
 
     P is the steady covariance of the filter with fading memory, in whose prediction F is alpha F: as its gain
-    makes alpha (I - K H) F stable, errors fade faster than exp(-t / seconds). Where F and H are constant the
+    makes alpha (I - K H) F stable, errors fade faster than exp(-k / steps). Where F and H are constant the
     floor is the noise by which a Kalman filter has this gain, and c at most 1: it is the least factor that is
-    enough. The time constant is that of the steady gain along the path, repeated for ever, of the observable part
-    of the state.
+    enough. Where no multiple is enough, it is the one with the shortest time constant of those that were tried.
 
     Args:
         path: slopes of the model, from `slopes_along`.
         model: its Q and R.
-        seconds: the longest time constant that is allowed [s].
-        dt: sample time [s].
+        steps: the longest time constant that is allowed.
+        slowest: the longest time constant with a Q (n, n); by default that of the steady gain along the path,
+            repeated for ever, of the observable part of the state.
 
     Raises:
-        ValueError: if nothing is observable, or no multiple is enough.
+        ValueError: if nothing is observable.
 
     Source: Anderson, Moore (1979), Optimal Filtering, section 6.2 (exponential data weighting).
     """
@@ -182,35 +216,37 @@ def forgetting_noise(path: Path, model: StateSpaceModel, seconds: float, dt: flo
         raise ValueError(
             "a filter that forgets (--forget) must observe a state, but its measurements tell of none"
         )
-    steps = seconds / dt
     root = np.linalg.cholesky(r)
     f = basis.T @ (path.transitions / scales[:, None] * scales) @ basis
     h = np.linalg.solve(root, path.observations * scales) @ basis
     q = basis.T @ (model.process_noise_cov / scales[:, None] / scales) @ basis
 
-    def slowest(noise: np.ndarray) -> float:
-        a, p, j = _steady(f, h, noise, path.q_factors)
+    def steady(lift: np.ndarray) -> float:
+        a, p, j = _steady(f, h, q + lift, path.q_factors)
         growth = np.abs(np.linalg.eigvals(np.linalg.solve(np.eye(len(p)) + j @ p, a.T).T)).max()
         return _steps_of(growth ** (1.0 / len(f)))
 
-    if slowest(q) <= steps * (1.0 + WITHIN):
-        return model.process_noise_cov
+    def cov(lift: np.ndarray) -> np.ndarray:
+        raised = model.process_noise_cov + basis @ lift @ basis.T * scales[:, None] * scales
+        return 0.5 * (raised + raised.T)
+
+    reached = steady if slowest is None else lambda lift: slowest(cov(lift))
+    first = reached(0.0 * q)
+    if first <= steps * (1.0 + (WITHIN if slowest is None else 0.0)):
+        return RaisedNoise(model.process_noise_cov, first)
     alpha = math.exp(1.0 / steps)
     floor = _floor(alpha * f, h, q, path.q_factors) * (1.0 - alpha**-2)
-    high = next((float(i) for i in range(FACTORS) if slowest(q + 2.0**i * floor) <= steps), math.nan)
-    if math.isnan(high):
-        least = slowest(q + 2.0**FACTORS * floor)
-        raise ValueError(
-            f"a time constant (--forget) must be one that some Q reaches, at least {least * dt:.3g} s, but got "
-            f"{seconds:.3g} s: allow a longer one, or measure more"
-        )
-    low = -float(FACTORS)
-    while high - low > WITHIN:
+    tried: dict[float, float] = {}  # time constants by the logarithm of the factor on the floor
+    for power in range(0, FACTORS + 1, STRIDE):
+        tried[power] = reached(2.0**power * floor)
+        if tried[power] <= steps:
+            break
+    low, high = -float(FACTORS), float(min(tried, key=lambda power: tried[power]))
+    while tried[high] <= steps and high - low > WITHIN:
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if slowest(q + 2.0**middle * floor) <= steps else (middle, high)
-    lifted = basis @ (2.0**high * floor) @ basis.T * scales[:, None] * scales
-    found = model.process_noise_cov + lifted
-    return 0.5 * (found + found.T)
+        tried[middle] = reached(2.0**middle * floor)
+        low, high = (low, middle) if tried[middle] <= steps else (middle, high)
+    return RaisedNoise(cov(2.0**high * floor), tried[high])
 
 
 def _floor(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) -> np.ndarray:

@@ -112,13 +112,14 @@ def test_without_measurements_errors_last_longer_and_what_is_not_observable_is_n
 def test_the_least_floor_makes_the_steady_gain_forget_in_the_time_that_is_allowed(blind):
     model = cart(blind=blind)
     path = slopes_along(make_filter("kf", model), runs(100))
-    q = forgetting_noise(path, model, 2.0, DT)
+    q, steps = forgetting_noise(path, model, 2.0 / DT)
+    assert 0.99 * 2.0 < steps * DT <= 2.0
     raised = model.replace(process_noise_cov=q)
     a, c = (part[:2, :2] for part in (model.matrices()[0], model.matrices()[3]))
     gain = steady_state(a, c, q[:2, :2], model.measurement_noise_cov)[1]
     values = np.abs(np.linalg.eigvals((np.eye(2) - gain @ c) @ a))
     assert -DT / np.log(values.max()) == pytest.approx(2.0, rel=2e-3)
-    np.testing.assert_array_equal(forgetting_noise(path, raised, 2.0, DT), raised.process_noise_cov)
+    np.testing.assert_array_equal(forgetting_noise(path, raised, 2.0 / DT).cov, raised.process_noise_cov)
     assert np.linalg.eigvalsh(q - model.process_noise_cov).min() > -1e-15
     assert time_constants(make_filter("kf", raised), runs(300)).steps[0] == pytest.approx(20.0, rel=2e-3)
 
@@ -126,7 +127,7 @@ def test_the_least_floor_makes_the_steady_gain_forget_in_the_time_that_is_allowe
 def test_a_q_that_is_large_enough_stays_and_nothing_to_forget_is_refused():
     model = walk(1.0)
     path = slopes_along(make_filter("kf", model), runs(40))
-    np.testing.assert_array_equal(forgetting_noise(path, model, 5.0), [[1.0]])
+    np.testing.assert_array_equal(forgetting_noise(path, model, 5.0).cov, [[1.0]])
     with pytest.raises(ValueError, match="must observe a state, but its measurements tell of none"):
         forgetting_noise(path._replace(observations=0.0 * path.observations), model, 5.0)
 

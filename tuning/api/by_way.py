@@ -125,6 +125,7 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     answer = study.user_attrs[ANSWER]
     found, refused = answer["choice"], answer.get("refused")
     choice = plan.forgetting(Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"])))
+    choice = plan.forgetting(choice, exact=True)
     value = measured(choice, plan, plan.training_data()).value
     nothing: dict[str, Any] = {
         "consistent": None,

@@ -45,6 +45,7 @@ class HeldOut:
         seed: of the study to which the seeds belong.
         name: the filter's label, "tuned" or, for the user's parameters, "own numbers".
         chosen: a study's choice and what it replaced, in sentences.
+        forget: the longest time constant that the study allowed [s]; None if any.
     """
 
     choice: Choice
@@ -54,6 +55,7 @@ class HeldOut:
     seed: int = 0
     name: str = TUNED
     chosen: tuple[str, ...] = ()
+    forget: float | None = None
 
     @property
     def filter(self) -> Filter:
@@ -117,7 +119,7 @@ class HeldOut:
         said = metrics(self.comparison)
         if not self.is_tuned:
             del said["tuned"]
-        warned = warnings_of(self.evaluation, self.problem)
+        warned = warnings_of(self.evaluation, self.problem, self.forget)
         return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said, "warnings": warned}
 
     def to_frame(self) -> pandas.DataFrame:
@@ -200,7 +202,7 @@ class HeldOut:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         restarts = restart_sentences(self.evaluations)
         if not self.chosen:  # a study's sentences have them
-            restarts += warnings_of(self.evaluation, self.problem)
+            restarts += warnings_of(self.evaluation, self.problem, self.forget)
         restarts.append(memory_sentence(self.evaluation, self.problem))
         if self.is_tuned:
             said = gains(self.comparison, self.problem.seed_word, self.name)

@@ -92,7 +92,7 @@ class Tuning(NamedTuple):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to beware of in the tuned filter: a covariance that is far off, and where the search ended."""
-        found = all_warnings(self.comparisons, self.plan.scenarios)
+        found = all_warnings(self.comparisons, self.plan.scenarios, self.plan.forget)
         return (*found, *range_warning(self.result.choice, self.plan))
 
     def write(self, file: str | Path) -> None:

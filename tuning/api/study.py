@@ -73,8 +73,11 @@ class Study:
     def evaluations(self) -> tuple[HeldOut, ...]:
         """The same on each problem."""
         pairs = zip(self.problems, self.tuning.comparisons, strict=True)
-        seed, chosen = self.tuning.plan.seed, self.tuning.chosen
-        return tuple(HeldOut(self.choice, one, comparison, seed=seed, chosen=chosen) for one, comparison in pairs)
+        plan, chosen = self.tuning.plan, self.tuning.chosen
+        return tuple(
+            HeldOut(self.choice, one, comparison, seed=plan.seed, chosen=chosen, forget=plan.forget)
+            for one, comparison in pairs
+        )
 
     @property
     def trials(self) -> list[FrozenTrial]:

@@ -29,7 +29,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.summary import numbers
 from tuning.evaluation.tuned import consistency, metrics
-from tuning.evaluation.worth import memory_sentence
+from tuning.evaluation.worth import memory_numbers, memory_sentence
 from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
@@ -285,6 +285,10 @@ def as_json(tuning: Tuning) -> dict:
         "best_training_value_without_consistency": result.free_value,
         **consistency(result),
         "warnings": list(tuning.warnings),
+        "memory": {
+            scenario.name: memory_numbers(comparison, scenario, plan.forget)
+            for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
+        },
         "blows_up": blown_up(tuning),
         "interrupted": result.interrupted,
         "sizes": [

@@ -25,7 +25,6 @@ from tuning.evaluation.evaluate import (
     median_score_ratio,
     score_ratio,
     with_restarts,
-    with_time_constants,
 )
 from tuning.evaluation.knowledge import KNOWLEDGE, STUDY_TRIALS, Known, known
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
@@ -35,6 +34,7 @@ from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.filter_parameters import ensemble_sizes_of
+from tuning.search.forgetting import time_constants_on
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice
 
@@ -259,7 +259,7 @@ def compare(
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
     runs, seconds = timed_runs(filter_, data, board.scenario.scale)
     evaluation = with_restarts(compute_metrics(filter_, runs, data, board.scenario.scale), filter_, runs, data)
-    evaluation = with_time_constants(evaluation, filter_, data)
+    evaluation = evaluation._replace(time_constants=time_constants_on(filter_, board.scenario))
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
     return Row(

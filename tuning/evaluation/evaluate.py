@@ -21,15 +21,14 @@ from filters.consistency.intervals import (
     without_interval,
 )
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
-from filters.consistency.time_constants import TimeConstants, time_constants
+from filters.consistency.time_constants import TimeConstants
 from filters.ensembles.recording import record_members
-from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.restarts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
-from tuning.problems.data import Data, runs_of
+from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
@@ -123,13 +122,6 @@ def with_restarts(found: Evaluation, filter_: Filter, runs: RunMetrics, data: Da
     return found._replace(
         restarts=told._replace(times=found.divergences, runs=len(lost), of_runs=len(runs.divergences), run=place)
     )
-
-
-def with_time_constants(found: Evaluation, filter_: Filter, data: Data) -> Evaluation:
-    """An evaluation with the time constants of the filter's gain on the first two runs."""
-    if isinstance(filter_, ForeignFilter):  # its model need not be what it computes with
-        return found
-    return found._replace(time_constants=time_constants(filter_, runs_of(data)))
 
 
 def restart_sentences(evaluations: Mapping[str, Evaluation]) -> list[str]:

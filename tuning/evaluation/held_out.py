@@ -30,11 +30,11 @@ from tuning.evaluation.evaluate import (
     evaluate,
     likelihood_gain,
     score_ratio,
-    with_time_constants,
 )
 from tuning.evaluation.regression import gain_over_regression
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
+from tuning.search.forgetting import time_constants_on, with_oracle_and_advice
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS
 from tuning.search.space import Choice
 
@@ -129,7 +129,10 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     found = {role: None if one is None else _found(one, done) for role, one in choices.items()}
     untuned, tuned = found.pop("untuned"), found.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
-    tuned = with_time_constants(tuned, choice.filter(scenario), data)
+    constants = time_constants_on(choice.filter(scenario), scenario, seed)
+    if constants is not None:
+        constants = with_oracle_and_advice(constants, choice, scenario, seed)
+    tuned = tuned._replace(time_constants=constants)
     bound, rule, lacks = scenario.bound(data), rule_label(scenario), scenario.lacks_ranges
     over_regression = NOTHING
     if data.states is None:

@@ -99,17 +99,30 @@ def _restarts(data: Mapping | None) -> Restarts | None:
 def _time_constants(found: TimeConstants) -> dict:
     """Time constants as plain numbers, None in place of an infinite one."""
     steps = [part if math.isfinite(part) else None for part in (*found.steps, found.uptake)]
+    known = {name: value for name, value in found._asdict().items() if value is not None}
     lists = {"steps": steps[:-1], "unobservable": list(found.unobservable)}
-    return {**found._asdict(), **lists, "uptake": steps[-1]}
+    if found.oracle is not None:
+        lists["oracle"] = [part if math.isfinite(part) else None for part in found.oracle]
+    return {**known, **lists, "uptake": steps[-1]}
 
 
 def _as_time_constants(data: Mapping | None) -> TimeConstants | None:
     """Time constants from plain numbers; None of a file that says nothing of them."""
     if data is None:
         return None
-    *steps, uptake = (math.inf if part is None else float(part) for part in (*data["steps"], data["uptake"]))
-    unobservable = tuple(map(int, data["unobservable"]))
-    return TimeConstants(tuple(steps), int(data["slowest"]), uptake, unobservable, int(data["length"]))
+    lists = (data["steps"], (data["uptake"], *data.get("oracle", ())))
+    steps, (uptake, *oracle) = (
+        tuple(math.inf if part is None else float(part) for part in parts) for parts in lists
+    )
+    return TimeConstants(
+        steps,
+        int(data["slowest"]),
+        uptake,
+        tuple(map(int, data["unobservable"])),
+        int(data["length"]),
+        (oracle[0], oracle[1]) if oracle else None,
+        data.get("advised"),
+    )
 
 
 def _number(value) -> float:

@@ -23,6 +23,8 @@ LATER = (
     "restarts",
     "state_nees",
     "time_constants",
+    "oracle",
+    "advised",
 )  # keys that older files lack
 
 

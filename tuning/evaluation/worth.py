@@ -6,16 +6,18 @@ NIS is the normalised innovation squared.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isnan
+from math import inf, isfinite, isnan
 
 from filters.consistency.intervals import Interval, slightly, span
+from filters.consistency.time_constants import TimeConstants
 from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
+from tuning.search.forgetting import TOLERANCE
 
-MOST_OF_A_RUN = 0.2  # that a time constant may take without a warning
+ALIKE = 1.5  # ratio to the oracle's time constant up to which a filter is as slow as the oracle
 MOST_TIMES = 4  # time constants in a sentence
 HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
 
@@ -44,9 +46,15 @@ def worth(comparison: Comparison, what: str = "the score") -> str:
     return _listed(parts)
 
 
-def warnings_of(evaluation: Evaluation, problem: Problem) -> list[str]:
-    """What a headline warns of in a filter: a NEES that is far off, and a gain that hardly moves the estimate."""
-    return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem)]
+def warnings_of(evaluation: Evaluation, problem: Problem, forget: float | None = None) -> list[str]:
+    """What a headline warns of in a filter: a NEES that is far off, and a gain that hardly moves the estimate.
+
+    Args:
+        evaluation: of the filter.
+        problem: on which it was evaluated.
+        forget: the longest time constant that was allowed [s]; None for a fifth of a run.
+    """
+    return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem, forget)]
 
 
 def _nees_warning(evaluation: Evaluation) -> list[str]:
@@ -67,27 +75,84 @@ def _nees_warning(evaluation: Evaluation) -> list[str]:
     return [f"Do not rely on the covariance, it is too {size}: the mean NEES is {', '.join(said)}.{remark}"]
 
 
-def _memory_warning(evaluation: Evaluation, problem: Problem) -> list[str]:
-    """A time constant that is longer than a fifth of a run, or a gain of practically zero."""
+def _memory_warning(evaluation: Evaluation, problem: Problem, forget: float | None) -> list[str]:
+    """A time constant that is longer than was allowed or than a fifth of a run, or a gain of practically zero.
+
+    A filter that is as slow as the one with the plant's own Q and R is not warned of.
+    """
     found = evaluation.time_constants
     if found is None or not found.steps:
         return []
-    limit, short = found.length * MOST_OF_A_RUN, _times([found.length * MOST_OF_A_RUN], problem)
-    run, forget = _times([found.length], problem), f"--forget {short.split()[0]} raises Q so that it is not"
-    if problem.dt is None:
-        forget = "a larger Q shortens it"
-    if found.steps[0] > limit:
-        state = problem.model().states[found.slowest].short_label.split(" [")[0]
+    slowest = _times(found.steps[:1], problem)
+    if forget is not None and problem.dt is not None:
+        if found.steps[0] * problem.dt <= forget * TOLERANCE:
+            return []
         return [
-            f"The filter hardly forgets: an error of {state} lasts for {_times(found.steps[:1], problem)} (the "
-            f"longest time constant of its gain), longer than a fifth of a run ({run}): {forget}."
+            f"The longest time constant of the gain is {slowest} and misses --forget {forget:g}: a larger Q "
+            "shortens it no further."
         ]
-    if found.uptake > found.length:
+    if is_like_the_oracle(found):
+        return []
+    run = f"{_run_in_words(problem)} ({_times([found.length], problem)})"
+    if found.is_slow:
+        state, oracle = problem.model().states[found.slowest].short_label.split(" [")[0], ""
+        if found.oracle is not None:
+            oracle = f" With the plant's own Q and R it is {_times(found.oracle[:1], problem)}."
         return [
-            f"The gain is practically zero: updates take {_times([found.uptake], problem)} to take up 63 % of an "
-            f"innovation, longer than a run ({run}), so the filter ignores what its model does not know: raise Q."
+            f"The longest time constant of the gain, of {state}, is {slowest}, more than a fifth of {run}: after "
+            f"a disturbance that no run had, the estimate needs that long to recover.{oracle} "
+            f"{_advice(found, problem)}"
+        ]
+    if found.has_no_gain:
+        return [
+            f"The gain is practically zero: updates need {_times([found.uptake], problem)} to take up 63 % of an "
+            f"innovation, longer than {run}. The filter follows its model alone; a larger Q changes that."
         ]
     return []
+
+
+def is_like_the_oracle(found: TimeConstants) -> bool:
+    """Whether a filter that sleeps is practically as slow as the same filter with the plant's own Q and R."""
+    if found.oracle is None:
+        return False
+    pairs = zip((found.steps[0], found.uptake), found.oracle, strict=True)
+    slow = (found.is_slow, found.has_no_gain)
+    return all(own <= ALIKE * oracle for (own, oracle), counts in zip(pairs, slow, strict=True) if counts)
+
+
+def _run_in_words(problem: Problem) -> str:
+    if problem.shortest_log is None:
+        return "a run"
+    word = "log" if problem.seed_word == "blocks" else "run"
+    return f"the {word}" if len(problem.log_names) == 1 else f"the shortest {word}"
+
+
+def _advice(found: TimeConstants, problem: Problem) -> str:
+    """How to make a filter that sleeps forget sooner."""
+    if problem.dt is None:
+        return "A larger Q shortens it."
+    if found.advised is None:
+        return "A larger Q hardly shortens it: measure more, or more often."
+    return f"--forget {found.advised:g} keeps it within {found.advised:g} s."
+
+
+def memory_numbers(comparison: Comparison, problem: Problem, forget: float | None = None) -> dict:
+    """The longest time constant of a tuned filter's gain and what it is compared with [s], for JSON.
+
+    Without a sample time they are in steps. None stands for what is infinite or unknown.
+    """
+    found, dt = comparison.tuned.time_constants, problem.dt or 1.0
+    if found is None or not found.steps:
+        return {"longest": None, "run": None, "oracle": None, "allowed": forget, "advised": None, "warns": False}
+    longest, oracle = (value * dt for value in (found.steps[0], (found.oracle or (inf,))[0]))
+    return {
+        "longest": longest if isfinite(longest) else None,
+        "run": found.length * dt,
+        "oracle": oracle if isfinite(oracle) else None,
+        "allowed": forget,
+        "advised": found.advised,
+        "warns": bool(_memory_warning(comparison.tuned, problem, forget)),
+    }
 
 
 def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
@@ -103,6 +168,12 @@ def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
     if found.unobservable:
         names = ", ".join(states[place].symbol for place in found.unobservable)
         said += f"; the measurements alone do not determine {names}, whatever the gain"
+    if is_like_the_oracle(found):
+        assert found.oracle is not None
+        said += (
+            f". The plant's own Q and R give {_times(found.oracle[:1], problem)}: such a slow filter is right, as "
+            f"long as nothing else disturbs the plant. {_advice(found, problem)[:-1]}"
+        )
     return f"{said}."
 
 
@@ -122,11 +193,13 @@ def _times(steps: Sequence[float], problem: Problem) -> str:
     return f"{', '.join(rounded(one * dt) for one in steps)} {'steps' if problem.dt is None else 's'}"
 
 
-def all_warnings(comparisons: Sequence[Comparison], problems: Sequence[Problem]) -> list[str]:
-    """The warnings of a tuned filter on all problems of a study."""
+def all_warnings(
+    comparisons: Sequence[Comparison], problems: Sequence[Problem], forget: float | None = None
+) -> list[str]:
+    """The warnings of a tuned filter on all problems of a study; `forget` as in `warnings_of`."""
     places = [f"{one.name}: " if len(problems) > 1 else "" for one in problems]
     pairs = zip(comparisons, problems, strict=True)
-    found = [warnings_of(comparison.tuned, problem) for comparison, problem in pairs]
+    found = [warnings_of(comparison.tuned, problem, forget) for comparison, problem in pairs]
     return [f"{place}{said}" for place, some in zip(places, found, strict=True) for said in some]
 
 

@@ -16,7 +16,7 @@ from filters.tuned_file import AUGMENTED, PRIOR
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import rows_argument
-from tuning.problems.data import Data
+from tuning.problems.data import Data, Run
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Problem
 
@@ -220,6 +220,10 @@ class AugmentedProblem(Problem):
         """Those of the problem."""
         return self.problem.held_out_seeds(seed, count)
 
+    def long_runs(self, seed: int) -> list[Run]:
+        """Those of the problem."""
+        return self.problem.long_runs(seed)
+
     def logs_of(self, seeds: Sequence[int]) -> np.ndarray | None:
         """Those of the problem."""
         return self.problem.logs_of(seeds)
@@ -237,6 +241,7 @@ class AugmentedProblem(Problem):
         return {"of": {"digest": self.problem.digest, "content": self.problem.as_mapping()}}
 
     remarks = property(lambda self: self.problem.remarks)
+    shortest_log = property(lambda self: self.problem.shortest_log)
     log_names = property(lambda self: self.problem.log_names)
     lacks_ranges = property(lambda self: self.problem.lacks_ranges)
     scale_about = property(lambda self: self.problem.scale_about)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters.consistency.time_constants import Run
 from thruster_env.core.checks import at_least
 
 FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately
@@ -155,7 +156,7 @@ def checked_first_scored_step(value: Any, steps: int) -> int:
     return first
 
 
-def runs_of(data: Data, count: int = 2) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def runs_of(data: Data, count: int = 2) -> list[Run]:
     """Keys (1, 2), inputs (1, K, p) and measurements (1, K + 1, m) of the first runs, without padding."""
     found = [data.one(place) for place in range(min(count, len(data.seeds)))]
     return [(one.filter_keys, one.inputs, one.measurements) for one in found if one.steps > 1]

@@ -18,7 +18,7 @@ from thruster_env.logs.steps import as_rows, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
-from tuning.problems.data import Data, mask_of, only, padded
+from tuning.problems.data import Data, Run, mask_of, only, padded
 from tuning.problems.digest import digest_of
 from tuning.problems.log_checks import check_apart, checked_logs
 from tuning.problems.log_parts import Parts, parts_of
@@ -192,6 +192,28 @@ class LogProblem(AssumedProblem):
     def held_out_seeds(self, seed: int, count: int) -> range:
         """Numbers of all held-out blocks, for any count."""
         return self.parts.held_out
+
+    def long_runs(self, seed: int) -> list[Run]:
+        """The two longest logs with training blocks, whole, or between gaps where runs are cut at these."""
+        training = {self.parts.blocks[place].run for place in (*self.parts.training, *self.parts.sizes)}
+        pieces = {run: max(self._pieces(run), key=lambda piece: piece[1]) for run in sorted(training)}
+        longest = sorted(pieces, key=lambda run: -pieces[run][1])[:2]
+        runs = []
+        for run in longest:
+            log, (first, rows) = self.logs[run], pieces[run]
+            inputs, measurements = log.inputs[first : first + rows - 1], log.measurements[first : first + rows]
+            runs.append((filter_keys((run,)), inputs[None], measurements[None]))
+        return runs
+
+    def _pieces(self, run: int) -> tuple[tuple[int, int], ...]:
+        """First row and number of rows of the parts of a log that filters run through without a cut."""
+        log = self.logs[run]
+        return ((0, log.steps + 1),) if self._holds else log.pieces
+
+    @property
+    def shortest_log(self) -> int:
+        """Number of steps of the shortest of the logs."""
+        return min(log.steps for log in self.logs)
 
     def logs_of(self, seeds: Sequence[int]) -> np.ndarray:
         """The number of each block's log: neighbouring blocks of one log depend on each other."""

@@ -14,7 +14,7 @@ import numpy as np
 from thruster_env.model.quantities import Quantities
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import seeds
-from tuning.problems.data import Data
+from tuning.problems.data import Data, Run, runs_of
 from tuning.problems.parameter import Parameter
 
 BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
@@ -78,6 +78,15 @@ class Problem(ABC):
     def held_out_seeds(self, seed: int, count: int) -> range:
         """Seeds that a study with a given seed never sees."""
         return seeds.held_out_seeds(seed, count)
+
+    def long_runs(self, seed: int) -> list[Run]:
+        """Two runs of full length that a study with a given seed may see, along which gains settle."""
+        return runs_of(self.data(self.training_seeds(seed, 2)[:2]))
+
+    @property
+    def shortest_log(self) -> int | None:
+        """Number of steps of the shortest of the given logs; None without logs."""
+        return None
 
     def logs_of(self, seeds: Sequence[int]) -> np.ndarray | None:
         """The number of the log of each block, (B,), whose neighbours are dependent; None for independent runs."""

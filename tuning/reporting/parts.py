@@ -60,7 +60,7 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
             for (name, mean, right, word), place in zip(squares, places, strict=True)
         ]
         parts.append(f"the covariance is {' and '.join(found)}")
-    warned = all_warnings(comparisons, plan.scenarios)
+    warned = all_warnings(comparisons, plan.scenarios, plan.forget)
     warned += range_warning(choice, plan)
     doubts = [model_doubts(*pair, plan.seed) for pair in zip(plan.scenarios, comparisons, strict=True)]
     return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])

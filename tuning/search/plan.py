@@ -19,7 +19,7 @@ from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.forgetting import forgetting
+from tuning.search.forgetting import TOLERANCE, forgetting, raised_noise, reachable
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
 from tuning.search.space import (
     AUTO,
@@ -143,7 +143,7 @@ class Plan(NamedTuple):
             raise ValueError(f"relations need a filter with a covariance, but got {self.filter!r}")
         self.space()  # relations are checked
         if self.forget is not None:
-            self._check_forget()
+            self._check_forget(positive("forget", self.forget))
         if self.budget is not None:
             positive("budget", self.budget)
         elif self.filter == AUTO and "cost" not in self.objectives:
@@ -153,20 +153,27 @@ class Plan(NamedTuple):
             )
         return self
 
-    def _check_forget(self) -> None:
+    def _check_forget(self, seconds: float) -> None:
         """Raise ValueError unless Q can be raised so that the filter forgets in time."""
         if not self._has_covariance:
             raise ValueError(f"forget (--forget) needs a filter with a Q, but got {self.filter!r}")
         for problem in self.scenarios:
             if problem.dt is None:
                 raise ValueError(f"forget (--forget) needs a sample time, but {problem.name} has none")
-            if not positive("forget", self.forget) >= problem.dt:
-                raise ValueError(
-                    f"forget must be at least the sample time, {problem.dt:g} s, but got {self.forget:g}"
-                )
+            if seconds < problem.dt:
+                raise ValueError(f"forget must be at least the sample time, {problem.dt:g} s, but got {seconds:g}")
         if len({one.model().n for one in self.scenarios}) > 1:
             raise ValueError("forget (--forget) needs problems with the same number of states")
-        self.forgetting(untuned_choice(self.filter_types[0], self.scenarios[0]))
+        choice = untuned_choice(self.filter_types[0], self.scenarios[0])
+        for problem in self.scenarios:
+            raised = raised_noise(choice, problem, self.seed, seconds)
+            if raised is not None and raised.steps * (problem.dt or 1.0) > TOLERANCE * seconds:
+                other = reachable(choice.name, problem, self.seed, seconds)
+                advice = "measure more" if other is None else f"allow a longer one, such as {other:g} s"
+                raise ValueError(
+                    f"a time constant (--forget) must be one that a larger Q reaches, but on {problem.name} none "
+                    f"reaches {seconds:g} s: {advice}"
+                )
 
     def _check_full_r(self) -> None:
         """Raise ValueError unless R may have correlations."""
@@ -232,12 +239,14 @@ class Plan(NamedTuple):
         """The choice of a trial's parameters."""
         return self.forgetting(choice_of(self.filter, values, self.scenarios[0], self.where))
 
-    def forgetting(self, choice: Choice) -> Choice:
-        """The choice with a Q that is raised, where it has to be, to keep time constants below `forget`."""
+    def forgetting(self, choice: Choice, *, exact: bool = False) -> Choice:
+        """The choice with a Q that is raised, where it has to be, to keep time constants below `forget`.
+
+        They are those of the steady gain; if exact, those of the filter's own gain, which results state.
+        """
         if self.forget is None:
             return choice
-        seeds = [one.training_seeds(self.seed, TRAINING_SEEDS) for one in self.scenarios]
-        return forgetting(choice, self.scenarios, seeds, self.forget)
+        return forgetting(choice, self.scenarios, self.seed, self.forget, exact=exact)
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""

@@ -61,14 +61,17 @@ def at_ends(choice: Choice, plan: Plan) -> list[str]:
 def _ended(choice: Choice, plan: Plan) -> list[Ended]:
     """The parameters of a choice at an end of their range.
 
-    Given values are not ends, nor are parameters that do not determine the choice's Q and R.
+    Given values are not ends, nor are parameters that do not determine the choice's Q and R, nor a Q that
+    `--forget` may have raised.
     """
     given: Mapping = plan.scenarios[0].given or {}
     own_noise = plan.scenarios[0].parameters is not None and bool(set(NOISE) & set(choice.model))
     found = []
     for name, one in model_ranges(plan).items():
-        value = one.get(choice)
-        if value is None or own_noise or value <= 0 < one.low or value == _given_value(one, choice, given):
+        value, raised = one.get(choice), plan.forget is not None and isinstance(one.place, ProcessVariance)
+        if value is None or own_noise or raised or value <= 0 < one.low:
+            continue
+        if value == _given_value(one, choice, given):
             continue
         part = _part(value, one)
         if not NEAR_END < part < 1.0 - NEAR_END:

@@ -206,8 +206,11 @@ def run_study(
     finalists = finalists_of(plan, present, resize)
     validation, value = validate(plan, finalists, data), best.values[0]
     if validation is None:
-        choice = next(iter(finalists.values()))
+        choice = plan.forgetting(next(iter(finalists.values())), exact=True)
+        if plan.forget is not None:
+            value = measured(choice, plan, data).value
     else:
+        validation = _forgetting(validation, plan)
         choice = validation.named(validation.chosen).choice
         value = measured(choice, plan, data).value
         study.set_user_attr(CHOSEN, {"trials": len(present), **(as_data(validation) or {})})
@@ -235,7 +238,10 @@ def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> S
     """The result with the answer of another method, which meets the baselines as trials do, and may give way."""
     data = plan.training_data()
     validation = validate(plan, {name: choice}, data, rescales=False)
-    if validation is not None:
+    if validation is None:
+        choice = plan.forgetting(choice, exact=True)
+    else:
+        validation = _forgetting(validation, plan)
         choice = validation.named(validation.chosen).choice
     return result._replace(
         choice=choice,
@@ -247,6 +253,13 @@ def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> S
         sizes=[],
         sized=None,
     )
+
+
+def _forgetting(validation: Validation, plan: Plan) -> Validation:
+    """A validation whose chosen filter has a Q by which its own gain forgets in time."""
+    chosen = validation.named(validation.chosen)
+    raised = chosen._replace(choice=plan.forgetting(chosen.choice, exact=True))
+    return validation._replace(met=tuple(raised if one is chosen else one for one in validation.met))
 
 
 def _begun(study: optuna.Study) -> list[FrozenTrial]:
