@@ -107,6 +107,22 @@ def made_with(content: Mapping[str, Any]) -> str:
     return " ".join(parts)
 
 
+def check_preset_file(options: Mapping[str, Any], given: Any, path: str | Path) -> None:
+    """Raise ValueError if a tuned file names a preset file that is not there, and no other one is given.
+
+    Args:
+        options: from `tune_options`.
+        given: the preset that the caller gives, or None.
+        path: of the tuned file.
+    """
+    preset = options.get("preset")
+    if given is None and isinstance(preset, str) and preset.endswith(".toml") and not Path(preset).is_file():
+        raise ValueError(
+            f"the preset of {path} must be where it was, but there is no file {preset}: say where it is "
+            "now (--preset FILE)"
+        )
+
+
 @contextmanager
 def compared(content: Mapping[str, Any], path: str | Path) -> Iterator[None]:
     """Add to an error of a comparison with a tuned file the options with which that was made."""

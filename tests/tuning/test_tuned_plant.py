@@ -234,7 +234,14 @@ def test_a_tuned_file_finds_its_preset_or_an_error_names_the_options_that_made_i
     others = thruster("estimate", "run.csv", "tuned.json", "--preset", "other.toml")
     assert others.returncode == 2 and others.stderr.strip().endswith(made)
     shutil.move("mine.toml", "moved.toml")
+    way_out = r"there is no file mine.toml: say where it is now \(--preset FILE\)"
+    for read in (lambda: problems_in(file), lambda: as_tuned({"preset": None}, file)):
+        with pytest.raises(ValueError, match=way_out):
+            read()
     assert read_tuned(file, problems_in(file, preset="moved.toml"))[1].digest == problem.digest
+    shutil.move("run.csv", "away.csv")
+    with pytest.raises(ValueError, match="there is no file run.csv: run the command in the folder"):
+        problems_in(file, preset="moved.toml")
 
 
 @pytest.mark.parametrize(
@@ -268,6 +275,7 @@ def test_the_options_that_made_a_file_are_those_of_the_command(content, options)
 
 def test_preset_of_a_scenario_must_be_the_file_s_own(nominal):
     with pytest.raises(
-        ValueError, match="must be that of the tuned file, but got t200, .* with --problem nominal"
+        ValueError,
+        match="must be that of the tuned file, but got t200, .* with --problem nominal, .*: leave --preset out",
     ):
         problems_in(nominal, preset="t200")

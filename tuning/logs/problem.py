@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from filters.tuned_file import made_with, read_tuned_file, tune_options
+from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
 from thruster_env.env.replay import read_for
 from thruster_env.logs.log import Log
@@ -172,6 +172,8 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
                 f"logs in a tuned file must have paths and options, but {file} has {short_repr(content)}"
             ) from None
         check_model(options.get("model"), model, file)
+        check_preset_file(options, preset, file)
+        _check_logs_are_there(paths, file)
         options |= {} if preset is None else {"preset": str(preset)}
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
@@ -181,9 +183,19 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
     if preset is not None and not found and str(preset) != tune_options(of_file).get("preset"):
         raise ValueError(
             f"preset (--preset) must be that of the tuned file, but got {preset}, and {file} was made with "
-            f"{made_with(of_file)}"
+            f"{made_with(of_file)}, whose contents it holds: leave --preset out"
         )
     return found
+
+
+def _check_logs_are_there(paths: Sequence[str], file: Path) -> None:
+    """Raise ValueError if one of the logs that a tuned file names is not there."""
+    missing = [path for path in paths if not Path(path).exists()]
+    if missing:
+        raise ValueError(
+            f"the logs of {file} must be where they were, but there is no file {', '.join(missing)}: run the "
+            "command in the folder in which thruster tune ran, or put them back"
+        )
 
 
 def model_named_in(problem: Problem) -> str | None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from filters.tuned_file import read_tuned_file, tune_options
+from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.modules import object_named
 from thruster_env.env.replay import ANY_DT, read_for
@@ -127,6 +127,7 @@ def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, An
     if tuned is None or named.get("model") is not None:
         return dict(named)
     options = tune_options(read_tuned_file(tuned))
+    check_preset_file(options, named.get("preset"), tuned)
     if named.get("preset") is None:
         check_model(options.get("model"), None, tuned)
     stored: dict[str, Any] = {name: value for name, value in options.items() if name in ("preset", "sensors")}
