@@ -1,7 +1,7 @@
 """docs/boat.md: every line is run, from ULogs to C code on the emulated controller that flags a stuck sensor."""
 
-import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("pyulog")
 from tests.thruster_env.logs.recorders.files import write_ulog
+from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 
 PAGE = (Path(__file__).parents[2] / "docs" / "boat.md").read_text()
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
@@ -19,10 +20,10 @@ CONTROLLER = "arm-none-eabi-gcc", "qemu-system-arm"
 FROZEN = 1000  # row of the fourth dive from which on the load cell repeats its reading
 
 
-def dive(folder, number, run):
+def dive(folder, number, thruster):
     """Record a dive as a ULog, by pyulog's own writer."""
     log = folder / f"truth{number}.csv"
-    run(["thruster", "simulate", "--preset", "tunnel_physical", "--steps", 1500, "--seed", number, "--out", log])
+    thruster("simulate", "--preset", "tunnel_physical", "--steps", 1500, "--seed", number, "--out", log)
     table = np.genfromtxt(log, delimiter=",", names=True)
     force, stamps = table["measured_thrust_N"].copy(), np.round(5e6 + 1e6 * table["time_s"]).astype(np.uint64)
     if number == 4:
@@ -36,23 +37,17 @@ def dive(folder, number, run):
 
 
 @pytest.mark.slow
-def test_every_line_leads_to_the_alarm(tmp_path):
-    (tmp_path / "bin").mkdir()
-    command = tmp_path / "bin" / "thruster"
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m tuning.cli "$@"\n')
-    command.chmod(0o755)
-    paths = [str(tmp_path / "bin"), os.environ["PATH"]]
-    environment = {**os.environ, "PATH": os.pathsep.join(paths), "PYTHONPATH": str(Path(__file__).parents[2])}
-
-    def run(words, **options):
-        done = subprocess.run(
-            list(map(str, words)), cwd=tmp_path, env=environment, capture_output=True, text=True, **options
-        )
+def test_every_line_leads_to_the_alarm(tmp_path, thruster):  # noqa: F811
+    def run(words):
+        if words[0] == "thruster":
+            done = thruster(*words[1:])
+        else:
+            done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode in (0, 3), (words, done.stdout, done.stderr)  # 3: no trial of so few was consistent
         return done.stdout
 
     for number in (1, 2, 3, 4):
-        dive(tmp_path, number, run)
+        dive(tmp_path, number, thruster)
     printed = {}
     for language, code in BLOCKS:
         if language == "c":
@@ -65,7 +60,8 @@ def test_every_line_leads_to_the_alarm(tmp_path):
                     continue
                 assert line.split()[0] in ("thruster", "cc", "./bow_log", "tail", *CONTROLLER), line
                 name = " ".join(line.split()[:2])
-                printed[name] = run(["sh", "-c", line.replace("--trials 40", "--trials 3")])
+                words = shlex.split(line.replace("--trials 40", "--trials 3"))
+                printed[name] = run(words if name.startswith("thruster") else ["sh", "-c", line])
     assert "load_cell.force" in printed["thruster log"] and "actuator_outputs.output[0]" in printed["thruster log"]
     said = " ".join(printed["thruster estimate"].split())
     assert "thrust: equal readings since 15 s, found at 15.09 s (stuck)" in said
