@@ -20,10 +20,10 @@ CONTROLLER = "arm-none-eabi-gcc", "qemu-system-arm"
 FROZEN = 1000  # row of the fourth dive from which on the load cell repeats its reading
 
 
-def dive(folder, number, thruster):
+def dive(folder, number, command):
     """Record a dive as a ULog, by pyulog's own writer."""
     log = folder / f"truth{number}.csv"
-    thruster("simulate", "--preset", "tunnel_physical", "--steps", 1500, "--seed", number, "--out", log)
+    command("simulate", "--preset", "tunnel_physical", "--steps", 1500, "--seed", number, "--out", log)
     table = np.genfromtxt(log, delimiter=",", names=True)
     force, stamps = table["measured_thrust_N"].copy(), np.round(5e6 + 1e6 * table["time_s"]).astype(np.uint64)
     if number == 4:

@@ -131,18 +131,31 @@ def test_a_digest_is_another_if_any_part_of_the_code_is(tmp_path):
     assert in_a_process(tmp_path / "more", extra="UNUSED = 3\n\ndef unused():\n    pass\n") == found[-1]
 
 
-def of_template(folder, name, *changes, run=False):
-    """The digest of the template's problem with some changes of its text, in a process of its own."""
+IMPORTED = """
+import importlib, sys
+for folder in sys.argv[1:]:
+    sys.path.insert(0, folder)
+    sys.modules.pop("spring", None)
+    print(importlib.import_module("spring").problem.digest)
+"""
+
+
+def written(path, changes):
+    """A file with the template's text, changed."""
     text = TEMPLATE.partition("\n\nif __name__")[0]
     for before, after in changes:
         assert before in text
         text = text.replace(before, after)
-    folder.mkdir(exist_ok=True)
-    (folder / f"{name}.py").write_text(text + PRINTED)
-    command = [f"{name}.py"] if run else ["-c", f"import {name}; print({name}.problem.digest)"]
-    done = subprocess.run([sys.executable, *command], cwd=folder, capture_output=True, text=True)
+    path.parent.mkdir()
+    path.write_text(text + PRINTED)
+    return path
+
+
+def printed(*command):
+    """The lines that a process of Python prints."""
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return done.stdout.splitlines()
 
 
 WRAPPED = (
@@ -182,14 +195,13 @@ CHANGES = {
     ],
 )
 def test_another_class_of_an_env_is_another_problem(form, tmp_path):
-    found = [of_template(tmp_path, "spring", *form)]
-    found += [
-        of_template(tmp_path, "spring", *form, *one) for one in list(CHANGES.values())[: 4 if not form else 1]
-    ]
-    assert len(set(found)) == len(found)
-    assert of_template(tmp_path, "another_name", *form, run=True) == found[0]
+    changes = [[], *list(CHANGES.values())[: 1 if form else 4]]
     if form is WRAPPED:
-        assert of_template(tmp_path, "spring", *form, ("0.5 * action", "0.6 * action")) not in found
+        changes.append([("0.5 * action", "0.6 * action")])
+    files = [written(tmp_path / str(k) / "spring.py", (*form, *change)) for k, change in enumerate(changes)]
+    found = printed("-c", IMPORTED, *(file.parent for file in files))
+    assert len(set(found)) == len(files)
+    assert printed(written(tmp_path / "run" / "another_name.py", form)) == found[:1]
 
 
 class Gravity(gym.Env):
