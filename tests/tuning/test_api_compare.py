@@ -10,6 +10,7 @@ import pytest
 
 import tuning
 from filters.augmented import Unknown
+from filters.registry import make_filter
 from tests import pendulum_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
@@ -124,6 +125,17 @@ def sluggish(**options):
     start = {"prior_mean": [0.0], "prior_cov": [1.0], "b": np.ones((1, 1)), "c": [[1.0]], "states": ["x"], **noise}
     truth, assumed = (affine_model(a=[[a]], **start) for a in (0.98, 0.7))
     return ModelProblem(truth, assumed, Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), **options)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_caption_says_of_each_row_whose_q_and_r_it_has():
+    model = sluggish(name="sluggish").truth
+    problem = ModelProblem(model, inputs=Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), name="right")
+    mine = make_filter("kf", model.replace(process_noise_cov=[9.0]))
+    found = tuning.compare({"mine": mine, "kf": "kf"}, problem, seeds=4, knows="true", progress=False)
+    text = " ".join(str(found).split())
+    assert "Q and R: of mine those of the filter itself; of kf the plant's own (oracle" in text
+    assert [row.knows for row in found.boards[0].rows] == ["own", "true"]
 
 
 @pytest.mark.usefixtures("as_python")

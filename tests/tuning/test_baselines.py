@@ -32,14 +32,15 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.residuals import noise_estimation, residuals
 from tuning.evaluation.summary import summarised, summary
-from tuning.evaluation.worth import warnings_of, worth
+from tuning.evaluation.worth import gain, warnings_of, worth
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.parameter import Parameter
 from tuning.reporting.gains import gains
+from tuning.reporting.residual_words import consistency_sentence
 from tuning.search.correlations import correlations_of, full_covariance
 
 
@@ -124,18 +125,38 @@ def test_a_headline_warns_of_a_nees_that_is_more_than_a_factor_of_three_off():
     np.testing.assert_allclose(bad.state_nees, (errors**2 / variances).mean((0, 1)), rtol=1e-12)
     assert warnings_of(good, problem) == [] and list(bad.scored_nees) == ["p [m]"]
     (said,) = warnings_of(bad, problem)
-    assert said.startswith("Do not rely on the covariance, it is too small: the mean NEES is")
-    assert "where 2 is right, that of p" in said
+    assert said.startswith("Do not rely on the covariance, it is too small for p [m] (mean NEES ")
+    assert " where 1 is right) and too small jointly (" in said and said.endswith(" where 2 is right).")
     singular = bad._replace(nees=Interval(219381.0, 0.0, 0.0), state_nees=np.array([1.2, 0.9]))
     assert warnings_of(singular, problem) == [
-        "Do not rely on the covariance, it is too small: the mean NEES is 219381 where 2 is right, that of p [m] "
-        "alone 1.2 where 1 is right. Each variance is about right: P is nearly singular, or its correlations are "
-        "wrong."
+        "Do not rely on the covariance, it is too small jointly (219381 where 2 is right): each variance is about "
+        "right, but P is nearly singular, or its correlations are wrong."
     ]
+    mixed = bad._replace(nees=Interval(4.9, 4.7, 5.1), state_nees=np.array([0.2, 0.9]))
+    assert warnings_of(mixed, problem) == [
+        "Do not rely on the covariance, it is too large for p [m] (mean NEES 0.2 where 1 is right) and too small "
+        "jointly (4.9 where 2 is right): its correlations are wrong, too."
+    ]
+    wide = bad._replace(nees=Interval(2.0, 1.8, 2.2), state_nees=np.array([0.2, 3.5]), scale=np.ones(2))
+    (said,) = warnings_of(wide, problem)
+    assert "(mean NEES 3.5 where 1 is right) and too large for p [m] (mean NEES 0.2 where 1 is right)." in said
+    comparison = Comparison(wide, wide, None, np.ones(2), range(8))
+    assert consistency_sentence(comparison).startswith("Consistent jointly, but not in each state: mean NEES 2 [")
     again = summarised(json.loads(json.dumps(summary(bad))), problem)
     assert warnings_of(again, problem) == warnings_of(bad, problem)
     old = {name: value for name, value in summary(bad).items() if name != "state_nees"}
     assert "of p" not in warnings_of(summarised(old, problem), problem)[0]
+
+
+def test_a_score_that_falls_to_a_small_part_is_a_factor_and_no_percentage():
+    small = Interval(0.004, 0.003, 0.005)
+    assert gain(small, 8) == "lowers the score by a factor of 250 [200, 333]"
+    assert gain(Interval(40.0, 30.0, 50.0), 8) == "raises the score by a factor of 40 [30, 50]"
+    assert gain(Interval(0.4, 0.3, 0.5), 8) == "lowers the score by 60 % [50, 70]"
+    comparison = evaluate_held_out(rule_of_thumb("kf", LinearProblem()), LinearProblem(), 0, 4)
+    ratios = dict.fromkeys(comparison.ratios, small)
+    said = gains(comparison._replace(stored_ratios=ratios), "seeds")[0]
+    assert "Tuning lowers the error by a factor of 250 [200, 333] against the " in said
 
 
 def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():

@@ -23,7 +23,7 @@ from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.fitting import DEFAULT_FILTERS, default_filters, fitting
-from tuning.evaluation.knowledge import OF_FILE, STUDY, STUDY_TRIALS
+from tuning.evaluation.knowledge import OF_FILE, OF_FILTER, STUDY, STUDY_TRIALS
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.augmented import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
@@ -198,7 +198,8 @@ def contenders_of(
             out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
         elif is_own(one):
             label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"
-            out.append(Contender(_new(label, out), partial(user_choice, one)))
+            source = "" if isinstance(one, Filter) and not one.has_covariance else OF_FILTER
+            out.append(Contender(_new(label, out), partial(user_choice, one), knows=source))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
             chosen, suit = partial(_from_file, Path(one), size), partial(suited_to, Path(one))

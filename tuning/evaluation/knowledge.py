@@ -31,7 +31,7 @@ from tuning.search.quiet import quiet_optuna
 from tuning.search.space import Choice, has_search_space
 from tuning.search.study import open_study, run_trials
 
-OF_FILE, STUDY = "tuned", "study"
+OF_FILE, OF_FILTER, STUDY = "tuned", "own", "study"
 STUDY_TRIALS = 20  # of a comparison's study, if no number is given
 TUNING = "tuning"  # how the progress of such a study begins
 # The one explanation of `knows`: that of the command's help, of the docstring of `tuning.compare` and of the docs.
@@ -52,6 +52,7 @@ SAID = {
     "noise": "noise estimation ({option} noise)",
     STUDY: "the best trial of a study ({option} study)",
     OF_FILE: "the tuned ones",
+    OF_FILTER: "those of the filter itself",
 }
 KNOWLEDGE = ("true", "scaled", "untuned", "given", "noise", STUDY)  # of Q and R; see `KNOWS`
 OF_BASELINE = {SCALED: "scaled", RULE: "untuned", GIVEN: "given", NOISE: "noise"}

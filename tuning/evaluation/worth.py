@@ -18,6 +18,7 @@ from tuning.problems.problem import Problem
 from tuning.search.forgetting import TOLERANCE
 
 ALIKE = 1.5  # ratio to the oracle's time constant up to which a filter is as slow as the oracle
+LARGEST_RATIO = 10.0  # of scores, up or down, that sentences give in percent
 MOST_TIMES = 4  # time constants in a sentence
 HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
 
@@ -61,18 +62,37 @@ def _nees_warning(evaluation: Evaluation) -> list[str]:
     """A mean NEES, joint or of a scored state, more than a factor of three off."""
     if not evaluation.has_truth:
         return []
-    joint, n, states = evaluation.nees.value, len(evaluation.rmse), evaluation.scored_nees
+    joint, n, states = evaluation.nees, len(evaluation.rmse), evaluation.scored_nees
     far = {name: ratio for name, ratio in states.items() if is_beyond(ratio)}
-    if not far and not is_beyond(joint / n):
+    if not far and not is_beyond(joint.value / n):
         return []
-    said = [] if isnan(joint) else [f"{rounded(joint)} where {n} is right"]
-    if states:
-        most = farthest(states.values())
-        name = next(name for name, ratio in states.items() if ratio == most)
-        said.append(f"that of {name} alone {rounded(most)} where 1 is right")
-    remark = "" if far else " Each variance is about right: P is nearly singular, or its correlations are wrong."
-    size = "small" if farthest([joint / n, *states.values()]) > 1.0 else "large"
-    return [f"Do not rely on the covariance, it is too {size}: the mean NEES is {', '.join(said)}.{remark}"]
+    parts = []
+    for size, end in (("small", "up"), ("large", "down")):
+        ratios = {name: ratio for name, ratio in far.items() if (ratio > 1.0) == (size == "small")}
+        if ratios:
+            until = "" if len(ratios) == 1 else f"{end} to "
+            most = f"mean NEES {until}{rounded(farthest(ratios.values()))}"
+            parts.append(f"too {size} for {', '.join(ratios)} ({most} where 1 is right)")
+    whole = _size_of(joint, n)
+    if whole:
+        parts.append(f"{whole} jointly ({rounded(joint.value)} where {n} is right)")
+    reason = ""
+    if not far:
+        reason = ": each variance is about right, but P is nearly singular, or its correlations are wrong"
+    elif whole and not any(part.startswith(whole) for part in parts[:-1]):
+        reason = ": its correlations are wrong, too"
+    return [f"Do not rely on the covariance, it is {_listed_words(parts)}{reason}."]
+
+
+def _size_of(nees: Interval, n: int) -> str:
+    """Whether P is "too small" or "too large" by a mean NEES; empty where it may be right or is unknown."""
+    if isnan(nees.value) or (nees.covers(n) and not is_beyond(nees.value / n)):
+        return ""
+    return "too small" if nees.value > n else "too large"
+
+
+def _listed_words(parts: Sequence[str]) -> str:
+    return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
 
 
 def _memory_warning(evaluation: Evaluation, problem: Problem, forget: float | None) -> list[str]:
@@ -219,7 +239,7 @@ def _listed(parts: Sequence[tuple[str, str]]) -> str:
         rest if place and parts[place - 1][0] == verb else f"{verb} {rest}"
         for place, (verb, rest) in enumerate(parts)
     ]
-    return " and ".join([*([", ".join(said[:-1])] if said[:-1] else []), said[-1]])
+    return _listed_words(said)
 
 
 def sized(gained: Interval) -> Interval:
@@ -235,7 +255,17 @@ def gain(ratio: Interval, seeds: int, what: str = "the score") -> str:
     verb = "lowers" if ratio.high < 1 else "raises"
     if slight := slightly(ratio):
         return f"{verb} {what} by {slight} (practically nothing)"
+    if not 1.0 / LARGEST_RATIO < ratio.value < LARGEST_RATIO:
+        return f"{verb} {what} {times(ratio)}"
     return f"{verb} {what} by {span(Interval(100 * abs(1 - ratio.value), *ends), 0, ' %')}"
+
+
+def times(ratio: Interval) -> str:
+    """A ratio far from 1 as a factor, "by a factor of 250 [240, 260]", where percentages all round to 100."""
+    parts = ratio if ratio.value > 1.0 else (1.0 / part if part > 0.0 else inf for part in ratio)
+    value, *ends = map(rounded, parts)
+    low, high = ends if ratio.value > 1.0 else ends[::-1]
+    return f"by a factor of {value}" + ("" if low == high else f" [{low}, {high}]")
 
 
 def scaling_sentence(comparison: Comparison) -> str:

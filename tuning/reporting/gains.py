@@ -7,7 +7,7 @@ from math import isnan
 from filters.consistency.intervals import Interval, slightly, span
 from tuning.evaluation.baselines import TUNED, called
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.worth import scaling_sentence, sized, without_truth
+from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
 
 GIVEN_IS_ORACLE = (
     "The given Q and R are the plant's own, as the oracle's are; no trial of a study starts from them."
@@ -53,7 +53,8 @@ def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
         changed = "lower" if ratio.high < 1 else "higher"
         return f"Practically equal to the {name}: the error is {changed} by {slight}."
     if ratio.high < 1:
-        return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} % against the {called(name)}."
+        much = times(ratio) if ratio.value < 1.0 / LARGEST_RATIO else f"by {100 * (1 - ratio.value):.0f} %"
+        return f"Tuning lowers the error {much} against the {called(name)}."
     if ratio.low > 1:
         return f"Tuning makes the filter worse than the {name}."
     return f"No significant difference from the {name} on these {seed_word}."

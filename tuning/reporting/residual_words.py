@@ -7,6 +7,7 @@ import numpy as np
 from filters.consistency.intervals import Interval, span
 from filters.consistency.verdicts import confidence, mean_sentence
 from thruster_env.model.quantities import Quantity
+from tuning.evaluation.evaluate import is_beyond
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation
@@ -18,6 +19,7 @@ SMALL = 0.1  # of a mean over its deviation, or of a correlation: what is below 
 STRONG = 0.5  # correlation of residuals with the next step, above which a headline says that the model is wrong
 LARGE_NIS = 3.0  # mean NIS of the given Q and R over its expected value, above which the model is in doubt
 MADE_UP = "made consistent by Q and R, not by the model"
+JOINTLY = "consistent jointly, but not in each state"
 
 
 def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
@@ -127,16 +129,19 @@ def consistency_of(comparison: Comparison) -> tuple[str, Interval, float, str]:
         name, mean, right = "NEES", tuned.nees, float(len(tuned.rmse))
     else:
         name, mean, right = "NIS", tuned.nis, tuned.expected_nis
-    made_up = mean.covers(right) and is_far_below(comparison.over_regression)
-    return name, mean, right, MADE_UP if made_up else confidence(mean, right)
+    if mean.covers(right) and is_far_below(comparison.over_regression):
+        return name, mean, right, MADE_UP
+    if mean.covers(right) and any(map(is_beyond, tuned.scored_nees.values())):
+        return name, mean, right, JOINTLY
+    return name, mean, right, confidence(mean, right)
 
 
 def consistency_sentence(comparison: Comparison) -> str:
     """The same in a sentence; a filter that predicts far worse than a regression is never called consistent."""
     name, mean, right, word = consistency_of(comparison)
     said = mean_sentence(name, mean, right)
-    if word == MADE_UP:
-        return f"{MADE_UP[:1].upper()}{MADE_UP[1:]}:{said.partition(':')[2]}"
+    if word in (MADE_UP, JOINTLY):
+        return f"{word[:1].upper()}{word[1:]}:{said.partition(':')[2]}"
     if not comparison.tuned.has_truth or said.startswith("Consistent"):
         return said
     return f"{said} RMSE and NIS do not fully test the covariance."
