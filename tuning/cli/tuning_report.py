@@ -60,8 +60,9 @@ def report(tuning: Tuning) -> list[RenderableType]:
     shown: list[RenderableType] = [*tuning.chosen]
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
-        first, *others = gains(comparison, scenario.seed_word)
-        shown += [f"{where}{first}", *others, *model_doubts(scenario, comparison, plan.seed)]
+        said, doubts = gains(comparison, scenario.seed_word), model_doubts(scenario, comparison, plan.seed)
+        headline = 1 if comparison.tuned.has_truth else len(said)
+        shown += [f"{where}{said[0]}", *said[1:headline], *doubts, *said[headline:]]
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
     shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
