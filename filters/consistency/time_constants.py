@@ -15,7 +15,8 @@ from thruster_env.model.affine import AffineModel, slopes_of_step
 from thruster_env.model.shape import observation_slopes
 from thruster_env.model.state_space import StateSpaceModel
 
-STEPS = 24  # up to each of the places in a run, at which slopes are taken
+STEPS = 24  # up to each of the places in a run, at which slopes are taken ...
+SAMPLES = 8  # ... or more steps, so that the channel that is measured most rarely has about so many of them
 PLACES = (0.75, 1.0)  # in a run: filters have settled there
 BLIND = 1e-10  # eigenvalue of the observability Gramian's correlations, below which nothing is observed
 DOUBLINGS = 60  # of a path, at most: then even slow covariances have settled
@@ -142,14 +143,15 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
 def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
     """Slopes of a filter's model along its estimates, at consecutive steps late in each run; None if lost."""
     model, parts, constant = filter_.kernel_model, [], None
-    slopes = observation_slopes(model.functions, model.shape)
+    functions = model.functions
+    slopes = observation_slopes(functions, model.shape)
     for keys, inputs, measurements in runs:
         found: Estimates = run(filter_, keys, inputs, measurements)
-        ends = (int(place * inputs.shape[1]) for place in PLACES)
-        for k in sorted({k for end in ends for k in range(max(end - STEPS, 0) + 1, end + 1)}):
+        ends, count = (int(place * inputs.shape[1]) for place in PLACES), _steps_to_take(measurements[0])
+        for k in sorted({k for end in ends for k in range(max(end - count, 0) + 1, end + 1)}):
             x, p, s = found.means[0, k - 1], found.covs[0, k - 1], found.innovation_covs[0, k]
             if constant is None or not isinstance(model, AffineModel):
-                f, _, after = slopes_of_step(model, x, inputs[0, k - 1])
+                f, _, after = slopes_of_step(model, x, inputs[0, k - 1], functions=functions)
                 h = np.array(slopes(as_value(after), as_value(model.scales), model.given_constants))
                 constant = f, h.reshape(model.m, model.n)
             f, h = constant[0], constant[1].copy()
@@ -158,6 +160,13 @@ def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
                 factor = inputs[0, k - 1, -1] if model.shape.step_ratio else 1.0
                 parts.append((f, h, p, s, factor))
     return Path(*map(np.array, zip(*parts, strict=True))) if parts else None
+
+
+def _steps_to_take(measurements: np.ndarray) -> int:
+    """The number of consecutive steps of measurements (K + 1, m) in which all channels have their usual share."""
+    measured = (~np.isnan(measurements[1:])).mean(axis=0)
+    rarest = measured[measured > 0.0].min(initial=1.0)
+    return max(STEPS, round(SAMPLES / rarest))
 
 
 def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:

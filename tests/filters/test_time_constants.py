@@ -108,6 +108,15 @@ def test_without_measurements_errors_last_longer_and_what_is_not_observable_is_n
     assert blind.unobservable == (2,) and len(blind.steps) == 2
 
 
+def test_a_fix_every_fifty_steps_counts_as_often_as_it_comes():
+    q, every, ((keys, inputs, z),) = 0.01, 50, runs(1000)
+    z[:, np.arange(1001) % every != 10] = np.nan
+    found = time_constants(make_filter("kf", walk(q)), [(keys, inputs, z)])
+    q *= every  # of the walk between two fixes
+    p = q / 2 + math.sqrt(q * q / 4 + q)
+    assert found.steps == pytest.approx([-every / math.log(1.0 - p / (p + 1.0))], rel=1e-6)
+
+
 @pytest.mark.parametrize("blind", (False, True))
 def test_the_least_floor_makes_the_steady_gain_forget_in_the_time_that_is_allowed(blind):
     model = cart(blind=blind)

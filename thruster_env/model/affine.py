@@ -14,7 +14,7 @@ from thruster_env.core.derivatives import step_of, stretch
 from thruster_env.core.pickling import makes_functions
 from thruster_env.core.sources import Source, as_value
 from thruster_env.model.layout import starts_of
-from thruster_env.model.shape import constants_are_array, observation_slopes, transition_slopes
+from thruster_env.model.shape import Functions, constants_are_array, observation_slopes, transition_slopes
 from thruster_env.model.state_space import StateSpaceModel
 
 
@@ -142,15 +142,27 @@ def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray)
 
 
 def slopes_of_step(
-    model: StateSpaceModel, x: np.ndarray, u: np.ndarray, by_input: bool = False
+    model: StateSpaceModel,
+    x: np.ndarray,
+    u: np.ndarray,
+    by_input: bool = False,
+    functions: Functions | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Slopes of a whole step at a state x (n,) and an input u (p,).
+
+    Args:
+        model: the model.
+        x: the state.
+        u: the input.
+        by_input: whether df/du is asked for.
+        functions: the model's, which take longer to prepare than a step, for callers of many steps.
 
     Returns:
         df/dx (n, n) and df/du (n, p) over all substeps, the latter zero unless asked for; and f(x, u), (n,).
     """
     a, b, point = np.eye(model.n), np.zeros((model.n, model.inputs)), as_value(x)
-    scales, v, functions, c = as_value(model.scales), as_value(u), model.functions, model.given_constants
+    scales, v, c = as_value(model.scales), as_value(u), model.given_constants
+    functions = functions or model.functions
     slopes = transition_slopes(functions, model.shape)
     for _ in range(model.substeps):
         f = np.array(slopes(point, scales, v, c)).reshape(a.shape)
