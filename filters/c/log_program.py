@@ -57,7 +57,8 @@ int main(int count, char **words)
     @REAL@ values[COLUMNS] = {0}, last[COLUMNS];
 
     if (count != 1 && count != 1 + COLUMNS) {
-        fprintf(stderr, "give no header, or %d, inputs first\\n", (int)COLUMNS);
+        fprintf(stderr, "give no header, or %d, inputs first, and the log as standard input: < log.csv\\n",
+                (int)COLUMNS);
         return 2;
     }
     if (!read_headers(count > 1 ? words + 1 : NULL)) {

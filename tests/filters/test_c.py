@@ -447,7 +447,7 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
         ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
         ([], "V_s,force\n", "a log must have a column measured_thrust_N, or its headers be given\n"),
         (["u", "z"], "u,thrust\n", "a log must have a column z, or its headers be given\n"),
-        (["u"], "u,z\n", "give no header, or 2, inputs first\n"),
+        (["u"], "u,z\n", "give no header, or 2, inputs first, and the log as standard input: < log.csv\n"),
         (
             ["u", "z"],
             "u,z\n,2\n1,3\n4,5\n",

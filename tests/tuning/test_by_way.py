@@ -17,6 +17,7 @@ from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
 from tuning.problems.runs_problem import RunsProblem
+from tuning.search.objectives import reported, reported_name
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import given_choice, untuned_choice
 from tuning.ways.lagged import stationary, steady_gain
@@ -159,8 +160,10 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
     refused = study.tuning.way.refused
     assert refused.found > refused.given == pytest.approx(study.tuning.result.best_value)
     again = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
+    objective = study.tuning.plan.objectives[0]
     for one in (study, again):
-        assert f"worse on these ({refused.found:.4g} for {refused.given:.4g})" in one.tuning.chosen[0]
+        answer, given = (f"{reported(objective, value):.4g}" for value in (refused.found, refused.given))
+        assert f"a {reported_name(objective)} of {answer} and the given filter {given}," in one.tuning.chosen[0]
 
 
 @pytest.mark.parametrize("options", [{}, {"hold_r": True}])
@@ -174,7 +177,7 @@ def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypa
     np.testing.assert_array_equal(found["process_noise_cov"], own["process_noise_cov"])
     np.testing.assert_array_equal(found["measurement_noise_cov"], r)
     refused = study.tuning.way.refused
-    assert refused.given < refused.found and "so what was given is chosen" in study.tuning.chosen[0]
+    assert refused.given < refused.found and "so that one is returned" in study.tuning.chosen[0]
 
 
 @pytest.mark.parametrize(("way", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])

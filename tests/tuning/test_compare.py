@@ -261,6 +261,9 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
         (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
         (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
         (("missing.json",), "a tuned file must be readable"),
+        (("ukf",), "an argument of compare must be a tuned file, but got ukf: use --filter ukf"),
+        (("auv:navigation",), "must be a tuned file, but got auv:navigation: use --scenario auv:navigation"),
+        (("own:problem",), "must be a tuned file, but got own:problem: use --problem own:problem"),
         (
             ("missing.safetensors", "--filter", "ekf"),
             "a trained estimator must be a file, but there is none",

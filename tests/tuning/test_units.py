@@ -5,7 +5,7 @@ from math import nan
 import pytest
 
 from filters.consistency.intervals import Interval, span
-from tuning.reporting.error_tables import about, limit_cell
+from tuning.reporting.error_tables import about, limit_cell, unless_blank
 from tuning.reporting.page import Table, Words
 from tuning.reporting.units import power_of_ten, scaled_unit, typeset
 
@@ -18,6 +18,13 @@ def test_units_are_typeset_in_words_and_tables(unit, page):
     assert (
         page in Words([f"It is 1 {unit}."]).html() and page in Table("", ["", f"q [{unit}]"], [["a", "1"]]).html()
     )
+
+
+def test_a_number_that_rounds_to_zero_has_no_minus():
+    cells = [
+        unless_blank(value, form) for value, form in ((-0.3, "+.0f"), (-0.004, ".2f"), (-1.2, "+.0f"), (nan, ""))
+    ]
+    assert cells == ["0", "0.00", "-1", ""]
 
 
 @pytest.mark.parametrize(

@@ -278,8 +278,8 @@ def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
     meeting = Validation((7, 8), True, (_met(GIVEN, 1.0, 1.0, 1.0), trial), GIVEN, "trial 3", GIVEN, None)
     (said,) = choice_sentences(as_data(meeting), plan)
     assert said.startswith(
-        "The study returns the given filter: on 2 validation seeds no trial is significantly better (the score of "
-        "trial 3 is 1.010 [0.990, 1.020] times as large)."
+        "The study returns the given filter: on 2 validation seeds no trial is significantly better (trial 3's "
+        "score is 1.010 [0.990, 1.020] times as large)."
     )
     paid = meeting._replace(met=(*meeting.met, _met("trial 4", 0.4, 0.3, 0.5, False, 5.0)), candidate="trial 4")
     said = choice_sentences(as_data(paid._replace(chosen="trial 4", price=1.742)), plan)
@@ -333,10 +333,10 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
     lost = trial._replace(worse_in=("run1.csv",))
     said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
     assert (
-        "no trial is significantly better without being worse in a log (the log-likelihood of a run of tr"
+        "no trial is significantly better without being worse in a log (trial 3's log-likelihood of a run is "
         in said[0]
     )
-    assert said[0].endswith("trial 3 is 610 [-523, 1740] higher, but it is worse in run1.csv).")
+    assert said[0].endswith("of a run is 610 [-523, 1740] higher, but it is worse in run1.csv).")
 
 
 def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():

@@ -15,6 +15,7 @@ from tuning.likelihood.goal import OF_STATES
 from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
+from tuning.search.objectives import reported, reported_name
 from tuning.search.parameters import R
 from tuning.search.plan import Plan
 from tuning.search.space import (
@@ -141,14 +142,17 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     )
 
 
-def way_sentence(found: Followed, word: str) -> str:
+def way_sentence(found: Followed, word: str, objective: str) -> str:
     """How the parameters were found, and the cost."""
     way = WAYS[found.name]
-    took = f"It took {found.seconds:.2g} s and as much as {found.runs:.0f} passes of the filter over one of the"
+    took = f"It took {found.seconds:.2g} s, as long as {found.runs:.0f} runs of the filter over one of the"
     worse = ""
     if found.refused is not None:
-        given, answer = found.refused
-        worse = f" Its answer is worse on these ({answer:.4g} for {given:.4g}), so what was given is chosen."
+        given, answer = (reported(objective, value) for value in found.refused)
+        worse = (
+            f" On these its answer has a {reported_name(objective)} of {answer:.4g} and the given filter "
+            f"{given:.4g}, so that one is returned."
+        )
     return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
 
 

@@ -86,7 +86,7 @@ class Tuning(NamedTuple):
         """Which trial was chosen and what it replaced, in sentences, and what to beware of in the result."""
         warned = self.warnings
         if self.way is not None:
-            return (way_sentence(self.way, self.scenario.seed_word), *warned)
+            return (way_sentence(self.way, self.scenario.seed_word, self.plan.objectives[0]), *warned)
         return (*choice_sentences(as_data(self.result.validation), self.plan), *warned)
 
     @property
@@ -211,7 +211,7 @@ def with_budget(plan: Plan) -> Plan:
     states = len(plan.scenarios[0].quantities.states)
     budget = DEFAULT_BUDGET * states**2
     warnings.warn(
-        f"filter 'auto' has no budget (--budget): a step may take {budget:g} microseconds of one core, the "
+        f"--filter auto got no --budget: a step may take {budget:g} microseconds of one core, the "
         f"default of {states} states",
         stacklevel=3,
     )

@@ -22,6 +22,7 @@ from tuning.evaluation.knowledge import KNOWS
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.augmented import unknown_in
 from tuning.problems.find import find_problem
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
@@ -83,6 +84,8 @@ def command(
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
+    for file in files or []:
+        _check_is_file(file)
     chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
     chosen = [of_preset(one, preset) for one in chosen]
     for file, problem in product(files or [], chosen):
@@ -102,6 +105,16 @@ def command(
     emit(shown, {**told, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)
+
+
+def _check_is_file(file: Path) -> None:
+    """Raise ValueError, with the option to use, if a name of a filter or problem stands where files do."""
+    name = str(file)
+    option = "--filter" if name in FILTERS else "--scenario" if name in built_in() else ""
+    if not file.exists() and (option or ":" in name):
+        raise ValueError(
+            f"an argument of compare must be a tuned file, but got {name}: use {option or '--problem'} {name}"
+        )
 
 
 def _default(files: list[Path]) -> Problem:

@@ -85,7 +85,7 @@ def report(tuning: Tuning) -> list[RenderableType]:
     shown += _search_sentences(tuning)
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
-    trained += f"; {over} ended for their cost" if over else ""
+    trained += f"; {over} stopped at the budget" if over else ""
     return [*shown, f"Study {tuning.study!r}: {trained}."]
 
 

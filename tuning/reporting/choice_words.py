@@ -49,7 +49,7 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
             without, but = " without being worse in a log", f", but it is worse in {_listed(lost)}"
         none_is, its = f"{the} is not", f"its {what}"
         if _is_trial(candidate):
-            none_is, its = "no trial is", f"the {what} of {candidate}"
+            none_is, its = "no trial is", f"{candidate}'s {what}"
         said = [
             f"The study returns the {called(baseline)}{members}: on {where} {none_is} significantly better"
             f"{without} ({its} is {_over(over, likely)}{but})."

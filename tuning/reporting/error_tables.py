@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite, isnan, log10
 
@@ -161,4 +162,4 @@ def about(value: Interval, digits: int) -> str:
 
 def unless_blank(value: float, form: str) -> str:
     """A value in a form; empty if there is no value."""
-    return "" if isnan(value) else format(value, form)
+    return "" if isnan(value) else re.sub(r"^-(0(?:\.0*)?)$", r"\1", format(value, form))  # no -0
