@@ -177,7 +177,7 @@ def test_a_rescaled_trial_has_the_estimates_of_the_trial_and_the_right_nees():
     assert _rescaled({"trial 1": trial}, plan._replace(hold_r=True), data) == {}
 
 
-def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_so_are_baselines():
+def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_so_are_baselines(monkeypatch):
     problem, size = LinearProblem(2, 1, steps=30), 60
     plan, data = Plan("enkf", (problem,)), [problem.data(range(16))]
     values = {"Q11": 1e-3, "Q22": 1e-3, "R": 1e-2, "N": 6, "inflation": 1.2, "relaxation": 0.0}
@@ -197,6 +197,11 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
         found[SCALED] == scaled_default("enkf", problem, 0, size).choice != scaled_default("enkf", problem).choice
     )
     assert (baseline_size(first), baseline_size(first.with_size(6))) == (size, 30)
+    monkeypatch.setattr(validation, "cost_of", lambda one, *_: one.numbers["ensemble_size"])
+    for budget, member in ((60.0, 60), (59.0, 30)):
+        dear = _baselines_of(plan._replace(budget=budget), first, data)
+        assert dear.keys() == found.keys() and {one.numbers["ensemble_size"] for one in dear.values()} == {member}
+    assert _baselines_of(plan._replace(budget=29.0), first, data) == {}
     assert baseline_size(untuned_choice("kf", problem)) is None
 
 

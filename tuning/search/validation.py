@@ -27,6 +27,7 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
+from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.measures import (
     LEVEL,
@@ -187,7 +188,9 @@ def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, trainin
     if plan.full_q or plan.scenarios[0].parameters is None:
         return None
     ratio, data, better = plan.objectives[0] not in PROPER, plan.validation_data(), []
-    for name, choice in _full_noise(plan, first, training).items():
+    for name, choice in _full_noise(plan, first.name, baseline_size(first)).items():
+        if plan.budget is not None and cost_of(choice, plan, training) > plan.budget:
+            continue
         one = measured(choice, plan, data)
         gained = over(one, chosen, ratio=ratio)
         if gained.high < (1.0 if ratio else 0.0) and not (ratio and slightly(gained)):
@@ -196,9 +199,9 @@ def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, trainin
     return min(better, key=lambda one: one.value, default=None)
 
 
-def _full_noise(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
-    """Noise estimation of own parameters with a full Q, and with a full Q and R, within the budget, by name."""
-    problem, kind, size = plan.scenarios[0], first.name, baseline_size(first)
+def _full_noise(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, Choice]:
+    """Noise estimation of own parameters with a full Q, and with a full Q and R, by name."""
+    problem = plan.scenarios[0]
     if not filter_type(kind).has_covariance or len({(one.model().n, one.model().m) for one in plan.scenarios}) > 1:
         return {}
     found = {
@@ -206,9 +209,9 @@ def _full_noise(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str
         FULL_QR: full_noise(kind, problem, plan.seed, with_r=True),
     }
     return {
-        name: one if size is None else one.with_size(size)
+        name: one if ensemble_size is None else one.with_size(ensemble_size)
         for name, one in found.items()
-        if one is not None and (plan.budget is None or cost_of(one, plan, training) <= plan.budget)
+        if one is not None
     }
 
 
@@ -348,11 +351,33 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
 def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
     """The baselines of a finalist but the oracle, within the budget; of several problems those of the first.
 
-    An ensemble has `baseline_size` members. Where R is held none of them changes it, and relations among numbers
-    hold for all but what was given.
+    An ensemble has `baseline_size` members, or, over the budget, the fewer of the finalist's and the usual ones.
     """
-    problem, kind = plan.scenarios[0], first.name
-    found = competing_baselines(kind, problem, plan.seed, baseline_size(first))
+    size, budget = baseline_size(first), plan.budget
+    found = _competing(plan, first.name, size)
+    if budget is None:
+        return found
+    pairs = {name: [one] for name, one in found.items()}
+    if size is not None:
+        least = min(first.numbers.get("ensemble_size", size), ensemble_sizes_of(filter_type(first.name)).untuned)
+        for name, one in _competing(plan, first.name, least).items():
+            pairs.setdefault(name, []).append(one)
+    within = (
+        (name, one) for name, some in pairs.items() for one in some if cost_of(one, plan, training) <= budget
+    )
+    affordable: dict[str, Choice] = {}
+    for name, one in within:
+        affordable.setdefault(name, one)
+    return affordable
+
+
+def _competing(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, Choice]:
+    """The baselines of a filter but the oracle, of any cost.
+
+    Where R is held none of them changes it, and relations among numbers hold for all but what was given.
+    """
+    problem = plan.scenarios[0]
+    found = competing_baselines(kind, problem, plan.seed, ensemble_size)
     if plan.hold_r and filter_type(kind).has_covariance:
         held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
         found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
@@ -363,13 +388,9 @@ def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[s
     if len(sizes) > 1:  # a Q or R fits problems of one size alone
         found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}
     if plan.full_q and problem.parameters is not None:
-        full = _full_noise(plan, first, training)
+        full = _full_noise(plan, kind, ensemble_size)
         found |= {name: one for name, one in full.items() if plan.full_r or name == FULL_Q}
-    found = {name: plan.forgetting(one) for name, one in found.items()}
-    budget = plan.budget
-    if budget is not None:
-        found = {name: one for name, one in found.items() if cost_of(one, plan, training) <= budget}
-    return found
+    return {name: plan.forgetting(one) for name, one in found.items()}
 
 
 def _best_of(
