@@ -14,16 +14,10 @@ from benchmarks.rates import measure_again, rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
 from thruster_env.core.checks import one_of
+from thruster_env.core.text_tables import table
 from thruster_env.core.threads import cores
-from tuning.cli.output import (
-    JsonOption,
-    SeedOption,
-    announce_compilation,
-    check_targets,
-    emit,
-    progress_console,
-    table,
-)
+from tuning.cli.options import JsonOption, SeedOption
+from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
 from tuning.policies.extras import check_installed
 
 CAPTION = (

@@ -16,9 +16,9 @@ from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.workloads import normals, step_of_filter, times
 from filters import run
 from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.sources import column_reader, column_writer, vector_reader
 from thruster_env.core.streams import FILTER_PROCESS, fill_normals
 from thruster_env.core.threads import cores, spread
-from thruster_env.core.tuples import column_reader, column_writer, vector_reader
 from thruster_env.thruster.dynamics import Constants, substep
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate

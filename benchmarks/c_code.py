@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, side_by_side
 from filters import make_filter, thruster_model
-from filters.c.source import c_filter
+from filters.c.project import c_filter
 from thruster_env.model.state_space import StateSpaceModel
 
 STEPS, GOAL = 20_000, 1.0

@@ -14,7 +14,7 @@ from filterpy.kalman import (
 )
 
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.tuples import vector_reader
+from thruster_env.core.sources import vector_reader
 from thruster_env.model.affine import AffineModel
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant

@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.rows import Row, machine_lines, machine_name
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import write_whole
-from thruster_env.core.markdown import table, with_tables
+from thruster_env.core.text_tables import markdown_table, with_tables
 
 HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
 NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit
@@ -49,4 +49,4 @@ def speed_table(rows: Sequence[Row]) -> str:
         _, *cells = row.cells()
         numbers = ("" if cell == "-" else cell.replace(" ", NO_BREAK) for cell in cells)
         lines.append([row.what, row.peer_name or "", *numbers])
-    return table(HEADER, lines)
+    return markdown_table(HEADER, lines)

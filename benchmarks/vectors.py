@@ -22,7 +22,7 @@ from thruster_env.core.threads import cores, spread
 from thruster_env.thruster.dynamics import substep
 from thruster_env.thruster.engine.copies import Copies
 from thruster_env.thruster.engine.memory import COMMAND, SUBSTEPS, VOLTAGE
-from thruster_env.thruster.engine.motion import move_thruster
+from thruster_env.thruster.engine.simulation import move_thruster
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.task import Task
 

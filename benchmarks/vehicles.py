@@ -20,11 +20,11 @@ from benchmarks.workloads import step_of_filter, step_of_filtered, times
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
-from thruster_env.auv.engine.motion import read_constants
+from thruster_env.auv.engine.simulation import read_constants
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import cores
-from thruster_env.core.tuples import tuple_of, written_out
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
 from tuning.problems.seeds import training_seeds

@@ -30,7 +30,6 @@ from typing import ClassVar
 import tuning
 from filters import ExtendedKalmanFilter
 from filters.algebra.blocks import forward_quotient
-from filters.algebra.densities import log_density
 from filters.algebra.operations import (
     divide,
     joseph,
@@ -41,9 +40,11 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import root
+from filters.algebra.samples import log_density
 from filters.algebra.scalars import at_most, diagonal, exponential
-from filters.gaussian.extended import advance, settle
-from filters.pages.page_filter import Page, PageFilter
+from filters.gaussian.extended import add_process_noise, propagate
+from filters.pages.page import Page
+from filters.pages.page_filter import PageFilter
 from thruster_env.thruster.model import thruster_model
 
 SEEDS = 100
@@ -79,7 +80,7 @@ class MaximumCorrentropyFilter(PageFilter):
     """
 
     name: ClassVar[str] = "mckf"
-    page: ClassVar[Page] = Page(advance, settle, update)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     ranges: ClassVar[dict] = {"bandwidth": (1.0, 20.0)}
     bandwidth: float = 3.0
 

@@ -1,40 +1,36 @@
 """Kalman-type filters: as values with `init`, `predict`, `update`, over batches, and as Gymnasium wrappers."""
 
-from filters.adaptive.robust import RobustExtendedKalmanFilter
-from filters.adaptive.sage_husa import SageHusaFilter
-from filters.adaptive.variational import VariationalBayesFilter
+from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model
-from filters.baselines.baselines import Inversion, LowPass, OpenLoop
+from filters.baselines import Inversion, LowPass, OpenLoop
 from filters.engine.batch import Estimates
 from filters.engine.belief import Belief, Innovation
-from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
-from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.rank_histogram import RankHistogramFilter
-from filters.ensembles.serial import SerialSquareRootFilter
-from filters.ensembles.stochastic import EnsembleKalmanFilter
-from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
-from filters.gaussian.cubature import CubatureKalmanFilter
-from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.gaussian.fading import FadingMemoryFilter
-from filters.gaussian.fuzzy import FuzzyKalmanFilter
-from filters.gaussian.gaussian_sum import GaussianSumFilter
-from filters.gaussian.h_infinity import HInfinityFilter
-from filters.gaussian.interacting import InteractingMultipleModelFilter
-from filters.gaussian.iterated import IteratedExtendedKalmanFilter
-from filters.gaussian.kalman import KalmanFilter
-from filters.gaussian.schmidt import SchmidtKalmanFilter
-from filters.gaussian.static_models import MultipleModelAdaptiveEstimator
-from filters.gaussian.steady_state import SteadyStateKalmanFilter
-from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.ensembles.square_root import (
+    EnsembleTransformFilter,
+    FiniteSizeEnsembleFilter,
+    LocalEnsembleTransformFilter,
+    SerialSquareRootFilter,
+)
+from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter
+from filters.gaussian.extended import (
+    ExtendedKalmanFilter,
+    FadingMemoryFilter,
+    HInfinityFilter,
+    IteratedExtendedKalmanFilter,
+    SchmidtKalmanFilter,
+)
+from filters.gaussian.kalman import KalmanFilter, SteadyStateKalmanFilter
+from filters.gaussian.mixtures import FuzzyKalmanFilter, GaussianSumFilter
+from filters.gaussian.multiple_models import InteractingMultipleModelFilter, MultipleModelAdaptiveEstimator
+from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter
-from filters.particles.auxiliary import AuxiliaryParticleFilter
-from filters.particles.particle import ParticleFilter
-from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
+from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
-from filters.restarts import Restarts, RestartWarning, restarts_of, run
 from filters.smoothers.modes import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
+from filters.starts import Restarts, RestartWarning, restarts_of, run
 from filters.tensors import torch
 from filters.transformed import transformed_model
 from filters.wrappers.ids import register_filtered_envs

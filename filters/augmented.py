@@ -12,9 +12,8 @@ from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.checks import finite, positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import step_of, stretch
-from thruster_env.core.pickling import makes_functions
-from thruster_env.core.sources import Source, entrywise, tuple_of, written_out
-from thruster_env.core.tuples import assembled, joiner, vector_part
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.sources import Source, assembled, entrywise, joiner, tuple_of, vector_part, written_out
 from thruster_env.model.quantities import Output, Quantity
 from thruster_env.model.shape import constants_are_array
 from thruster_env.model.state_space import StateSpaceModel

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import is_array, matrix_of, tuple_of, written_out
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Quantity

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from filters.engine.belief import Belief, Innovation, Kernels
-from filters.engine.gated import GatedSession
-from filters.engine.session import Running, Session
+from filters.engine.session import GatedSession, Running, Session
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.belief import Belief
-from filters.engine.checks import vector_like
+from filters.engine.belief import Belief, vector_like
 from filters.engine.session import Session
 from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
-from filters.restarts import FirstRestart, Restarts
+from filters.starts import FirstRestart, Restarts
 from thruster_env.core.checks import as_floats, finite, one_of, positive, short_repr
 from thruster_env.core.stamps import closeness, count_steps, resolution_of
 

@@ -12,12 +12,18 @@ from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, i
 from thruster_env.core.derivatives import step_of, stretch
 from thruster_env.core.matrices import multiplier, quadratic_form
 from thruster_env.core.progress import told
-from thruster_env.core.sources import Source
+from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
 from thruster_env.core.streams import GROUP
 from thruster_env.core.threads import cores, spread
-from thruster_env.core.tuples import matrix_reader, vector_reader, vector_writer
-from thruster_env.model.layout import constants_reader, number_places, padded
-from thruster_env.model.shape import Functions, Shape, observation_slopes, transition_slopes
+from thruster_env.model.shape import (
+    Functions,
+    Shape,
+    constants_reader,
+    number_places,
+    observation_slopes,
+    padded,
+    transition_slopes,
+)
 from thruster_env.model.simulate import noise_step, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -5,37 +5,33 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-from filters.adaptive.robust import RobustExtendedKalmanFilter
-from filters.adaptive.sage_husa import SageHusaFilter
-from filters.adaptive.variational import VariationalBayesFilter
-from filters.baselines.baselines import Inversion, LowPass, OpenLoop
-from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
-from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
+from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
+from filters.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.rank_histogram import RankHistogramFilter
-from filters.ensembles.serial import SerialSquareRootFilter
-from filters.ensembles.stochastic import EnsembleKalmanFilter
-from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
+from filters.ensembles.square_root import (
+    EnsembleTransformFilter,
+    FiniteSizeEnsembleFilter,
+    LocalEnsembleTransformFilter,
+    SerialSquareRootFilter,
+)
+from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter
 from filters.estimators.find import as_filter, estimator_named, is_filter_class, is_foreign, label_of
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from filters.gaussian.cubature import CubatureKalmanFilter
-from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.gaussian.fading import FadingMemoryFilter
-from filters.gaussian.fuzzy import FuzzyKalmanFilter
-from filters.gaussian.gaussian_sum import GaussianSumFilter
-from filters.gaussian.h_infinity import HInfinityFilter
-from filters.gaussian.interacting import InteractingMultipleModelFilter
-from filters.gaussian.iterated import IteratedExtendedKalmanFilter
-from filters.gaussian.kalman import KalmanFilter
-from filters.gaussian.schmidt import SchmidtKalmanFilter
-from filters.gaussian.static_models import MultipleModelAdaptiveEstimator
-from filters.gaussian.steady_state import SteadyStateKalmanFilter
-from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.gaussian.extended import (
+    ExtendedKalmanFilter,
+    FadingMemoryFilter,
+    HInfinityFilter,
+    IteratedExtendedKalmanFilter,
+    SchmidtKalmanFilter,
+)
+from filters.gaussian.kalman import KalmanFilter, SteadyStateKalmanFilter
+from filters.gaussian.mixtures import FuzzyKalmanFilter, GaussianSumFilter
+from filters.gaussian.multiple_models import InteractingMultipleModelFilter, MultipleModelAdaptiveEstimator
+from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter
-from filters.particles.auxiliary import AuxiliaryParticleFilter
-from filters.particles.particle import ParticleFilter
-from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
+from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from thruster_env.core.checks import one_of
 from thruster_env.logs.steps import AnyStepModel
 from thruster_env.model.state_space import StateSpaceModel

@@ -1,16 +1,318 @@
-"""Where the trajectories of a batch begin, if that is not the model's prior; and a prior that is wide."""
+"""Initial beliefs of runs: priors, and restarts of a filter from measurements."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import warnings
+from functools import wraps
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters.engine import batch
+from filters.engine.batch import Estimates, trajectories
+from filters.engine.session import Session
+from filters.filter import Filter
+from filters.gaussian.multiple_models import MultipleModelFilter
 from thruster_env.core.angles import difference
+from thruster_env.core.checks import as_floats
 from thruster_env.core.sources import as_value
-from thruster_env.model.layout import number_places
-from thruster_env.model.shape import observation_slopes
+from thruster_env.model.shape import number_places, observation_slopes, transition_slopes
 from thruster_env.model.state_space import StateSpaceModel
+
+# Restarts from the prior, in words: how many, the first step and state, and the likely cause.
+
+
+Found = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
+Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
+UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
+
+
+class RestartWarning(RuntimeWarning):
+    """A filter restarted from the prior, so that what it knew is lost."""
+
+
+class Restarts(NamedTuple):
+    """Restarts of a filter on B runs: an estimate was not finite, or a variance negative.
+
+    Attributes:
+        times: how often it restarted, in all runs.
+        runs: with any.
+        of_runs: B.
+        run: the first run with any.
+        step: of the first restart in that run.
+        states: symbols of the states that were lost first.
+        cause: the likely one, as an extended Kalman filter meets it at the estimate before.
+    """
+
+    times: int
+    runs: int
+    of_runs: int
+    run: int
+    step: int
+    states: tuple[str, ...]
+    cause: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it in one sentence."""
+        times = "once" if self.times == 1 else f"{self.times} times"
+        among = f" in {self.runs} of {self.of_runs} runs" if self.of_runs > 1 else ""
+        run = f" of run {self.run}" if self.of_runs > 1 else ""
+        states = f" ({', '.join(self.states)})" if self.states else ""
+        return (
+            f"The filter restarted from the prior {times}{among}, first at step {self.step}{run}{states}: "
+            f"{self.cause}."
+        )
+
+
+@wraps(batch.run)
+def run(filter_: Filter, keys=None, inputs=None, measurements=None, **noise) -> Estimates:
+    """`filters.engine.batch.run`, with a `RestartWarning` if the filter restarted."""
+    found = batch.run(filter_, keys, inputs, measurements, **noise)
+    warn_of_restarts(filter_, found.divergences, keys, inputs, measurements, **noise)
+    return found
+
+
+def warn_of_restarts(filter_: Filter, divergences: np.ndarray, keys, inputs, measurements, **noise) -> None:
+    """Warn, for the function that called the caller, with what `restarts_of` says, if it says anything."""
+    told = restarts_of(filter_, divergences, keys, inputs, measurements, **noise)
+    if told is not None:
+        warnings.warn(told.sentence, RestartWarning, stacklevel=3)
+
+
+def restarts_of(
+    filter_: Filter,
+    divergences: np.ndarray,
+    keys=None,
+    inputs=None,
+    measurements=None,
+    *,
+    process_noise_covs=None,
+    measurement_noise_covs=None,
+) -> Restarts | None:
+    """The restarts of a filter on runs, by its `divergences` (B,) there; None if it never restarted.
+
+    The other arguments are those of `filters.run`. The first run that restarted is stepped once more.
+    """
+    divergences = np.atleast_1d(divergences)
+    if not divergences.any():
+        return None
+    place, session, first = int(np.flatnonzero(divergences)[0]), Session(filter_), FirstRestart(filter_)
+    keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
+    for k, one in enumerate(z[place]):
+        if measurement_noise_covs is not None:
+            session.set_noise(measurement_noise_cov=measurement_noise_covs[k])
+        if k == 0:
+            session.start(keys[place], one)
+        else:
+            if process_noise_covs is not None:
+                session.set_noise(process_noise_cov=process_noise_covs[k - 1])
+            session.step(inputs[place, k - 1], one)
+        first.note(session, inputs[place, k - 1] if k else None, one)
+        if session.divergences:
+            break
+    runs = int((divergences > 0).sum())
+    return Restarts(int(divergences.sum()), runs, len(divergences), place, *first.found)
+
+
+class FirstRestart:
+    """The first restart of a filter that is stepped by hand: `note` what each step did.
+
+    Attributes:
+        found: the step, symbols of the states that were lost, and the likely cause.
+    """
+
+    def __init__(self, filter_: Filter):
+        """Begin before the first measurement."""
+        self._filter, self._step = filter_, 0
+        self._before: list[Moments] | None = None
+        self.found: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
+        self._is_open = True
+
+    def hold(self, session: Any) -> None:
+        """Keep the belief before a prediction that is not part of a step; `note` comes after the update."""
+        if self._is_open:
+            self._before = _moments(self._filter, session)
+
+    def note(self, session: Any, u, z) -> None:
+        """Look at a session after a step with input u (p,), None without a prediction, and measurement z (m,)."""
+        if session.divergences and self._is_open:
+            self._is_open = False
+            numbers = getattr(session, "numbers", None)
+            self.found = self._step, *_states_and_cause(self._filter, numbers, self._before, u, as_floats(z))
+        if self._is_open:
+            self.hold(session)
+            self._step += 1
+
+    def restarts(self, count: int) -> Restarts | None:
+        """So many restarts of one run; None if there were none."""
+        return Restarts(count, 1, 1, 0, *self.found) if count else None
+
+
+class FirstRestarts:
+    """The same of N copies of a filter at once."""
+
+    def __init__(self, filter_: Filter, count: int):
+        """Begin before the first measurements."""
+        n = filter_.kernel_model.n
+        self._filter, self._counts, self._steps = filter_, np.zeros(count), np.zeros(count, dtype=int)
+        self._means, self._covs = np.zeros((count, n)), np.zeros((count, n, n))
+        self._found: list[tuple[int, tuple[str, ...], str] | None] = [None] * count
+
+    def start(self, which: np.ndarray) -> None:
+        """Begin anew in some copies, by their indices."""
+        self._counts[which], self._steps[which] = 0.0, 0
+        for i in which:
+            self._found[i] = None
+
+    def note(self, which: np.ndarray, counts: np.ndarray, moments: Moments, u, z) -> np.ndarray | None:
+        """What there is to say of copies that restarted in this step, (N,) of sentences and None; None of none.
+
+        Args:
+            which: copies that made a step, or were started, (N,) bool.
+            counts: of restarts since then, (N,).
+            moments: means (N, n) and covariances (N, n, n) after it, which are kept.
+            u: inputs (N, p).
+            z: measurements (N, m).
+        """
+        lost = np.flatnonzero(which & (counts > self._counts)).tolist()
+        told = np.full(len(counts), None, dtype=object)
+        for i in lost:
+            step = int(self._steps[i])
+            before = [(self._means[i], self._covs[i])] if step else None
+            first = self._found[i] or (step, *_states_and_cause(self._filter, None, before, u[i], z[i]))
+            self._found[i] = first
+            told[i] = Restarts(int(counts[i]), 1, 1, 0, *first).sentence
+        self._steps[which] += 1
+        self._counts = np.where(which, counts, self._counts)
+        everywhere, (means, covs) = which.all(), moments
+        self._means = means if everywhere else np.where(which[:, None], means, self._means)
+        self._covs = covs if everywhere else np.where(which[:, None, None], covs, self._covs)
+        return told if lost else None
+
+
+def _moments(filter_: Filter, session: Any) -> list[Moments]:
+    """Means and covariances of a session's belief, of all modes where it has some."""
+    if isinstance(filter_, MultipleModelFilter) and hasattr(session, "belief"):
+        means, covs, _ = filter_.mode_moments(session.belief())
+        return list(zip(means, covs, strict=True))
+    return [(session.mean.copy(), session.cov.copy())]
+
+
+def _states_and_cause(
+    filter_: Filter, numbers: np.ndarray | None, before: list[Moments] | None, u, z
+) -> tuple[tuple[str, ...], str]:
+    """Symbols of the states that were lost in a step, and why: of the first mode that has a reason, if there are.
+
+    Args:
+        filter_: the filter.
+        numbers: that it read, if they are known.
+        before: moments before the step, of each mode or of all together; None for the first measurement.
+        u: input (p,); None without a prediction.
+        z: measurement (m,).
+    """
+    modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
+    models = [one.kernel_model for one in modes] or [_as_set(filter_.kernel_model, numbers)]
+    begun = before if before is None or len(before) == len(models) else before * len(models)
+    for j, model in enumerate(models):
+        states, cause = likely_cause(model, None if begun is None else begun[j], u, z)
+        if cause != UNKNOWN:
+            break
+    symbols = (one.symbol for one, lost in zip(filter_.model.states, states, strict=True) if lost)
+    return tuple(symbols), f"{cause} in modes[{j}]" if modes and cause != UNKNOWN else cause
+
+
+def _as_set(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:
+    """The model with the Q, R and constants that a session was set to."""
+    if numbers is None or np.array_equal(numbers[: len(model.numbers)], model.numbers):
+        return model
+    at, n, m, form = number_places(model.n, model.m), model.n, model.m, type(model.constants)
+    constants = numbers[at.constants : at.constants + model.shape.constants].tolist()
+    changes: dict[str, Any] = {
+        "process_noise_cov": numbers[at.q : at.q + n * n].reshape(n, n),
+        "measurement_noise_cov": numbers[at.r : at.r + m * m].reshape(m, m),
+        "constants": form._make(constants) if hasattr(form, "_make") else tuple(constants),
+    }
+    try:
+        return model.replace(**changes)
+    except (ValueError, TypeError):  # constants of another form
+        return model
+
+
+def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Found:
+    """Which states were lost in a step, (n,) bool, and why, by the equations of an extended Kalman filter.
+
+    Args:
+        model: the filter's.
+        before: mean (n,) and covariance (n, n) before the step; None for the first measurement of the prior.
+        u: input (p,) of the step; None without a prediction.
+        z: measurement (m,) at its end.
+    """
+    x, p = (model.prior_mean, model.prior_cov) if before is None else before
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = None
+        if before is not None and u is not None:
+            x, p, found = _predicted(model, x, p, u)
+        return found or _updated(model, x, p, z)
+
+
+def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Found | None]:
+    slopes = transition_slopes(model.functions, model.shape)
+    for _ in range(model.substeps):
+        moved = _called(model.functions.transition, model.n, as_value(x), as_value(u), model.constants)
+        if not np.isfinite(moved).all():
+            return x, p, (~np.isfinite(moved), f"f(x, u) is {_kind(moved)}")
+        f = _called(slopes, (model.n, model.n), as_value(x), as_value(model.scales), as_value(u), model.constants)
+        if not np.isfinite(f).all():
+            return x, p, (~np.isfinite(f).all(axis=1), f"F = df/dx is {_kind(f)}")
+        x, p = moved, f @ p @ f.T
+    p = p + model.process_noise_cov
+    return x, p, _flaw_of(p, "prediction")
+
+
+def _updated(model: StateSpaceModel, x, p, z) -> Found:
+    everything = np.ones(model.n, dtype=bool)
+    expected = _called(model.functions.observe, model.m, as_value(x), model.constants)
+    seen = ~np.isnan(z)
+    if not np.isfinite(expected[seen]).all():
+        return everything, f"h(x) is {_kind(expected[seen])}"
+    slopes = observation_slopes(model.functions, model.shape)
+    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), model.constants)[seen]
+    if not np.isfinite(h).all():
+        return ~np.isfinite(h).all(axis=0), f"H = dh/dx is {_kind(h)}"
+    s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(seen, seen)]
+    try:
+        root = np.linalg.cholesky(s)
+    except np.linalg.LinAlgError:
+        return everything, "the innovation's covariance S is not positive definite, by rounding or overflow"
+    half = np.linalg.solve(root, h @ p)
+    flaw = _flaw_of(p - half.T @ half, "update")
+    return flaw or (~everything, UNKNOWN)
+
+
+def _flaw_of(p: np.ndarray, when: str) -> Found | None:
+    if not np.isfinite(p).all():
+        return ~np.isfinite(p).all(axis=1), f"the covariance overflows in the {when}"
+    if (np.diag(p) < 0.0).any():
+        return np.diag(p) < 0.0, f"a variance is negative after the {when}, by rounding"
+    return None
+
+
+def _called(function, shape, *arguments) -> np.ndarray:
+    """What a function of the model returns; NaN where it raises."""
+    try:
+        return np.asarray(function(*arguments), dtype=np.float64).reshape(shape)
+    except (ArithmeticError, ValueError, TypeError):
+        return np.full(shape, np.nan)
+
+
+def _kind(values: np.ndarray) -> str:
+    return "NaN" if np.isnan(values).any() else "infinite, it overflows"
+
+
+# Where the trajectories of a batch begin, if that is not the model's prior; and a prior that is wide.
+
 
 PRIOR, MEASUREMENT = "prior", "measurement"
 STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin

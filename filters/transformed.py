@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.pickling import as_function, as_made, makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import as_value, is_array, tuple_of, written_out
+from thruster_env.core.user_functions import as_function, as_made
 from thruster_env.model.quantities import Output, Quantity
 from thruster_env.model.state_bounds import Bound, checked_bounds
 from thruster_env.model.state_space import StateSpaceModel

@@ -16,11 +16,12 @@ import numpy as np
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState
-from pages.page import digits, make_page, table
-from thruster_env.auv.control.depth_and_course import DepthAndCourse
-from thruster_env.auv.manoeuvres import MANOEUVRES
+from pages.page import digits, make_page
+from thruster_env.auv.control import DepthAndCourse
+from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.core.files import write_whole
-from thruster_env.env.observe import ObserveStateVector
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.env.commands import ObserveStateVector
 
 
 def frame(path: Path) -> Path:
@@ -54,7 +55,7 @@ def returns() -> str:
             mean_return(env, None),
         )
         rows.append([f"path {given['path']}" if given else "depth", *(digits(score) for score in scores)])
-    return table(["task", "PD on measurements", "PD on the true state", "planes still, 2.845 N"], rows)
+    return markdown_table(["task", "PD on measurements", "PD on the true state", "planes still, 2.845 N"], rows)
 
 
 def mean_return(env, controller: DepthAndCourse | None) -> float:

@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from filters.augmented import Unknown
 from filters.consistency.intervals import Interval
 from pages import ranking_tables
-from pages.page import DOCS, digits, table
+from pages.page import DOCS, digits
+from thruster_env.core.text_tables import markdown_table
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
 from tuning.evaluation.compare import Contender, Row, compare, contender
@@ -131,7 +132,7 @@ def filters_current() -> str:
         units |= {one.symbol: one.unit for one in found.states}
         known = [digits(errors[symbol].value, 2) if symbol in errors else "" for symbol in shown]
         lines.append([f"`{name}`, {len(errors)} states", *known, f"{about(found.nees)} of {len(errors)}"])
-    return table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in shown), "NEES"], lines)
+    return markdown_table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in shown), "NEES"], lines)
 
 
 def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -> list[Row]:
@@ -146,12 +147,12 @@ def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -
 def by_scenario(scenarios: Sequence[str], filters: Sequence[Contender], runs: int = RUNS) -> str:
     """A table with the scenario in the first column."""
     rows = [[f"`{name}`", *cells(row)] for name in scenarios for row in rows_of(name, filters, runs)]
-    return table(["scenario", *HEADER], rows)
+    return markdown_table(["scenario", *HEADER], rows)
 
 
 def of_rows(rows: Sequence[Row]) -> str:
     """A table of one scenario."""
-    return table(HEADER, [cells(row) for row in rows])
+    return markdown_table(HEADER, [cells(row) for row in rows])
 
 
 def cells(row: Row) -> list[str]:

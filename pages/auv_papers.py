@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS
 from tuning.experiments.vehicle.experiment import PathResult, run_tasks
@@ -53,7 +54,7 @@ def members() -> str:
             ]
         )
     rows.append(["bound", "", "", _row(iv.bound.pose), "", ""])
-    return table(["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
+    return markdown_table(["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
 
 
 def velocities() -> str:
@@ -88,7 +89,7 @@ def paths() -> str:
             ]
         )
     columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published"]
-    return table([*columns, "why they differ"], rows)
+    return markdown_table([*columns, "why they differ"], rows)
 
 
 def ends() -> str:
@@ -107,13 +108,13 @@ def ends() -> str:
             rows.append(
                 [f"{result.path} ({', '.join(names)})", label, _row(printed.final_percent.values()), *ours]
             )
-    return table(["path", "", "published", "by yaw alone", "full"], rows)
+    return markdown_table(["path", "", "published", "by yaw alone", "full"], rows)
 
 
 def outside() -> str:
     """Time outside the bounds of the fuzzy filter."""
     rows = [[one.path, *(f"{100 * share:.0f}" for share in one.outside)] for one in _of_vehicle()]
-    return table(["path", *"uvwpqr", "any"], rows)
+    return markdown_table(["path", *"uvwpqr", "any"], rows)
 
 
 def said() -> str:
@@ -136,7 +137,7 @@ def _velocities(result: PathResult, base: str = "") -> str:
     bound = np.concatenate([result.bound.velocities, result.bound.attitude])
     rows.append(["bound", *(digits(1e3 * value) for value in bound), *([""] * (2 if base else 1))])
     columns = ["", "u", "v", "w", "p", "q", "r", "phi", "theta", "NEES"]
-    return table([*columns, f"position over {base}"] if base else columns, rows)
+    return markdown_table([*columns, f"position over {base}"] if base else columns, rows)
 
 
 def _ratio(scores: Scores, base: Scores) -> str:

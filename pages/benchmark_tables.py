@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from pages.page import DOCS, table
+from pages.page import DOCS
 from thruster_env.core.files import write_whole
-from thruster_env.core.markdown import with_tables
+from thruster_env.core.text_tables import markdown_table, with_tables
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments import BENCHMARKS
 from tuning.experiments.benchmark import find_benchmark
@@ -32,7 +32,7 @@ def published(name: str) -> str:
     """A standard problem: theirs, ours, why different."""
     benchmark = find_benchmark(name)
     remarks = "\n".join(f"- {remark}" for remark in benchmark.remarks)
-    return f"{table(benchmark.header, [row.cells() for row in benchmark.reproduce(RUNS)])}\n\n{remarks}"
+    return f"{markdown_table(benchmark.header, [row.cells() for row in benchmark.reproduce(RUNS)])}\n\n{remarks}"
 
 
 def inflation() -> str:
@@ -43,7 +43,7 @@ def inflation() -> str:
         found = choice.numbers
         numbers = [f"{found['ensemble_size']}", f"{found['inflation']:.3f}", f"{found['relaxation']:.3f}"]
         rows.append([name, *numbers, f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"])
-    return table(["filter", "N", "inflation", "relaxation", "rmse.a on held-out seeds"], rows)
+    return markdown_table(["filter", "N", "inflation", "relaxation", "rmse.a on held-out seeds"], rows)
 
 
 def pendulum_errors() -> str:
@@ -59,7 +59,7 @@ def pendulum_errors() -> str:
             errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in one.rmse]
             rows.append([name, word, f"{sigma:.3f}", *errors, f"{one.nees.value:.2f}", f"{one.nis.value:.2f}"])
     header = ["filter", "", "sigma [rad/s]", "theta [rad]", "omega [rad/s]", "mean NEES", "mean NIS"]
-    return table(header, rows)
+    return markdown_table(header, rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pages.page import digits, make_page, table
+from pages.page import digits, make_page
 from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.text_tables import markdown_table
 from tuning.exploring.bench import Bench
 from tuning.exploring.scenes import SCENES, Scene
 from tuning.exploring.view import View
@@ -78,7 +79,7 @@ def figures_of(scene: Scene) -> str:
         for name, one in views[0].figures.items()
         if name != "restarts"
     ]
-    return table(["", *heads], rows)
+    return markdown_table(["", *heads], rows)
 
 
 def halved() -> str:
@@ -90,7 +91,7 @@ def halved() -> str:
         values = {"R": factor * bench.start["R"]}
         view = bench.view(values)
         rows.append([digits(values["R"]), digits(_score(view)), digits(_score(view) / rule), *_consistency(view)])
-    return table(["R [N^2]", "score", "over the rule of thumb's", "NEES", "NIS"], rows)
+    return markdown_table(["R [N^2]", "score", "over the rule of thumb's", "NEES", "NIS"], rows)
 
 
 def _score(view: View) -> float:

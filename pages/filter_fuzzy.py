@@ -9,12 +9,13 @@ import numpy as np
 from filters import FuzzyKalmanFilter, StateSpaceModel, make_filter, run, thruster_model
 from filters.consistency.intervals import Interval, rmse_ratios
 from filters.filter import Filter
-from filters.gaussian.fuzzy import BLENDINGS
+from filters.gaussian.mixtures import BLENDINGS
 from pages.filter_gaussian import FLOW, FLOW_RMSE
 from pages.filter_runs import STYLES, Runs, errors_of, held_runs, nees, times
-from pages.page import digits, legend_below, log_ticks, table
+from pages.page import digits, legend_below, log_ticks
 from thruster_env.core.plots import DARK, SKY, new_figure, save_figure, tidy
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import PRESETS
 from tuning.problems.data import FIRST_SCORED_STEP
 
@@ -75,7 +76,7 @@ def fuzzy() -> str:
     filters["`weights`, no offsets"] = FuzzyKalmanFilter(model=model, offsets=False)
     rows += _rows("-12 to 12 V", model, runs, filters)
     over = "over `weights`"
-    return table(["levels", "filter", "omega_m [rad/s]", over, "U_a [m/s]", over, "NEES"], rows)
+    return markdown_table(["levels", "filter", "omega_m [rad/s]", over, "U_a [m/s]", over, "NEES"], rows)
 
 
 def _rows(name: str, model: StateSpaceModel, runs: Runs, filters: dict[str, Filter]) -> list[list[str]]:

@@ -9,12 +9,12 @@ import numpy as np
 from filters import Estimates, run
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
-from filters.plot_styles import TRUTH, plot_style
+from filters.logs.figure import TRUTH, plot_style
 from filters.registry import FILTERS
 from thruster_env.core.plots import MUSTARD
 from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.thruster.engine.copies import simulate
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP
 from tuning.problems.excitation import held_levels
 

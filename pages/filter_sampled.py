@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from filters import ParticleFilter, make_filter, run, thruster_model
-from filters.ensembles.recording import record_members
+from filters.ensembles.rank_histogram import record_members
 from pages.filter_runs import PUBLISHED_NOISE, STYLES, Runs, errors_of, held_runs, runs_of, times
 from pages.page import log_ticks
 from thruster_env.core.plots import DARK, RUST, new_figure, save_figure, tidy

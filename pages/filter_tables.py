@@ -15,8 +15,9 @@ from filters.registry import filter_type
 from pages.filter_noise import LOUD, outliers
 from pages.filter_runs import PUBLISHED_NOISE, Runs, errors_of, held_runs
 from pages.filter_sampled import SIGNLESS, signless_runs
-from pages.page import digits, table
+from pages.page import digits
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.text_tables import markdown_table
 
 
 class Words(NamedTuple):
@@ -96,7 +97,7 @@ def kinds() -> str:
         row = [f"`{name}`", f"`{kind.__name__}`", words.assumes, words.belief]
         row += ["yes" if kind.has_covariance else "no", likelihood, calls(name)]
         rows.append([*row, words.ratio, words.fails])
-    return table(header, rows)
+    return markdown_table(header, rows)
 
 
 def calls(name: str) -> str:
@@ -140,7 +141,7 @@ def advice() -> str:
             motor, flow, squares = errors_of(filter_, runs)
             honesty = "" if np.isnan(squares) else digits(squares) if squares < 1000 else "> 1000"
             rows.append(["" if place else situation.name, label, digits(motor), digits(flow), honesty])
-    return table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)
+    return markdown_table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)
 
 
 def situations() -> list[Situation]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.hidden_truth import CASES, MANY_RUNS, RUNS, TRIALS, Hidden, hide_truth
 from tuning.problems.find import find_problem
 
@@ -25,7 +26,9 @@ def hidden_truth(
         states = ", ".join(f"{ratio:.3f}" for ratio in found[-1].rmse_ratios)
         rows.append([f"`{scenario}`", f"`{name}`", *map(_ratio, found), states, sizes])
     counts = [f"{count} logs" for count in runs]
-    return table(["scenario", "filter", *counts, f"RMSE of each state, {counts[-1]}", "N, seen and hidden"], rows)
+    return markdown_table(
+        ["scenario", "filter", *counts, f"RMSE of each state, {counts[-1]}", "N, seen and hidden"], rows
+    )
 
 
 def _ratio(found: Hidden) -> str:

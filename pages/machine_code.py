@@ -13,15 +13,18 @@ from collections.abc import Sequence
 from filters import StateSpaceModel
 from filters.algebra.matrices import Matrix, in_order
 from filters.differentiated.memory import Memory
-from filters.differentiated.recursion import MOST, Wanted, stages_of
-from filters.ensembles import deterministic, steps, stochastic
+from filters.differentiated.recursion import Wanted, stages_of
+from filters.ensembles import ensemble as steps
+from filters.ensembles import stochastic
+from filters.ensembles import stochastic as deterministic
 from filters.gaussian import extended
 from filters.pages import kernels
 from filters.pages.equations import Equations
+from filters.pages.kernels import Stage, as_programs
 from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as stages_of_members
-from filters.pages.memory import RowMemory
-from filters.pages.stages import Stage, as_programs
+from filters.pages.page import RowMemory
+from filters.pages.traced import MOST
 from filters.particles import particle, weighted
 from pages.page import make_page
 from thruster_env.graphs.loops import cut
@@ -69,7 +72,7 @@ def block(text: str, language: str = "python") -> str:
 
 def page() -> str:
     """The filter as it stands in a textbook."""
-    functions = extended.advance, extended.settle, extended.update
+    functions = extended.propagate, extended.add_process_noise, extended.update
     return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
 
 
@@ -131,7 +134,7 @@ def program() -> str:
 
 def members() -> str:
     """The ensemble Kalman filter as it stands in a textbook."""
-    functions = steps.advance, steps.settle, steps.compare, stochastic.update
+    functions = steps.propagate, steps.add_process_noise, steps.compare, stochastic.update_stochastic
     return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
 
 

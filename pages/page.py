@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from thruster_env.core.files import write_whole
-from thruster_env.core.markdown import table as table  # for the scripts, beside what follows
-from thruster_env.core.markdown import with_tables
+from thruster_env.core.text_tables import with_tables
 
 DOCS = Path(__file__).parents[1] / "docs"  # where the pages and their pictures are
 

@@ -20,15 +20,13 @@ from pages.plant_tables import FULL_VOLTAGE, TABLES, thrust_coefficient
 from thruster_env.core.files import write_whole
 from thruster_env.core.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
 from thruster_env.core.streams import episode_keys
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.engine.copies import Copies
+from thruster_env.thruster.engine.copies import Copies, simulate
 from thruster_env.thruster.engine.memory import AMBIENT, FIXED_ROWS, READINGS, REFERENCE, THRUST, VALID, VOLTAGE
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import PRESETS
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.simulation import simulate
 from thruster_env.thruster.task import Task
 
 # Presets are told apart by colour and by dashes; open_bladed hardly turns and is left out of the pictures.

@@ -8,11 +8,12 @@ import gymnasium as gym
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from pages.page import digits, table
-from thruster_env.env.observe import ObserveStateVector
+from pages.page import digits
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.env.commands import ObserveStateVector
 from thruster_env.thruster.control.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
-from thruster_env.thruster.linear.steady_state import (
+from thruster_env.thruster.linear.analysis import (
     jacobians,
     required_substeps,
     run_substeps,
@@ -81,7 +82,7 @@ def presets() -> str:
         "inferred": lambda name, p: INFERRED[name],
     }
     cells = [[label, *(cell(name, p) for name, p in PRESETS.items())] for label, cell in rows.items()]
-    return table(["", *(f"`{name}`" for name in PRESETS)], cells)
+    return markdown_table(["", *(f"`{name}`" for name in PRESETS)], cells)
 
 
 def parameters() -> str:
@@ -94,7 +95,7 @@ def parameters() -> str:
         [f"`{field}`", symbol, *(cell(getattr(p, field)) for p in PRESETS.values())]
         for field, symbol in SYMBOLS.items()
     ]
-    return table(["field", "symbol", *(f"`{name}`" for name in PRESETS)], rows)
+    return markdown_table(["field", "symbol", *(f"`{name}`" for name in PRESETS)], rows)
 
 
 def accuracy() -> str:
@@ -107,7 +108,7 @@ def accuracy() -> str:
         cells = {count: _small(error) for count, error in errors.items()}
         cells[chosen] = f"**{cells[chosen]}**"
         rows.append([f"`{name}`", *cells.values()])
-    return table(["preset", *map(str, COUNTS)], rows)
+    return markdown_table(["preset", *map(str, COUNTS)], rows)
 
 
 def one_step_error(p: ThrusterParameters, max_voltage: float, substeps: int) -> float:
@@ -139,7 +140,7 @@ def returns() -> str:
             (seen, LQRController.for_env(seen)),
         ]
         rows.append([f"`{task}`", *(_mean_return(*policy) for policy in policies)])
-    return table(["", "0 V", "feed-forward alone", "PI with feed-forward", "LQR on the true state"], rows)
+    return markdown_table(["", "0 V", "feed-forward alone", "PI with feed-forward", "LQR on the true state"], rows)
 
 
 def _mean_return(env, controller) -> str:

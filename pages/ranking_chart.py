@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from filters.plot_styles import colour_of
+from filters.logs.figure import colour_of
 from pages.page import DOCS
 from thruster_env.core.plots import DARK, GREY, new_figure, save_figure
 

@@ -16,9 +16,10 @@ import numpy as np
 
 from filters.filter import Filter
 from filters.registry import make_filter
-from pages.page import digits, table
+from pages.page import digits
 from pages.ranking_tables import SEEDS, leaderboard, main, marked, ratio_cell, table_of
 from pages.tuning_mismatch import UNKNOWNS, tuned_augmented
+from thruster_env.core.text_tables import markdown_table
 from tuning.api.train_estimator import FOLDER, train_estimator
 from tuning.evaluation.compare import Contender, Row, contender
 from tuning.evaluation.evaluate import evaluate
@@ -51,7 +52,7 @@ ELSEWHERE = (
     "reversal",
     "medium_noise",
 )
-FILTERPY = "filters.estimators.filterpy:unscented"
+FILTERPY = "filters.estimators.libraries:unscented"
 
 
 def network_mismatch() -> str:
@@ -74,7 +75,7 @@ def network_elsewhere() -> str:
         _, *found = leaderboard(find_scenario(name), [contender("ekf"), *some]).rows
         cells = {row.label: ratio_cell(row) for row in found}
         rows.append([f"`{name}`", *(cells.get(" ".join(pair), "-") for pair in pairs)])
-    return table(["scenario", *(f"{kind}, trained on `{name}`" for kind, name in pairs)], rows)
+    return markdown_table(["scenario", *(f"{kind}, trained on `{name}`" for kind, name in pairs)], rows)
 
 
 def network_further() -> str:
@@ -93,7 +94,7 @@ def network_further() -> str:
             nees = one.evaluations[HELD_OUT].nees.value
             cells = [*map(marked, ratios), "" if np.isnan(nees) else digits(nees)]
             rows.append(["" if place else f"`{name}`", one.label, *cells])
-    return table(["scenario", "filter", HELD_OUT, LONGER, NOISIER, "NEES"], rows)
+    return markdown_table(["scenario", "filter", HELD_OUT, LONGER, NOISIER, "NEES"], rows)
 
 
 def network_papers() -> str:
@@ -110,7 +111,7 @@ def network_papers() -> str:
         }
         found = [evaluate(one, data, problem.scale) for one in filters.values()]
         rows.append([problem.name, *(digits(kalmannet.decibels(one.mean_squares)) for one in found)])
-    return table(["setting", "ekf, oracle", *TRAININGS], rows)
+    return markdown_table(["setting", "ekf, oracle", *TRAININGS], rows)
 
 
 def filterpy() -> str:

@@ -12,9 +12,10 @@ import numpy as np
 from filters import StateSpaceModel, make_filter, run
 from filters.filter import Filter
 from filters.horizon.window import LOSSES, STUDENT
-from pages.page import digits, table
+from pages.page import digits
 from pages.ranking_tables import EKF, IEKF, ROBUST, SEEDS, leaderboard, main, ratio_cell
 from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.compare import contender
 from tuning.problems.seeds import held_out_seeds
@@ -76,7 +77,7 @@ def batch_reactor() -> str:
         lost = (np.abs(errors[:, -1]).max(axis=1) > 0.5).sum()
         row = [label, *map(digits, rmse), digits(found.means[:, 1:, 0].min()), f"{lost} of {SEEDS}"]
         rows.append(row)
-    return table(["filter", "p_A", "p_B", "least p_A", "lost"], rows)
+    return markdown_table(["filter", "p_A", "p_B", "least p_A", "lost"], rows)
 
 
 def _of_reactor() -> dict[str, Filter]:
@@ -105,7 +106,7 @@ def horizon() -> str:
             errors = (digits(one.value) for one in row.evaluation.rmse)
             cells = [f"`{name}`" if first else "", row.label, *errors, "" if first else ratio_cell(row)]
             rows.append([*cells, digits(row.nees)])
-    return table(["scenario", "filter", "omega_m [rad/s]", "U_a [m/s]", "score over ekf", "NEES"], rows)
+    return markdown_table(["scenario", "filter", "omega_m [rad/s]", "U_a [m/s]", "score over ekf", "NEES"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (batch_reactor, horizon)}

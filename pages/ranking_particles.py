@@ -15,8 +15,9 @@ from scipy.stats import chi2
 from filters import Unknown, make_filter, run
 from filters.consistency.intervals import rmse_intervals
 from filters.consistency.nees import whitened
-from pages.page import DOCS, table
+from pages.page import DOCS
 from pages.ranking_tables import leaderboard, main, table_of
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.compare import contender
 from tuning.experiments import mixed_linear
 from tuning.problems.model_problem import ModelProblem
@@ -74,7 +75,7 @@ def errors_of(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
         label = " ".join([name, *(str(one) for key, one in numbers.items() if key != "resampling_threshold")])
         cells = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in parts]
         rows.append([label, *cells, f"{nees / chi2.median(model.n):.2f}", f"{level:.1f}"])
-    return table(["filter", *symbols, "NEES", "log L"], rows)
+    return markdown_table(["filter", *symbols, "NEES", "log L"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (conditional, accurate, constants)}

@@ -17,8 +17,9 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.registry import FILTERS, filter_type
-from pages.page import DOCS, digits, table, with_tables
+from pages.page import DOCS, digits
 from thruster_env.core.files import write_whole
+from thruster_env.core.text_tables import markdown_table, with_tables
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
@@ -144,7 +145,7 @@ def ratios_of(filters: Sequence[Contender], problems: Sequence[str]) -> str:
         for row in (first, *others):
             times[row.label].append(row.microseconds / first.microseconds)
     header = ["filter", *(re.sub("[_:]", " ", name) for name in problems), "time"]
-    return table(header, [[label, *line, _median_of(times[label])] for label, line in cells.items()])
+    return markdown_table(header, [[label, *line, _median_of(times[label])] for label, line in cells.items()])
 
 
 def _median_of(ratios: Sequence[float]) -> str:
@@ -212,8 +213,19 @@ def _about(value: Interval, digits: int) -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    table.__name__: table
-    for table in (speed, fast, outliers, ambient, published, reference, startup, every_filter, scores, scenarios)
+    markdown_table.__name__: markdown_table
+    for markdown_table in (
+        speed,
+        fast,
+        outliers,
+        ambient,
+        published,
+        reference,
+        startup,
+        every_filter,
+        scores,
+        scenarios,
+    )
 }
 
 

@@ -24,9 +24,9 @@ from filters.engine.batch import run
 from pages.page import DOCS
 from thruster_env.core.files import write_whole
 from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from tuning.api.run import Tuning
 from tuning.cli.demo import FILTER, SCENARIO, before_and_after
 from tuning.cli.tune import tune
-from tuning.cli.tuning_report import Tuning
 from tuning.reporting.panels import axis_label
 from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario

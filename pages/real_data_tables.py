@@ -13,9 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pages.page import DOCS
-from thruster_env.core.files import write_whole
-from thruster_env.core.markdown import table, with_tables
-from thruster_env.core.toml import as_toml
+from thruster_env.core.files import as_toml, write_whole
+from thruster_env.core.text_tables import markdown_table, with_tables
 from tuning.experiments.recordings.comparison import estimates_of
 from tuning.experiments.recordings.identification import CHOSEN
 from tuning.experiments.recordings.model import IDENTIFIED, model
@@ -38,14 +37,14 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
             [f"{one.factor:g}", f"{one.log_likelihood:.0f}", f"{one.nis:.2f}", f"{one.ratio:.3f}"]
             for one in regimes(model(), runs)
         ]
-        return table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
+        return markdown_table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
 
-    made = {name: (lambda one=one: table(*one)) for name, one in rows_of(runs, left_out, tasks).items()}
+    made = {name: (lambda one=one: markdown_table(*one)) for name, one in rows_of(runs, left_out, tasks).items()}
     ratios = made["ratios"]
     return {
         **made,
         "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
-        "all_runs": lambda: table(*rows_of(runs, whole)["ratios"]),
+        "all_runs": lambda: markdown_table(*rows_of(runs, whole)["ratios"]),
         "regime": regime,
     }
 

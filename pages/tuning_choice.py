@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
 from tuning.problems.log_parts import Block, parts_of
@@ -350,7 +351,7 @@ def _table(cases: Sequence[Case], truth: bool, studies: int) -> str:
         rates = case_rates(case, truth, studies)
         rows.append([case.about, *(f"{share:.1f}" for part in rates for share in part)])
     parts = "changed", "false keeps", "false changes"
-    return table(["case", *(f"{part}, {when} [%]" for when in ("before", "now") for part in parts)], rows)
+    return markdown_table(["case", *(f"{part}, {when} [%]" for when in ("before", "now") for part in parts)], rows)
 
 
 def log_choices(studies: int = STUDIES) -> str:
@@ -378,7 +379,7 @@ def choice_sizes(studies: int = SIZE_STUDIES) -> str:
         "every third, signed ranks [%]",
         "the choice [%]",
     )
-    return table(["scores", "time constant [rows]", *heads], rows)
+    return markdown_table(["scores", "time constant [rows]", *heads], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from pages.page import log_ticks, make_page, table
+from pages.page import log_ticks, make_page
 from pages.tuning_masses import TABLES as MASSES_TABLES
 from pages.tuning_recovery import TABLES as RECOVERY_TABLES
 from pages.tuning_recovery import bad_start
 from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
@@ -102,7 +103,7 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
             honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{comparison.tuned.nis.value:.2f}"
             price = f"{100 * (result.best_value / result.free_value - 1):.1f} %"
             rows.append([f"`{name}`" if kind == FILTERS[0] else "", f"`{kind}`", *ratios, *honesty, price])
-    return table(COLUMNS, rows)
+    return markdown_table(COLUMNS, rows)
 
 
 def recovered() -> str:
@@ -115,7 +116,7 @@ def recovered() -> str:
         started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
         ratios = (score_ratio(one, comparison.true) for one in (started, comparison.tuned))
         rows.append([f"`{name}`", *(_about(ratio, 4) for ratio in ratios)])
-    return table(["scenario", "start over oracle", "tuned over oracle"], rows)
+    return markdown_table(["scenario", "start over oracle", "tuned over oracle"], rows)
 
 
 def maximum_likelihood() -> str:
@@ -125,7 +126,7 @@ def maximum_likelihood() -> str:
     true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
     columns = zip(found.names, true, found.best.parameters, found.standard_errors, strict=True)
     rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
-    return table(["", "true", "most likely", "standard error"], rows)
+    return markdown_table(["", "true", "most likely", "standard error"], rows)
 
 
 def aims() -> str:
@@ -138,7 +139,7 @@ def aims() -> str:
         rows.append(_proved(f"gradient of `{aim}`", found.choice, scenario, found.names, found.identified))
     choice = studied("ekf", scenario).choice
     rows.append(_proved(f"study of `score`, {TRIALS} trials", choice, scenario))
-    return table(["", "score over the scaled default", "NEES", "NIS", "not determined"], rows)
+    return markdown_table(["", "score over the scaled default", "NEES", "NIS", "not determined"], rows)
 
 
 def _proved(what: str, choice: Choice, scenario: Scenario, names=(), identified=()) -> list[str]:

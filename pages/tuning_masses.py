@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import expm
 
-from pages.page import table
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.baselines import GIVEN, NOISE
 from tuning.evaluation.evaluate import score_ratio
@@ -64,7 +64,7 @@ def many() -> str:
             ratio = score_ratio(comparison.evaluations[NOISE], comparison.evaluations[GIVEN])
             rows.append(["noise estimation", f"{ratio.value:.2f}"])
         rows.append([name, f"{comparison.ratios[GIVEN].value:.2f}"])
-    return table(["", "score over the given one"], rows)
+    return markdown_table(["", "score over the given one"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {"many": many}

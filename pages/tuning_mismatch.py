@@ -15,9 +15,10 @@ import optuna
 from filters.augmented import Unknown, augmented_model
 from filters.filter import Filter
 from filters.registry import make_filter
-from pages.page import make_page, table
+from pages.page import make_page
 from thruster_env.core.compiled import inlined
-from thruster_env.core.tuples import written_out
+from thruster_env.core.sources import written_out
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants
 from tuning.evaluation.baselines import scaled_default
@@ -148,7 +149,7 @@ def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int =
     lines = [_line("`ekf`, scaled default", base, base)]
     for name in rows if rows is not None else made:
         lines.append(_line(name, evaluate(made[name](), held_out, scenario.scale), base))
-    return table(COLUMNS, lines)
+    return markdown_table(COLUMNS, lines)
 
 
 def _studied(plan: Plan, trials: int) -> Choice:

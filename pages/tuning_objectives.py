@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.search.objectives import LOG_SCORE, nees_ratio, nis_ratio
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
@@ -62,7 +63,7 @@ def objectives() -> str:
                 cells.append(f"{np.median([ratio(one[place]) for one in pairs]):.3g}")
         rows.append([f"`{name}`", *cells])
     heads = ["scenario", "score, log score over score", "single studies", "NEES, by score", "by log score"]
-    return table([*heads, "NIS, by score", "by log score"], rows)
+    return markdown_table([*heads, "NIS, by score", "by log score"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {"objectives": objectives}

@@ -17,7 +17,8 @@ from optuna.trial import TrialState
 from scipy.stats import t as student
 
 from filters.consistency.intervals import Interval
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import choice_of
@@ -99,7 +100,7 @@ def pruning() -> str:
             ]
         )
     header = ["scenario", "filter", f"squares in {TOP_RUNS} of {TRAINING_SEEDS} runs", "with over without"]
-    return table([*header, "single studies", "better ones pruned", "by at most", "runs saved"], rows)
+    return markdown_table([*header, "single studies", "better ones pruned", "by at most", "runs saved"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {"pruning": pruning}

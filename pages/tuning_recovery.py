@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from pages.page import make_page, table
+from pages.page import make_page
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.evaluate import score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START
@@ -76,7 +77,7 @@ def numbers_found() -> str:
             within = f"within a factor of {max(factors):.2f}" if factors else "no"
             part = f" in {len(factors)} of {len(found)}" if 0 < len(factors) < len(found) else ""
             rows.append(["" if i else title, number, start, span, within + part])
-    return table(["study", "", "start over true", "found over true", "determined"], rows)
+    return markdown_table(["study", "", "start over true", "found over true", "determined"], rows)
 
 
 def scores_reached() -> str:
@@ -90,7 +91,7 @@ def scores_reached() -> str:
         count = sum(score.high < 1 + EQUAL for score in scores)
         title = f"`{name}`, `{kind}`, {trials} trials"
         rows.append([title, excess[0], f"{excess[1]} ({worst})", f"{count} of {len(scores)}"])
-    return table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
+    return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {made.__name__: made for made in (numbers_found, scores_reached)}

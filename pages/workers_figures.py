@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pages.page import log_ticks, make_page, table
+from pages.page import log_ticks, make_page
 from pages.workers_rates import FILTERS, NOTHING, STORAGES, WAITING, WORKS, rates
 from thruster_env.core.plots import BLUE, RUST, new_figure, save_figure, tidy
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.core.threads import cores
 
 COLOURS = dict(zip(STORAGES, (BLUE, RUST), strict=True))
@@ -68,7 +69,7 @@ def trials_a_second() -> str:
             found = rates()[storage, work.name]
             cells = [f"{found[count]:.3g}" if count in found else "" for count in COUNTS]
             rows.append([work.name if storage == STORAGES[0] else "", storage, *cells])
-    return table(["a trial", "storage", *map(str, COUNTS)], rows)
+    return markdown_table(["a trial", "storage", *map(str, COUNTS)], rows)
 
 
 FIGURES: dict[str, Callable[[Path], Path]] = {"workers_throughput.png": throughput}

@@ -11,21 +11,17 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv.noise import noise_adder
-from thruster_env.core.arguments import arguments_of, takes_arguments_of
-from thruster_env.core.checks import covariance_root, positive, vector
+from thruster_env.auv.engine.encoding import noise_adder
+from thruster_env.core.checks import arguments_of, covariance_root, positive, takes_arguments_of, vector
 from thruster_env.core.checks import options as checked_options
 from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
-from thruster_env.effects.chains import chain_of
-from thruster_env.effects.effects import Context, dropping_channels, encoded
+from thruster_env.effects.effects import Context, chain_of, dropping_channels, encoded
 from thruster_env.effects.sensors import SENSOR_EFFECTS
-from thruster_env.env.channels import Channel, reader_of
-from thruster_env.env.copies import PlantCopies, machine_code_of
-from thruster_env.env.env import PlantEnv
-from thruster_env.env.modelled import ModelledEnv
-from thruster_env.env.report import ReportRows
+from thruster_env.env.copies import Channel, PlantCopies, machine_code_of, reader_of
+from thruster_env.env.env import PlantEnv, ReportRows
+from thruster_env.env.model_env import ModelledEnv
 from thruster_env.env.vector_env import PlantVectorEnv
 from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity

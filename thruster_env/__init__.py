@@ -3,9 +3,13 @@
 from gymnasium.envs.registration import register, registry
 
 from thruster_env.core.compiled import may_be_inlined
-from thruster_env.thruster.env import BowThrusterEnv
+from thruster_env.thruster.env import (
+    BowThrusterEnv,
+    BowThrusterLinearEnv,
+    BowThrusterReversalEnv,
+    BowThrusterTrackingEnv,
+)
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters
-from thruster_env.thruster.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
 may_be_inlined("thruster_env.core")
 may_be_inlined("thruster_env.model", "thruster_env.core")
@@ -26,24 +30,24 @@ __all__ = [
 ]
 
 
-def _register(env_id: str, package: str, name: str, is_task: bool, **options) -> None:
+def _register(env_id: str, package: str, name: str, **options) -> None:
     if env_id not in registry:
         register(
             id=env_id,
-            entry_point=f"thruster_env.{package}.{'tasks' if is_task else 'env'}:{name}Env",
-            vector_entry_point=f"thruster_env.{package}.vector_env:{name}VectorEnv",
+            entry_point=f"thruster_env.{package}.env:{name}Env",
+            vector_entry_point=f"thruster_env.{package}.env:{name}VectorEnv",
             **options,
         )
 
 
 for _task in ("", "Tracking", "Reversal", "Linear"):
-    _register(f"BowThruster{_task}-v0", "thruster", f"BowThruster{_task}", bool(_task), max_episode_steps=500)
+    _register(f"BowThruster{_task}-v0", "thruster", f"BowThruster{_task}", max_episode_steps=500)
 # Steps, and the mean return of PD on measurements over 100 held-out episodes; without a task nobody sees a path.
 for _task, _steps, _threshold in (("", 1200, None), ("Path", 600, -17.6), ("Depth", 1200, -694.0)):
     _register(
-        *(f"SegorogeniAUV{_task}-v0", "auv", f"SegorogeniAUV{_task}", bool(_task)),
+        *(f"SegorogeniAUV{_task}-v0", "auv", f"SegorogeniAUV{_task}"),
         max_episode_steps=_steps,
         reward_threshold=_threshold,
     )
 if "Replay-v0" not in registry:
-    register(id="Replay-v0", entry_point="thruster_env.env.replay:ReplayEnv")
+    register(id="Replay-v0", entry_point="thruster_env.env.record:ReplayEnv")

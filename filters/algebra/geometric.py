@@ -12,8 +12,7 @@ from filters.algebra.matrices import Operation, operation, same
 from filters.algebra.operations import factor, mirrored, quotient
 from thruster_env.core import matrices
 from thruster_env.core.compiled import inlined
-from thruster_env.core.sources import Source, entrywise, is_array
-from thruster_env.core.tuples import matrix_reader, matrix_writer
+from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader, matrix_writer
 from thruster_env.graphs.graphs import Graph, called
 from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
 

@@ -2,16 +2,29 @@
 
 A vector of a member is one for each of N members. Of NumPy's arrays it is a matrix (n, N) with a column a member,
 beside which vectors that are the same for all are columns (n, 1).
+
+Columns behind the last member are worked out, too, but count in no mean and no covariance.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import cache
+from math import prod
+from typing import Any
+
 import numpy as np
 
-from filters.algebra.matrices import operation, same
+from filters.algebra import matrices, samples, scalars
+from filters.algebra.matrices import Matrix, Operation, operation, same
 from filters.algebra.points import outer
 from filters.algebra.scalars import choose, constant, exceeds
-from thruster_env.core.angles import whole_turns
+from thruster_env.core import matrices as arrays
+from thruster_env.core.angles import row_aligner, whole_turns
+from thruster_env.core.compiled import not_inlined
+from thruster_env.core.sources import Source, column_reader, column_writer, entrywise, is_array, written_out
+from thruster_env.core.streams import exponential
 from thruster_env.graphs.graphs import Number, arctan2, over_members, size_of, where
 
 
@@ -109,3 +122,277 @@ def stretches(before, after, part):
         return where(there, 1.0 + part * ((b / where(there, a, 1.0)) ** 0.5 - 1.0), 1.0)
 
     return np.array([factor(b, a) for b, a in zip(before, after, strict=True)])
+
+
+# Operations on vectors of members as loops over arrays (n, columns), for `calls`: a column a member.
+
+
+Kinds = tuple[tuple[tuple[int, ...], bool], ...]  # of arguments: the shape, and whether each member has one
+
+
+def function_of(one: Matrix) -> tuple[Callable, bool] | None:
+    """The function that works out an operation on members, and whether their number is its last argument.
+
+    None if it is to be worked out for each by itself.
+    """
+    others = tuple(a for a in one.arguments if not isinstance(a, Matrix))
+    kinds = tuple((a.shape, a.member) for a in one.of)
+    work = _function(one.operation, one.shape, others, kinds) if one.operation in _RULES else None
+    return None if work is None else (work, one.operation in SIZED)
+
+
+@cache
+def _function(operation: Operation, result: tuple, others: tuple, kinds: Kinds) -> Callable | None:
+    """The same for all operations alike. Tuples are turned into arrays, and back."""
+    work = _RULES[operation](others, kinds)
+    small = {f"a{k}": shape for k, (shape, member) in enumerate(kinds) if not member and _is_tuple(shape)}
+    if work is None or not small and not (operation.reduces and _is_tuple(result)):
+        return work
+    size = ["size"] * (operation in SIZED)
+    arguments = [f"a{k}" for k in range(len(kinds))]
+    given = [f"as_array_{name}({name})" if name in small else name for name in arguments]
+    call = f"work({', '.join(given + size)})"
+    names: dict[str, Any] = {f"as_array_{k}": _as_array(one) for k, one in small.items()}
+    if operation.reduces and _is_tuple(result):
+        as_tuple = entrywise("as_tuple", "a", result, lambda *at: f"a[{', '.join(map(str, at))}]")
+        call, names = f"as_tuple({call})", names | {"as_tuple": as_tuple}
+    return written_out("of_members", ", ".join(arguments + size), call, work=work, **names)
+
+
+def _is_tuple(shape: tuple[int, ...]) -> bool:
+    return bool(shape) and not is_array(*shape)
+
+
+@cache
+def _as_array(shape: tuple[int, ...]) -> Callable:
+    lines = [f"out = np.empty({shape})"]
+    for place in np.ndindex(*shape):
+        lines.append(f"out[{', '.join(map(str, place))}] = a" + "".join(f"[{i}]" for i in place))
+    return written_out("as_array", "a", *lines, "out", np=np)
+
+
+def entry(name: str, shape: tuple[int, ...], member: bool) -> str:
+    """Source of number i of a value, in column j if each member has one."""
+    if member:
+        return f"{name}[{'i' if shape else 0}, j]"
+    if len(shape) == 2:
+        return f"{name}[i // {shape[1]}][i % {shape[1]}]"
+    return f"{name}[i]" if shape else name
+
+
+@cache
+def reader(shape: tuple[int, ...]) -> Callable:
+    """A function (array, j) that reads a value from a column."""
+    if len(shape) == 2:
+        return entrywise("read", "array, j", shape, lambda i, k: f"array[{i * shape[1] + k}, j]")
+    return column_reader(*shape) if shape else written_out("read", "array, j", "array[0, j]")
+
+
+@cache
+def writer(shape: tuple[int, ...]) -> Callable:
+    """A function (array, j, value) that writes a value into a column."""
+    if len(shape) < 2:
+        return column_writer(*shape) if shape else written_out("store", "array, j, x", "array[0, j] = x", "None")
+    source = Source("store", "array, j, x", x=shape)
+    for i in source.range(shape[0]):
+        for k in source.range(shape[1]):
+            source.line(f"array[{i * shape[1] + k}, j] = x[{i}][{k}]")
+    return source.function()
+
+
+def _by_entries(kinds: Kinds, text: str) -> Callable | None:
+    """A function of values, some of them of members, whose entries have a source of those of a0, a1.
+
+    None if members have matrices, or numbers that registers hold: more is done with these at once.
+    """
+    longest = max(range(len(kinds)), key=lambda k: (prod(kinds[k][0]), kinds[k][1]))
+    if not is_array(*kinds[longest][0]) or any(member and len(shape) > 1 for shape, member in kinds):
+        return None
+    entries = {f"a{k}": entry(f"a{k}", *kind) for k, kind in enumerate(kinds)}
+    first = next(f"a{k}" for k, (_, member) in enumerate(kinds) if member)
+    size = f"a{longest}.shape[0], {first}.shape[1]"
+    return _of_entries(", ".join(entries), size, text.format(**entries))
+
+
+@cache
+def _of_entries(arguments: str, size: str, text: str) -> Callable:
+    lines = (
+        f"out = np.empty(({size}))",
+        "for i in range(out.shape[0]):",
+        "    for j in range(out.shape[1]):",
+        f"        out[i, j] = {text}",
+        "out",
+    )
+    return not_inlined(written_out("by_entries", arguments, *lines, _loops=True, np=np))
+
+
+@not_inlined
+def _called_means(a, size):
+    out = np.zeros(a.shape[0])
+    for i in range(a.shape[0]):
+        total = 0.0
+        for j in range(size):
+            total += a[i, j]
+        out[i] = total / size
+    return out
+
+
+@not_inlined
+def _square(a, size):
+    out = arrays.square_of_rows(arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size))
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            out[i, k] /= size - 1
+    return out
+
+
+@not_inlined
+def _covariance(a, b, size):
+    d = arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size)
+    out = arrays.product_of_rows(d, arrays.deviations(b, 0, b.shape[0], _called_means(b, size), size))
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            out[i, k] /= size - 1
+    return out
+
+
+@not_inlined
+def _variances(a, size):
+    means, out = _called_means(a, size), np.zeros(a.shape[0])
+    for i in range(a.shape[0]):
+        total = 0.0
+        for j in range(size):
+            total += (a[i, j] - means[i]) ** 2
+        out[i] = total / (size - 1)
+    return out
+
+
+@not_inlined
+def _centred(a, size):
+    means, factor, out = _called_means(a, size), (size / (size - 1.0)) ** 0.5, np.empty_like(a)
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = factor * (a[i, j] - means[i])
+    return out
+
+
+@not_inlined
+def _called_total(a, size):
+    found = 0.0
+    for j in range(size):
+        found += a[0, j]
+    return found
+
+
+@not_inlined
+def _weighted_sums(a, w, size):
+    out = np.zeros(a.shape[0])
+    for i in range(a.shape[0]):
+        for j in range(size):
+            out[i] += w[0, j] * a[i, j]
+    return out
+
+
+def _weighted_mean(others: tuple, kinds: Kinds) -> Callable:
+    (shape, _), _ = kinds
+    return written_out("mean", "a, w, size", f"sums(a, w, size).reshape({shape})", sums=_weighted_sums)
+
+
+@not_inlined
+def _largest(a, size):
+    most = -math.inf
+    for j in range(size):
+        most = a[0, j] if a[0, j] > most else most
+    return most if most > -math.inf else math.nan
+
+
+@not_inlined
+def _effective_size(w, size):
+    squares = 0.0
+    for j in range(size):
+        squares += w[0, j] * w[0, j]
+    return 1.0 / squares
+
+
+@not_inlined
+def _spread_share(w, size):
+    rest = others = 0.0
+    for j in range(size):
+        other = w[0, j] if w[0, j] <= 0.5 else 0.0
+        others += other
+        rest += other * (1.0 - other)
+    return rest + others * (1.0 - others)
+
+
+@not_inlined
+def _weighted_square(d, w, size):
+    return arrays.weighted_square_of_rows(d[:, :size].copy(), w, 0)
+
+
+def _on_branch(others: tuple, kinds: Kinds) -> Callable:
+    n = kinds[0][0][0]
+    if len(kinds) == 1:
+        return written_out(
+            "on_branch", "a, size", "out = a.copy()", "align(out, size)", "out", align=row_aligner(0, *others)
+        )
+    lines = (
+        f"out = np.empty(({n} + 1, a.shape[1]))",
+        f"out[:{n}], out[{n}] = a, w[0]",
+        "align(out, size)",
+        f"out[:{n}]",
+    )
+    return written_out("on_branch", "a, w, size", *lines, np=np, align=row_aligner(0, *others, n))
+
+
+def _product(others: tuple, kinds: Kinds) -> Callable | None:
+    (matrix, first), (shape, _) = kinds
+    return None if first or len(shape) > 1 or not is_array(*matrix) else arrays.sparse_product
+
+
+def _multiple(others: tuple, kinds: Kinds) -> Callable | None:
+    return _by_entries(kinds, f"{others[0]!r} * {{a0}}" if others else "{a1} * {a0}")
+
+
+_RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
+    matrices.add: lambda others, kinds: _by_entries(kinds, "{a0} + {a1}"),
+    matrices.subtract: lambda others, kinds: _by_entries(kinds, "{a0} - {a1}"),
+    matrices.scale: _multiple,
+    matrices.multiply: _product,
+    scalars.entries_product: lambda others, kinds: _by_entries(kinds, "{a0} * {a1}"),
+    samples.total: lambda others, kinds: _called_total,
+    samples.weighted_mean: _weighted_mean,
+    samples.largest: lambda others, kinds: _largest,
+    samples.effective_size: lambda others, kinds: _effective_size,
+    samples.spread_share: lambda others, kinds: _spread_share,
+    samples.weighted_square: lambda others, kinds: _weighted_square,
+    mean: lambda others, kinds: _called_means,
+    variances: lambda others, kinds: _variances,
+    centred: lambda others, kinds: _centred,
+    on_one_branch: _on_branch,
+    cross_covariance: lambda others, kinds: _covariance,
+    scatter: lambda others, kinds: _square,
+}
+SIZED = {  # operations that ask how many members there are
+    *(
+        samples.total,
+        samples.weighted_mean,
+        samples.largest,
+        samples.effective_size,
+        samples.spread_share,
+        samples.weighted_square,
+    ),
+    *(mean, variances, cross_covariance, scatter),
+    *(centred, on_one_branch),
+}
+
+
+def _stretches(result: tuple, before: tuple, after: tuple, part: tuple) -> Callable:
+    entry = "(1.0 + p * ((b[{0}] / a[{0}]) ** 0.5 - 1.0) if a[{0}] > 0.0 else 1.0)".format
+    source = Source("stretches", "b, a, p", result=result, b=before, a=after)
+    return source.function(source.vector(result[0], entry))
+
+
+FUNCTIONS: dict[Operation, Callable] = {
+    stretches: _stretches,
+    samples.weights: lambda result, logarithm: exponential,
+}

@@ -7,12 +7,11 @@ from collections.abc import Iterable
 from filters.c.log_columns import COLUMNS
 from filters.c.log_reader import LINES, ROWS
 from filters.c.programs import FilterPrograms
-from filters.logs.columns import header_of
 from filters.logs.estimate import SKIPPED
+from filters.logs.findings import header_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs import write
-from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, plain
-from thruster_env.logs.units import LENGTHS, WORDS, conversion
+from thruster_env.logs.columns import DATE_NAMES, LENGTHS, TIME_NAMES, WORDS, conversion, plain
 from thruster_env.model.quantities import Quantity
 
 MAIN = """\

@@ -1,33 +1,122 @@
-"""A page's stages as programs in C: a model's numbers are constants in them, so that zeros and ones vanish."""
+"""A page's stages as programs in C: names, constants, and the error of single precision."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
 from typing import NamedTuple
 
 import numpy as np
 
-from filters.algebra.densities import dot
 from filters.algebra.matrices import Matrix, evaluate
 from filters.algebra.operations import factor, quotient
-from filters.c.identifiers import is_macro, is_name
-from filters.engine.layout import memory_places
-from filters.ensembles.ensemble import EnsembleFilter
-from filters.ensembles.page_is_all import check_page_is_all
+from filters.algebra.samples import dot
+from filters.engine.batch import run
+from filters.engine.belief import memory_places
+from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.pages.equations import Equations
-from filters.pages.kernels import stages_of
+from filters.pages.kernels import numbers_of, stages_of
 from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as stages_of_members
-from filters.pages.memory import RowMemory
+from filters.pages.page import RowMemory
 from filters.pages.page_filter import FilterWithPage, with_page
-from filters.pages.stages import numbers_of
 from filters.pages.traced import MOST, Traced
+from thruster_env.core.angles import difference, wrapped_where
+from thruster_env.core.streams import (
+    FILTER_MEASUREMENT,
+    FILTER_PRIOR,
+    FILTER_PROCESS,
+    GROUP,
+    fill_normals,
+    filter_keys,
+)
+from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import Graph, TooLarge
-from thruster_env.graphs.programs import BY_MEMBERS, Place, Program, program_of
-from thruster_env.model.shape import Shape
+from thruster_env.graphs.programs import BY_MEMBERS, Place, Program, program_of, work_names
+from thruster_env.model.shape import LANES, Shape, padded
 from thruster_env.model.state_space import StateSpaceModel
+
+# Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
+
+
+KEYWORDS = frozenset(  # of C99 to C23 and C++20, and tokens that C++ writes as words
+    "alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class "
+    "co_await co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype "
+    "default delete do double dynamic_cast else enum explicit export extern false float for friend goto if inline "
+    "int long main mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected public "
+    "register reinterpret_cast requires restrict return short signed sizeof static static_assert static_cast std "
+    "struct switch template this thread_local throw true try typedef typeid typename typeof typeof_unqual union "
+    "unsigned using virtual void volatile wchar_t while xor xor_eq".split()
+)
+HEADERS = frozenset(  # NAME.h would hide them
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg "
+    "stdatomic stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar "
+    "unistd wchar wctype".split()
+)
+MACROS = re.compile(
+    "NAN|INFINITY|NULL|EOF|BUFSIZ|FILENAME_MAX|FOPEN_MAX|MB_CUR_MAX|MAXFLOAT|I|DOMAIN|SING|OVERFLOW|UNDERFLOW|PLOSS|"
+    "TLOSS|linux|unix|i386|errno|stdin|stdout|stderr|signgam|assert|"
+    "P_tmpdir|L_(tmpnam|ctermid|cuserid)|(HUGE_VAL|SNAN)[A-Z0-9]*|"
+    "(FP|M|MATH|SEEK|EXIT|RAND|TMP|SIZE|PTRDIFF|SIG|WCHAR|WINT|FLT|DBL|LDBL)_[A-Z0-9_]*|"
+    "(U?INT(PTR|MAX|(_LEAST|_FAST)?(8|16|32|64))|U?CHAR|U?SHRT|U?INT|U?L?LONG)_[A-Z]+"
+)
+OF_MATH = (  # and with an f or l behind them
+    "acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh drem erf erfc exp exp10 exp2 expm1 "
+    "fabs fdim finite floor fma fmax fmin fmod frexp gamma gamma_r hypot ilogb isinf isnan j0 j1 jn ldexp "
+    "lgamma lgamma_r llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter "
+    "nexttoward pow pow10 remainder remquo rint round roundeven scalb scalbln scalbn significand sin sincos "
+    "sinh sqrt tan tanh tgamma trunc y0 y1 yn"
+).split()
+OF_OTHERS = (
+    "fpclassify isfinite isnormal signbit isgreater isgreaterequal isless islessequal islessgreater "
+    "isunordered math_errhandling offsetof abort abs alloca atexit atof atoi atol atoll bcmp bcopy bsearch "
+    "bzero calloc clearerr ctermid div dprintf drand48 ecvt erand48 exit fclose fcvt fdopen feof ferror "
+    "fflush ffs fgetc fgetpos fgets fileno fopen fprintf fputc fputs fread free freopen fscanf fseek fsetpos "
+    "ftell fwrite gcvt getc getchar getdelim getenv getline gets getw index initstate jrand48 labs ldiv llabs "
+    "lldiv lrand48 malloc mblen mbstowcs mbtowc memccpy memchr memcmp memcpy memmove memset mktemp mrand48 "
+    "nrand48 pclose perror popen printf putc putchar putenv puts putw qsort rand random realloc realpath "
+    "remove rename rewind rindex scanf select setbuf setenv setstate setvbuf snprintf sprintf srand srandom "
+    "sscanf stpcpy strcat strchr strcmp strcoll strcpy strcspn strdup strerror strlen strncat strncmp strncpy "
+    "strnlen strpbrk strrchr strsep strsignal strspn strstr strtod strtof strtok strtol strtold strtoll "
+    "strtoul strtoull strxfrm system tempnam tmpfile tmpnam ungetc unsetenv valloc vfprintf vfscanf vprintf "
+    "vscanf vsnprintf vsprintf vsscanf wcstombs wctomb write read"
+).split()
+OF_LIBRARIES = frozenset([*OF_OTHERS, *(name + kind for name in OF_MATH for kind in ("", "f", "l"))])
+FUNCTIONS = "{0}_init", "{0}_predict", "{0}_update", "{0}_test_anew", "{0}_channel"  # of a filter of this name
+
+
+def is_name(text: str) -> bool:
+    """Whether text is letters, digits and _, begins with a letter, and is no keyword of C or C++."""
+    return bool(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", text, flags=re.ASCII)) and text not in KEYWORDS
+
+
+def is_macro(text: str) -> bool:
+    """Whether headers of C replace a name by something else."""
+    return bool(MACROS.fullmatch(text))
+
+
+def is_taken(name: str, texts: Iterable[str]) -> bool:
+    """Whether a filter cannot have a name: libraries of C declare it, as do types that end in _t, or its files do.
+
+    Args:
+        name: of letters, digits and _.
+        texts: the files of the same filter under another name.
+    """
+    if name in OF_LIBRARIES or name in HEADERS or name == "board" or name.endswith("_t") or is_macro(name):
+        return True
+    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _without_comments(text))}
+    return not used.isdisjoint([name, *(one.format(name) for one in FUNCTIONS)])
+
+
+def _without_comments(text: str) -> str:
+    """A text of C without its comments, strings and characters, of which one may be a quote."""
+    return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)
+
+
+# A page's stages as programs in C: a model's numbers are constants in them, so that zeros and ones vanish.
+
 
 NIS = -1  # its place in a row, where machine code has none
 TOLD = frozenset(  # of each filter in C, and by its tests
@@ -229,3 +318,72 @@ def _program(
         for k, one in enumerate(np.ravel(np.array(value, dtype=object))):
             stores.append((lies(Place(array, first + k)), graph.number(one)))
     return program_of(stores, {})
+
+
+# How far single precision moves the estimates of a filter in C: its programs, run as Python with float32.
+
+
+class _Single:
+    """In place of `float` in a program's text."""
+
+    @staticmethod
+    def fromhex(text: str) -> np.float32:
+        return np.float32(as_single(float.fromhex(text)))
+
+
+def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, z: np.ndarray) -> float:
+    """The largest difference between estimates in single and double precision, in standard deviations.
+
+    Args:
+        filter_: the filter.
+        programs: what it is made of.
+        inputs: u of a run, (K, p).
+        z: its measurements, (K + 1, m).
+    """
+    key = filter_keys([0])
+    exact = run(filter_, key, inputs[None], z[None])
+    stds = np.sqrt(np.einsum("kii->ki", exact.covs[0]))
+    with np.errstate(all="ignore"):
+        found = _means(programs, key[0], inputs.astype(np.float32), z.astype(np.float32))
+    off = abs(difference(found, exact.means[0], programs.model.shape.state_angles))
+    return float(np.max(off / np.where(stds > 0, stds, 1.0)))
+
+
+def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Means of a run, (K + 1, n), without restarts."""
+    model, n, m = programs.model, programs.model.n, programs.model.m
+    start, begin, advance, settle, update, _ = map(_compiled, programs.all)
+    names = {**work_names(), "float": _Single, "X": np.zeros(programs.flying, np.float32)}
+    names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
+    names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.kept.items()}
+    x = names["x"] = wrapped_where(model.prior_mean, model.shape.state_angles).astype(np.float32)
+    names["innovation"], found = np.zeros(m, np.float32), []
+    size, width = programs.members, padded(programs.members, LANES)
+    names |= {"size": size, "table": np.zeros((n, size), np.float32)}
+
+    def draw(stream: int, step: int, rows: int) -> None:
+        normals = np.empty(padded(rows * width, GROUP))
+        fill_normals(normals, rows * width * (size > 0), step, stream, *key)
+        names["draws"] = normals[: rows * width].reshape(rows, width)[:, :size].astype(np.float32)
+
+    draw(FILTER_PRIOR, 0, n)
+    exec(start, names)
+    for k in range(len(z)):
+        if k > 0:
+            names["u"] = inputs[k - 1]
+            exec(begin, names)
+            for _ in range(model.substeps):
+                for point in names["X"].reshape(-1, n) if programs.points else [x]:
+                    exec(advance, names | {"x": point})
+            draw(FILTER_PROCESS, k, n)
+            exec(settle, names)
+        names["z"] = z[k]
+        draw(FILTER_MEASUREMENT, k, m)
+        exec(update, names)
+        found.append(x.astype(np.float64))
+    return np.array(found)
+
+
+def _compiled(program: Program):
+    text = "\n".join(program.text).replace("filter->", "")
+    return compile(text, "<a filter in single precision>", "exec")

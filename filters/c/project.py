@@ -1,20 +1,270 @@
-"""A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them."""
+"""A folder with a filter in C: sources, headers, a program that filters a log, sizes, and an emulated board.
+
+The machine is ARM's MPS2 with the image AN386. Standard input and output of the program are those of the emulator,
+by semihosting.
+"""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
-from filters.c import board as emulated
-from filters.c.cpp import class_of
 from filters.c.log_program import log_program
 from filters.c.monitor import TestsWriter
-from filters.c.programs import programs_of
-from filters.c.sizes import COMPILERS, Sizes, sizes_of
-from filters.c.source import c_filter
+from filters.c.programs import FilterPrograms, is_name, is_taken, programs_of
+from filters.c.writer import EnsembleWriter, Writer
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.files import check_target, write_whole
+
+# NAME.hpp: a filter in C as a class of C++.
+
+
+CLASS = """\
+/* The filter {name} as a class of C++11; link with {name}.c, which a compiler of C makes. */
+#ifndef {guard}_HPP
+#define {guard}_HPP
+
+#include "{name}.h"
+
+class {type} {{
+public:
+    using Real = {real};
+
+    enum {{ states = {guard}_STATES, inputs = {guard}_INPUTS, measurements = {guard}_MEASUREMENTS }};
+
+    /* Begins with the prior{with_key}. */
+    {explicit}{type}({of_key}) noexcept {{ reset({by_key}); }}
+
+    void reset({of_key}) noexcept {{ {name}_init(&filter_{and_key}); }}
+
+    /* Predict a step{under}. */
+    void predict({u}) noexcept {{ {name}_predict(&filter_{given}); }}
+
+    /* Correct by a measurement; a channel that is NaN is missing. */
+    void update(const Real (&z)[measurements]) noexcept {{ {name}_update(&filter_, z); }}
+
+    Real estimate(int state) const noexcept {{ return filter_.x[state]; }}
+
+    Real covariance(int row, int column) const noexcept {{ return filter_.P[row * states + column]; }}
+
+    /* The innovation, its covariance, NIS, and whatever else {name}.h names. */
+    const {name} &told() const noexcept {{ return filter_; }}
+
+{tests}private:
+    {name} filter_;
+}};
+
+#endif
+"""
+
+
+TESTS = """\
+    /* Whether no test has raised an alarm of late; tests that raise one now, a sum of {guard}_STUCK, ... */
+    bool healthy() const noexcept {{ return filter_.healthy != 0; }}
+
+    unsigned alarms(int channel) const noexcept {{ return filter_.channel[channel].alarms; }}
+
+    /* Begin the tests anew. */
+    void test_anew() noexcept {{ {name}_test_anew(&filter_); }}
+
+"""
+
+
+def class_of(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
+    """The header of a class, NameFilter, around the filter in C of this name, which may test its innovations."""
+    words = "".join(word.capitalize() for word in name.split("_"))
+    inputs, drawn = programs.model.inputs > 0, programs.members > 0
+    return CLASS.format(
+        name=name,
+        guard=name.upper(),
+        type=f"{words}Filter",
+        real="float" if single else "double",
+        under=" under u" * inputs,
+        u="const Real (&u)[inputs]" * inputs,
+        given=", u" * inputs,
+        tests=TESTS.format(name=name, guard=name.upper()) * tested,
+        with_key=" and a key: the same one gives the same random numbers" * drawn,
+        explicit="explicit " * drawn,
+        of_key="uint32_t key_0 = 0, uint32_t key_1 = 0" * drawn,
+        by_key="key_0, key_1" * drawn,
+        and_key=", key_0, key_1" * drawn,
+    )
+
+
+# NAME.h and NAME.c of a filter.
+
+
+STAND_IN = "another_name"  # of a filter whose own words are asked for
+
+
+class CFilter(NamedTuple):
+    """A filter in C.
+
+    Attributes:
+        name: of its type and its files.
+        header: NAME.h.
+        source: NAME.c.
+    """
+
+    name: str
+    header: str
+    source: str
+
+
+def c_filter(
+    filter_: Filter, name: str | None = None, *, single: bool = False, monitor: Monitor | None = None
+) -> CFilter:
+    """A filter as C99, from its page and its model's functions, with the model's numbers in it.
+
+    NAME_init sets the prior, NAME_predict(filter, u) is a step, NAME_update(filter, z) corrects by a measurement
+    whose channels may be NaN. The estimates are those of `filters.run` to rounding, restarts included; an ensemble
+    draws the same numbers from the same key, which NAME_init takes. The code has fixed sizes, no heap and no
+    recursion, and needs math.h alone.
+
+    Args:
+        filter_: a filter with a page, so no "gsf", "imm", "mmae", "mhe" or "fuzzy".
+        name: of the type, and before all names; the filter's by default.
+        single: floats in place of doubles.
+        monitor: tests of the innovations, which run after each update.
+
+    Raises:
+        ValueError: for another filter, a name that C does not take, or a model whose functions decide, look
+            numbers up, or have too many operations.
+    """
+    name = filter_.name.replace("-", "_") if name is None else name
+    if not is_name(name):
+        raise ValueError(f"a name in C must be letters, digits and _, and no keyword, but got {name!r}")
+    programs = programs_of(filter_)
+
+    def called(name: str) -> CFilter:
+        tests = None if monitor is None else TestsWriter(monitor, name, programs.model.m, single)
+        writer = (EnsembleWriter if programs.members else Writer)(name, programs, single, tests)
+        return CFilter(name, writer.header(filter_.name), writer.source())
+
+    _, *texts = called(STAND_IN)
+    texts.append(class_of(STAND_IN, programs, single=single, tested=monitor is not None))
+    texts.append(log_program(STAND_IN, programs, single=single, tested=monitor is not None))
+    if is_taken(name, texts):
+        raise ValueError(
+            "a name in C must be one that neither its libraries nor the filter's own files use, but got "
+            f"{name!r}: take another one, such as {name}_filter"
+        )
+    return called(name)
+
+
+# How many bytes a filter in C takes: its struct, its stack, and its code, as gcc tells.
+
+
+CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
+COMPILERS = {"gcc": "", "arm-none-eabi-gcc": CORTEX_M4}  # with arguments
+ONE = '#include "{name}.h"\n\nextern {name} a_filter;\n{name} a_filter;\n'  # a global, which is its size
+
+
+class Sizes(NamedTuple):
+    """Bytes of a filter."""
+
+    struct: int
+    stack: int  # of the deepest call, without those of math.h
+    code: int  # and constants
+
+
+def sizes_of(made: CFilter, compiler: str = "gcc") -> Sizes | None:
+    """The sizes with -Os; None where that compiler of `COMPILERS`, or its `size`, is not installed."""
+    size = compiler.removesuffix("gcc") + "size"
+    if shutil.which(compiler) is None or shutil.which(size) is None:
+        return None
+    with TemporaryDirectory() as folder:
+        texts = {f"{made.name}.h": made.header, "filter.c": made.source, "one.c": ONE.format(name=made.name)}
+        for name, text in texts.items():
+            Path(folder, name).write_text(text, encoding="utf-8")
+        options = f"-std=c99 -Os -fstack-usage {COMPILERS[compiler]} -c filter.c one.c".split()
+        for command in ([compiler, *options], [size, "filter.o", "one.o"]):
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+            if done.returncode != 0:
+                return None
+        (code, data, bss), (_, _, struct) = (
+            [int(word) for word in line.split()[:3]] for line in done.stdout.splitlines()[1:]
+        )
+        lines = Path(folder, "filter.su").read_text(encoding="utf-8").splitlines()
+    stacks = {line.split("\t")[0].rsplit(":", 1)[1]: int(line.split("\t")[1]) for line in lines}
+    own = [stacks.pop(f"{made.name}_{one}", 0) for one in ("init", "predict", "update")]
+    tested = stacks.pop("test_update", 0) + stacks.pop("test_channel", 0) + stacks.pop("sound", 0)
+    drawn = stacks.pop("draw", 0) + stacks.pop("philox", 0)
+    of_prior = max(drawn, stacks.pop("start", 0), stacks.pop("summarise", 0))
+    of_update = max((stacks.pop(one) for one in [*stacks] if one.startswith("geometric_mean")), default=0)
+    within = (
+        stacks.pop("become_prior", 0) + of_prior,
+        stacks.pop("correct", 0) + of_update,
+        tested,
+        *stacks.values(),
+    )
+    return Sizes(struct, max(own) + max(within), code + data + bss)
+
+
+# A Cortex-M4 that QEMU emulates, for a program that filters a log: start-up code, memory map, and commands.
+
+
+BOARD = """\
+extern void _start(void);
+
+static void reset(void)
+{
+    *(volatile unsigned *)0xE000ED88u |= 0xF00000u; /* the floating-point unit */
+    _start();
+}
+
+__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
+    (void (*)(void))0x20400000u, reset};
+"""
+MEMORY = """\
+ENTRY(_start)
+MEMORY
+{
+    CODE (rx) : ORIGIN = 0x00000000, LENGTH = 4M
+    DATA (rwx) : ORIGIN = 0x20000000, LENGTH = 4M
+}
+SECTIONS
+{
+    .vectors : { KEEP(*(.vectors)) } > CODE
+    .text : { *(.text*) *(.rodata*) KEEP(*(.init)) KEEP(*(.fini)) } > CODE
+    .ARM.exidx : { *(.ARM.exidx*) } > CODE
+    .data : {
+        *(.data*) . = ALIGN(8);
+        __preinit_array_start = .; KEEP(*(.preinit_array)) __preinit_array_end = .;
+        __init_array_start = .; KEEP(*(.init_array*)) __init_array_end = .;
+        __fini_array_start = .; KEEP(*(.fini_array*)) __fini_array_end = .;
+    } > DATA
+    .bss : { __bss_start__ = .; *(.bss*) *(COMMON) __bss_end__ = .; } > DATA
+    end = ALIGN(8);
+    __end__ = end;
+}
+"""
+BUILD = (
+    "arm-none-eabi-gcc {flags} "
+    f"{CORTEX_M4} --specs=rdimon.specs -T board.ld "
+    "{name}.c main.c board.c -lm -o {name}.elf"
+)
+EMULATE = (
+    "qemu-system-arm -M mps2-an386 -nographic -monitor none -serial none "
+    "-semihosting-config enable=on,target=native -kernel {name}.elf"
+)
+BOARD_README = """
+## On an emulated controller
+
+On a Cortex-M4 that QEMU emulates (gcc-arm-none-eabi and qemu-system-arm of Debian):
+
+    {build}
+    {emulate} < log.csv > estimates.csv
+"""
+
+
+# A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them.
+
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.10)
@@ -116,7 +366,7 @@ def write_project(
         "main.c": log_program(made.name, programs, single=single, tested=watch is not None, dt=dt),
         "CMakeLists.txt": CMAKE.format(name=made.name),
         "README.md": README.format(**about),
-        **({"board.c": emulated.BOARD, "board.ld": emulated.MEMORY} if board else {}),
+        **({"board.c": BOARD, "board.ld": MEMORY} if board else {}),
     }
     files = [Path(folder) / one for one in texts]
     for file in files:
@@ -128,5 +378,5 @@ def write_project(
 
 def _of_board(name: str) -> str:
     """The part of the README on the emulated controller."""
-    build = emulated.BUILD.format(name=name, flags="-std=c99 -O2")
-    return emulated.README.format(build=build, emulate=emulated.EMULATE.format(name=name))
+    build = BUILD.format(name=name, flags="-std=c99 -O2")
+    return BOARD_README.format(build=build, emulate=EMULATE.format(name=name))

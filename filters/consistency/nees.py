@@ -1,18 +1,20 @@
-"""Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions.
-
-NEES is the normalised estimation error squared, e' P^-1 e; NIS is the normalised innovation squared, v' S^-1 v.
-"""
+"""Is a filter's covariance consistent? NEES, NIS, the whiteness of innovations, and models that blow up."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtr, chdtri
+from scipy.special import chdtr, chdtrc, chdtri
 
-from filters.consistency.intervals import Interval, mean_interval
-from filters.consistency.uniformity import Uniformity, uniformity
+from filters.consistency.intervals import Interval, Uniformity, mean_interval, uniformity
+from thruster_env.core.checks import at_least
 from thruster_env.core.threads import spread
+
+# Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions.
+
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
@@ -155,3 +157,130 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
     sums, place = np.unique(total, return_inverse=True)  # there are few, and chdtri is slow
     limits = chdtri(np.maximum(sums, 1.0)[:, None], [0.975, 0.025])[place]  # it takes the upper tail
     return np.where(runs[:, None] > 0, limits / np.maximum(runs, 1)[:, None], np.nan)
+
+
+# Do innovations contain anything that the filter could have predicted? Their correlation over time.
+
+
+LAGS = 20
+
+
+class Whiteness(NamedTuple):
+    """Correlations of normalised innovations over time, pooled over runs; all zero for a consistent filter."""
+
+    correlations: np.ndarray  # (lags, m, m): of channel i with channel j so many steps later; lags 1, 2, ...
+    half_widths: np.ndarray  # (lags, m, m): a correlation lies within plus and minus this with 95 % probability
+    share_inside: float  # of correlations within these; 0.95 is right
+    statistic: float  # of the portmanteau test, chi-squared with lags m^2 degrees of freedom; 0 of no values
+    p_value: float  # probability of a statistic as large if the innovations were white; NaN of no values
+
+
+def whiteness(
+    innovations: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None, lags: int = LAGS
+) -> Whiteness:
+    """`whiteness_of` innovations (B, T, m) with their covariances (B, T, m, m)."""
+    return whiteness_of(whitened(innovations, covs), present, lags)
+
+
+def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = LAGS) -> Whiteness:
+    """Test whether the innovations of B runs are white, with e = L^-1 v and L L' = S.
+
+        rho_ij(l) = sum e_i(k) e_j(k + l) / (c sqrt(mean e_i^2 mean e_j^2)) over all runs and the c pairs of steps
+                    that have both
+        portmanteau: N sum over l, i, j of c rho_ij(l)^2 (N + 2)/N^2, chi-squared with lags m^2 degrees of freedom
+
+    for N values a channel: with one run and one channel the test of Ljung and Box. Innovations have mean zero,
+    so none is subtracted. Many runs find correlations that are too small to matter: look at their size, too.
+
+    Args:
+        e: whitened innovations, (B, T, m), as `filters.consistency.nees.whitened` gives them.
+        present: which channels were measured, (B, T, m); all if None.
+        lags: number of lags, less than T.
+
+    Raises:
+        ValueError: if there are not more steps than lags.
+
+    Source: Ljung, Box (1978), "On a measure of lack of fit in time series models"; Hosking (1980), "The
+    multivariate portmanteau statistic"; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
+    """
+    steps = e.shape[1]
+    lags = at_least("lags", lags, 1)
+    if steps <= lags:
+        raise ValueError(f"there must be more steps than lags, but got {steps} steps and {lags} lags")
+    there = ~np.isnan(e) if present is None else present & ~np.isnan(e)
+    e, there = np.where(there, e, 0.0), there.astype(np.float64)
+    values = np.maximum(there.sum(axis=(0, 1)), 1.0)
+    e /= np.sqrt(np.maximum((e**2).sum(axis=(0, 1)) / values, 1e-300))
+    sums = _lagged_sums(e, lags)
+    pairs = _all_pairs(there, lags) if there.all() else _lagged_sums(there, lags)
+    known = pairs > 0  # a channel that never was measured is no white one
+    pairs = np.maximum(pairs, 1.0)
+    correlations = sums / pairs
+    size = np.sqrt(np.outer(values, values))
+    squares = correlations**2 * pairs * (size + 2.0) / size  # each chi-squared with one degree of freedom
+    statistic = float(squares.sum())
+    return Whiteness(
+        correlations,
+        1.96 * np.sqrt(size / (size + 2.0) / pairs),
+        float((squares[known] <= 1.96**2).mean()) if known.any() else np.nan,
+        statistic,
+        float(chdtrc(known.sum(), statistic)) if known.any() else np.nan,
+    )
+
+
+def _lagged_sums(x: np.ndarray, lags: int) -> np.ndarray:
+    """Sums over runs and steps k of x_i(k) x_j(k + l), (lags, m, m), for x of shape (B, T, m) and l from 1 on."""
+    path = ["einsum_path", (0, 1)]  # the only one, which to find took half of the time
+    return np.array(
+        [np.einsum("bki,bkj->ij", x[:, :-lag], x[:, lag:], optimize=path) for lag in range(1, lags + 1)]
+    )
+
+
+def _all_pairs(there: np.ndarray, lags: int) -> np.ndarray:
+    """The same of ones: numbers of pairs."""
+    runs, steps, m = there.shape
+    return np.broadcast_to(runs * (steps - np.arange(1.0, lags + 1.0))[:, None, None], (lags, m, m))
+
+
+# Does a model blow up between samples? Then its predictions are off by more than any Q or R explains.
+
+
+BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """Root mean square of the values that are not NaN, infinite only if one of them is; NaN of none."""
+    there = values[~np.isnan(values)]
+    if not there.size:
+        return np.nan
+    largest = float(abs(there).max()) or 1.0  # by which squares stay finite where a model blows up
+    return float(np.sqrt(((there / largest) ** 2).mean()) * largest) if isfinite(largest) else np.inf
+
+
+def blow_up_sentence(
+    innovations: np.ndarray, measurements: np.ndarray, names: Sequence[str], dt: float | None = None
+) -> str:
+    """A sentence on a model that blows up between samples; empty where it does not.
+
+    That is where a channel's root mean square innovation is a thousand times its standard deviation.
+
+    Args:
+        innovations: (..., m), NaN where they do not count.
+        measurements: (..., m), NaN where missing.
+        names: of the channels.
+        dt: sample time [s], if there is one.
+    """
+    for place, name in enumerate(names):
+        rmse, z = root_mean_square(innovations[..., place]), measurements[..., place]
+        if np.isnan(rmse) or np.isnan(z).all():
+            continue
+        spread = float(np.nanstd(z))
+        if rmse > BLOW_UP * spread:
+            time = "this dt" if dt is None else f"dt = {dt:g} s"
+            return (
+                f"The model diverges between samples: its prediction of {name} is off by {rmse:.3g}, and "
+                f"{spread:.3g} is the channel's standard deviation. Its integration step is too long for "
+                f"{time}: give the model more substeps or the data a smaller dt, and check that the "
+                "model's time is in seconds, as that of the data is."
+            )
+    return ""

@@ -11,20 +11,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, mean_interval
-from filters.consistency.nees import SquaresCheck, check_whitened, whitened
-from filters.consistency.scores import (
+from filters.consistency.intervals import (
     LEVELS,
+    Interval,
+    Uniformity,
     covered,
     ensemble_crps,
     ensemble_ranks,
     expected_gaussian_crps,
     gaussian_crps,
+    mean_interval,
+    uniformity,
 )
-from filters.consistency.uniformity import Uniformity, uniformity
-from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
+from filters.consistency.nees import LAGS, SquaresCheck, Whiteness, check_whitened, whitened, whiteness_of
 from filters.engine.batch import Estimates
-from filters.ensembles.recording import Members
+from filters.ensembles.rank_histogram import Members
 from thruster_env.core.angles import difference, is_angle, wrapped
 
 
@@ -46,7 +47,7 @@ class ConsistencyReport(NamedTuple):
     nis: SquaresCheck
     whiteness: Whiteness
     coverage: tuple[Interval, ...]  # share of each state's errors within 1.96 standard deviations; 0.95 is right
-    coverage_by_level: np.ndarray  # (levels, n), of intervals of the levels `filters.consistency.scores.LEVELS`
+    coverage_by_level: np.ndarray  # (levels, n), of intervals of the levels `filters.consistency.intervals.LEVELS`
     crps: tuple[Interval, ...]  # mean CRPS of each state's Gaussian, in its unit
     crps_expected: np.ndarray  # (n,), what it would be if the covariances were right
     crps_ratio: np.ndarray  # (T, n), mean CRPS over runs in units of that expectation, step by step
@@ -198,7 +199,7 @@ def report_of(
     Args:
         found: of all runs, at least two.
         states: the truth, (B, K + 1, n); None where it is not known.
-        members: of the first of these runs, for ensembles, from `filters.ensembles.recording.record_members`.
+        members: of the first of these runs, for ensembles, from `filters.ensembles.rank_histogram.record_members`.
         first_step: the first that counts.
         names: of the states, with units.
         angles: (n,), which states are angles.

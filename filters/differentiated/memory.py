@@ -7,12 +7,10 @@ from math import prod
 from filters.algebra.matrices import Matrix, given
 from filters.algebra.points import root
 from filters.pages.equations import PagedModel
-from filters.pages.memory import NumbersMemory
-from filters.pages.page import Page
-from filters.pages.programs import together
+from filters.pages.kernels import together
+from filters.pages.page import NumbersMemory, Page
 from thruster_env.graphs.programs import Place
-from thruster_env.model.layout import number_places, starts_of
-from thruster_env.model.shape import Shape
+from thruster_env.model.shape import Shape, number_places, starts_of
 
 
 class Memory(NumbersMemory):
@@ -42,7 +40,7 @@ class Memory(NumbersMemory):
         super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, like=x), own)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
-        flying = (x, self.P) if page.begin is None else together(page.begin(model, x, self.P))
+        flying = (x, self.P) if page.represent is None else together(page.represent(model, x, self.P))
         started = page.started(model)
         self.begun, self.notes = n + n * n, m + m * m
         starts = starts_of(*(prod(one.shape) for one in flying))
@@ -69,7 +67,7 @@ class Memory(NumbersMemory):
             self.R: self.read("move", r, m, m, symmetric=True),
         }
         self.flying = [self.x, self.P]
-        if page.begin is not None:
+        if page.represent is not None:
             self.flying = [self._moving(*one) for one in zip(starts, flying, strict=False)]
         self.kept = {
             name: self._moving(at, one) for at, (name, one) in zip(of_kept, started.items(), strict=False)

@@ -14,20 +14,82 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.algebra.matrices import Matrix
-from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.operations import factor, inverse, only, present, quotient, uncorrelated, wrap
+from filters.algebra.samples import density, density_slope, dot, heavier, outlier_weight
+from filters.algebra.scalars import slopes_of
 from filters.differentiated.memory import Memory
-from filters.differentiated.scores import LIKELIHOOD, LOG_SCORE, SQUARES, Wanted, density_of, score_of_truth
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.equations import Equations
+from filters.pages.kernels import Stage, as_calls, as_programs, stage_of, with_kept
 from filters.pages.page import Page
-from filters.pages.programs import with_kept
-from filters.pages.stages import Stage, as_calls, as_programs, stage_of
 from filters.pages.traced import MOST
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.graphs.graphs import uncollected
 from thruster_env.graphs.programs import callable_of
-from thruster_env.model.layout import constants_reader, number_places, starts_of
-from thruster_env.model.shape import Functions, Shape, observation_slopes, transition_slopes
+from thruster_env.model.shape import (
+    Functions,
+    Shape,
+    constants_reader,
+    number_places,
+    observation_slopes,
+    starts_of,
+    transition_slopes,
+)
+
+# What is summed over a filter's steps, with its slopes: densities of innovations, or scores of true states.
+
+
+LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
+
+
+class Wanted(NamedTuple):
+    """What is worked out: a score, with its gradient, and what stands beside it."""
+
+    information: bool  # Fisher's
+    constants: bool  # slopes along the model's constants
+    tails: bool  # densities with more outliers than the normal one, and channels that are predicted only
+    score: str = LIKELIHOOD  # of the innovations; or of the true states, which are given then
+    own: bool = False  # slopes along the filter's own parameters
+
+    @property
+    def of_truth(self) -> bool:
+        """Whether the score is one of the true states."""
+        return self.score != LIKELIHOOD
+
+
+def density_of(
+    memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted
+) -> tuple[dict, dict]:
+    """The log density of an innovation, and of a parameter its slope, and what the information takes of both."""
+    seen, of = present(memory.z), factor(s)
+    w, e = quotient(v, of), inverse(of, seen)
+    level, weighted = density(v, of, seen), w
+    if wanted.tails:
+        q = dot(v, w)
+        level, weighted = level + heavier(q, seen, tail), w * outlier_weight(q, seen, tail)
+    dv, ds = slopes_of([v, s], moves)
+    slopes = {memory.slope: density_slope(w, weighted, e, dv, ds)}
+    if wanted.information:
+        m = memory.shape.m
+        slopes |= {memory.noted: dv, memory.noted + m: ds}
+        slopes |= {memory.weighed: e @ dv, memory.weighed + m: (e @ ds @ e) * 0.5}
+    return {memory.level: level}, slopes
+
+
+def score_of_truth(memory: Memory, off: Matrix, cov: Matrix, moves: dict, score: str) -> tuple[dict, dict]:
+    """A score of the estimate, given its error without the states that do not count, and its slope."""
+    if score == SQUARES:
+        weighted = memory.weights @ off
+        doff = slopes_of([off], moves)[0]
+        slope = None if doff is None else dot(weighted, doff) * -2.0
+        return {memory.level: dot(weighted, off) * -1.0}, {memory.slope: slope}
+    known = present(memory.truth)
+    s = uncorrelated(known, cov)
+    of = factor(s)
+    w = quotient(off, of)
+    slope = density_slope(w, w, inverse(of, known), *slopes_of([off, s], moves))
+    return {memory.level: density(off, of, known)}, {memory.slope: slope}
+
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
 
@@ -76,9 +138,9 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(one.length for one in made)
-    if page.start is None:
+    if page.initial is None:
         works[:0] = nothing, nothing
-    if page.begin is None:
+    if page.represent is None:
         works[2:2] = nothing, nothing
     run = CompiledOrPython(_accumulator(memory, works, wanted, page, at_once, fingerprint))
     return Recursion(run, at_once, length, memory.depth)
@@ -110,14 +172,17 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
         return found._replace(slopes=still | found.slopes | (slopes or {}))
 
     stages = []
-    if page.start is not None:
-        started = _by_place(memory, page.start(model))
+    if page.initial is not None:
+        started = _by_place(memory, page.initial(model))
         found = stage_of(started, started, moves)
         stages.append(found._replace(slopes={at: one * 0.0 for at, one in started.items()} | found.slopes))
-    model.kept = memory.kept
-    if page.begin is not None:
-        stages.append(moved(page.begin(model, x, p)))
-    stages += [moved(page.advance(model, *memory.flying, memory.u)), moved(page.settle(model, *memory.flying))]
+    model.extras = memory.kept
+    if page.represent is not None:
+        stages.append(moved(page.represent(model, x, p)))
+    stages += [
+        moved(page.propagate(model, *memory.flying, memory.u)),
+        moved(page.add_process_noise(model, *memory.flying)),
+    ]
     mean, cov, v, s, _, changed = with_kept(page.update(model, x, p, memory.z))
     if wanted.of_truth:
         known = present(memory.truth)
@@ -144,7 +209,7 @@ def _accumulator(
     start, start_slopes, begin, begin_slopes, advance, advance_slopes, settle, settle_slopes = works[:8]
     update, update_slopes = works[8:10]
     predicted, predicted_slopes = works[10:] or works[8:10]  # not called, if there are none
-    begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.begin is None else -1
+    begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.represent is None else -1
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information

@@ -8,15 +8,76 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.algebra.densities import tail_of
-from filters.differentiated.differentiable import differentiable
+from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
+from filters.algebra.samples import tail_of
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
+from filters.gaussian.extended import (
+    ExtendedKalmanFilter,
+    FadingMemoryFilter,
+    HInfinityFilter,
+    IteratedExtendedKalmanFilter,
+    SchmidtKalmanFilter,
+)
+from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter
+from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.threads import spread
 from thruster_env.model.state_space import StateSpaceModel
+
+# The filters that have derivatives: those with a page, but for a schedule of gains and the steady one.
+
+
+KINDS: tuple[type[PageFilter], ...] = (
+    KalmanFilter,
+    ExtendedKalmanFilter,
+    IteratedExtendedKalmanFilter,
+    UnscentedKalmanFilter,
+    CubatureKalmanFilter,
+    FadingMemoryFilter,
+    HInfinityFilter,
+    SchmidtKalmanFilter,
+    RobustExtendedKalmanFilter,
+    SageHusaFilter,
+    VariationalBayesFilter,
+)
+
+
+def has_derivatives(kind: type[Filter]) -> bool:
+    """Whether a class of filters has derivatives: one of `KINDS`, or a user's that has a page."""
+    return kind in KINDS or (not kind.__module__.startswith("filters.") and issubclass(kind, PageFilter))
+
+
+class Differentiable(NamedTuple):
+    """What derivatives are taken of."""
+
+    model: StateSpaceModel  # that the filter runs on
+    page: Page
+    own: tuple[float, ...]  # the filter's parameters
+
+
+def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differentiable:
+    """A filter with another model in place of its own; of None the extended Kalman filter.
+
+    Raises:
+        ValueError: for a filter without a page, or a value of its own that does not go with the model.
+    """
+    if filter_ is None:
+        return Differentiable(model, ExtendedKalmanFilter.page, ())
+    if not isinstance(filter_, Filter):
+        raise ValueError(f"filter must be an object that make_filter returns, but got {filter_!r}")
+    if not (isinstance(filter_, PageFilter) and has_derivatives(type(filter_))):
+        names = ", ".join(kind.name for kind in KINDS)
+        raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
+    if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:
+        raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
+    form = {"form": "covariance"} if filter_.forms else {}  # of the same estimates
+    used = replace(filter_, model=model, **form)
+    return Differentiable(used.kernel_model, used.written_page, used.own_parameters)
+
 
 STEP = 1e-6  # of parameters, of which 1 is a sensible change
 

@@ -1,11 +1,26 @@
-"""Beliefs, innovations, and the plain functions that a kind of filter is made of."""
+"""Beliefs: the values, their layout in memory, checks of arguments, and the restart of a diverged one.
+
+A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column per ensemble
+member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
+model's numbers, behind which a filter has its own, is laid out by `thruster_env.model.shape`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, lru_cache
+from math import inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
+
+from thruster_env.core.angles import angle_writer
+from thruster_env.core.checks import ROUNDING, as_floats, at_least, covariance, short_repr
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
+from thruster_env.model.shape import Shape, number_places, starts_of
+
+# Beliefs, innovations, and the plain functions that a kind of filter is made of.
 
 
 class Belief(NamedTuple):
@@ -54,7 +69,7 @@ class Innovation(NamedTuple):
 class Kernels(NamedTuple):
     """A kind of filter for one shape of model, as plain functions on its memory.
 
-    `row` is laid out by `filters.engine.layout`, `numbers` by `thruster_env.model.layout`; `table` is
+    `row` is laid out by `filters.engine.belief`, `numbers` by `thruster_env.model.shape`; `table` is
     (table_rows, padded size), its first n rows the members, without columns for filters without an ensemble;
     `draws` has room for `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first
     `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch`
@@ -82,3 +97,248 @@ class Kernels(NamedTuple):
     def kept_rows(self) -> int:
         """Rows of the table that belong to the belief."""
         return self.n + self.extra_kept_rows
+
+
+# Layout of the memory of a filter.
+
+
+class MemoryPlaces(NamedTuple):
+    """First places of the parts of a filter's row, for n states and m measurements."""
+
+    mean: int  # (n,)
+    cov: int  # (n, n)
+    key_0: int
+    key_1: int
+    step: int  # steps taken
+    divergences: int  # restarts after an estimate that was not finite
+    innovation: int  # (m,)
+    innovation_cov: int  # (m, m)
+    log_likelihood: int
+    gain: int  # (n, m), scratch
+    extras: int  # what a kind of filter keeps beside; the row ends with these
+
+
+@cache
+def memory_places(n: int, m: int) -> MemoryPlaces:
+    """Places in the row of a filter."""
+    return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
+
+
+def mean_writer(shape: Shape) -> Callable:
+    """Return `store(row, x)`: write the mean, its angles in (-pi, pi]."""
+    return angle_writer(memory_places(shape.n, shape.m).mean, shape.state_angles)
+
+
+@lru_cache(maxsize=64)
+def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
+    """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
+
+    Vectors are tuples, covariances tuples of rows. Angles in a mean are kept in (-pi, pi].
+
+    Returns:
+        `read(row)` of the mean (n,) and its covariance (n, n).
+        `write(row, value)` of the same.
+        `write(row, value)` of the innovation (m,) and its covariance (m, m).
+    """
+    n, m = shape.n, shape.m
+    places = memory_places(n, m)
+    return (
+        (vector_reader(n, places.mean), matrix_reader(n, n, places.cov)),
+        (mean_writer(shape), matrix_writer(n, n, places.cov)),
+        (vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)),
+    )
+
+
+def own_place(shape: Shape) -> int:
+    """Offset of the filter's own parameters in the packed row, behind those of its model."""
+    return number_places(shape.n, shape.m).constants + shape.constants
+
+
+# Checks of the arguments of filters: beliefs, keys, inputs and measurements.
+
+
+FEW = 4  # states, up to which a belief is looked at in Python
+
+
+def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
+    """Return value as float64 of the shape of `like`; raise ValueError for a wrong shape or infinite entries."""
+    try:
+        array = np.atleast_1d(as_floats(value))
+    except ValueError:
+        array = np.full(like.size + 1, np.nan)
+    wrong = np.isinf(array) if missing_allowed else ~np.isfinite(array)
+    if array.shape != like.shape or wrong.any():
+        rule = "finite or NaN" if missing_allowed else "finite"
+        count = f"{like.size} number{'' if like.size == 1 else 's'}"
+        raise ValueError(f"{name} must be {count}, each {rule}, but got {short_repr(value)}")
+    return array
+
+
+def checked_key(key) -> tuple[int, int]:
+    """Return a key as two integers; raise ValueError unless they are whole numbers below 2^32."""
+    if type(key) is tuple and len(key) == 2 and all(type(word) is int and 0 <= word < 2**32 for word in key):
+        return key
+    try:
+        words = [int(word) for word in as_floats(key)] if np.shape(key) == (2,) else []
+        if len(words) == 2 and words == list(key) and min(words) >= 0 and max(words) < 2**32:
+            return words[0], words[1]
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueError(f"key must be two whole numbers from 0 to 2^32 - 1, but got {short_repr(key)}")
+
+
+def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray:
+    """Return the actions of `count` envs as (count, size); raise ValueError unless they are numbers, none NaN.
+
+    Rows where `ignored` (count,) is true are not checked.
+    """
+    try:
+        array = as_floats(actions)
+    except ValueError:
+        array = np.empty(0)
+    whose = f"the {count} actions" if count > 1 else "an action"
+    numbers = f"{size} number{'' if size == 1 else 's'}"
+    if array.size != count * size:
+        raise ValueError(f"{whose} must be {numbers}{' each' * (count > 1)}, but got {short_repr(actions)}")
+    array = array.reshape(count, size)
+    if (np.isnan(array).any(axis=1) & ~np.asarray(ignored)).any():
+        raise ValueError(f"{whose} must be {numbers} and not NaN, but got {short_repr(actions)}")
+    return array
+
+
+def check_belief(belief: Belief, prior_variances: np.ndarray) -> None:
+    """Raise ValueError unless a belief's numbers are finite and its covariance is one, within rounding.
+
+    What filters leave of a covariance that is impossible is a part of its variances, or of the prior's (n,), which
+    they began with. A `LostBelief`, which declares that it is not finite, is accepted.
+    """
+    if _is_surely_one(belief, prior_variances):
+        return
+    at_least("step of a belief", belief.step, 0)
+    at_least("divergences of a belief", belief.divergences, 0)
+    if isinstance(belief, LostBelief):
+        return
+    # Particle filters keep log weights behind the members of their states; those, and extras, may be infinite.
+    finite = {"mean": belief.mean, "members": belief.members[: len(belief.mean)]}
+    for name, values in finite.items():
+        if not np.isfinite(as_floats(values)).all():
+            raise ValueError(f"{name} of a belief must be finite, but got {short_repr(values)}")
+    for name in ("members", "extras"):
+        if np.isnan(as_floats(getattr(belief, name))).any():
+            raise ValueError(f"{name} of a belief must not be NaN, but got {short_repr(getattr(belief, name))}")
+    covariance("cov of a belief", belief.cov, len(belief.mean), variances=prior_variances)
+
+
+def _is_surely_one(belief: Belief, prior_variances: np.ndarray) -> bool:
+    """Whether a belief passes all checks, by a quick look; if not, the thorough one says what is amiss.
+
+    P + r V = L L' with L real, where V has the variances or the prior's, and r is the tolerance: so no eigenvalue
+    of V^(-1/2) P V^(-1/2) is below -r.
+    """
+    mean, cov, members, extras = belief.mean, belief.cov, belief.members, belief.extras
+    if not all(type(one) is np.ndarray and one.dtype == np.float64 for one in (mean, cov, members, extras)):
+        return False
+    if type(belief.step) is not int or type(belief.divergences) is not int or min(belief[4:6]) < 0:
+        return False
+    n = len(mean)
+    if members.size:
+        if not np.abs(members[:n]).sum() < np.inf or np.isnan(members[n:]).any():
+            return False
+    if extras.size and np.isnan(extras).any():
+        return False
+    if n > FEW:
+        return _many(mean, cov, prior_variances)
+    return _few(mean.tolist(), cov.tolist(), prior_variances.tolist())
+
+
+def _few(mean: list[float], cov: list[list[float]], prior_variances: list[float]) -> bool:
+    """`_many` for a few states, for which NumPy's calls take longer than their arithmetic."""
+    if not isfinite(sum(mean)):
+        return False
+    root: list[list[float]] = []
+    for i, row in enumerate(cov):
+        new: list[float] = []
+        for j in range(i):
+            if row[j] != cov[j][i]:
+                return False
+            rest = row[j]
+            for k in range(j):
+                rest -= new[k] * root[j][k]
+            new.append(rest / root[j][j])
+        pivot = row[i] + ROUNDING * max(row[i], prior_variances[i])
+        if pivot == 0.0 and not any(row):  # of what is known exactly
+            pivot = 1.0
+        for one in new:
+            pivot -= one * one
+        if not (row[i] >= 0.0 and 0.0 < pivot < inf):
+            return False
+        new.append(sqrt(pivot))
+        root.append(new)
+    return True
+
+
+def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> bool:
+    """Whether a mean is finite and a covariance symmetric and positive semidefinite, by its Cholesky factor."""
+    variances = cov.diagonal()
+    if not np.abs(mean).sum() + np.abs(cov).sum() < np.inf or not (cov == cov.T).all() or variances.min() < 0:
+        return False
+    shifted, known = cov.copy(), ~cov.any(axis=1)  # what is known exactly has a variance of 0 and no covariance
+    shifted.ravel()[:: len(mean) + 1] += np.where(known, 1.0, ROUNDING * np.maximum(variances, prior_variances))
+    try:
+        np.linalg.cholesky(shifted)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+# Restart of a belief that has diverged (not finite, or with a negative variance): it becomes the prior.
+
+
+LARGEST = 1e300  # what the numbers of a belief may add up to
+
+
+@cache
+def row_magnitude(n: int, m: int) -> Callable:
+    """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation.
+
+    A negative variance, which rounding leaves of a covariance of very unequal numbers, counts as a number beyond
+    LARGEST, and so does NaN.
+    """
+    places = memory_places(n, m)
+    beyond = 10 * LARGEST
+    variances = [places.cov + i * (n + 1) for i in range(n)]
+    source = Source("magnitude", "row", work=places.gain)
+    if source.loops:
+        of_all = source.sum(f"abs(row[{i}])" for i in source.range(places.gain))
+        of_variances = source.sum(
+            f"(0.0 if row[{place}] >= 0.0 else {beyond})"
+            for place in (i * (n + 1) + places.cov for i in source.range(n))
+        )
+        return source.function(f"{of_all} + {of_variances}")
+    terms = [f"abs(row[{i}])" for i in range(places.gain) if i not in variances]
+    terms += [f"(row[{i}] if row[{i}] >= 0.0 else {beyond})" for i in variances]
+    return source.function(" + ".join(terms))
+
+
+@lru_cache(maxsize=64)
+def restart_if_lost(kernels: Kernels) -> Callable:
+    """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count."""
+    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
+    places, r_place = memory_places(n, m), number_places(n, m).r
+    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
+    divergences, magnitude = places.divergences, row_magnitude(n, m)
+
+    @inlined
+    def restart(memory, numbers, size):
+        row, _, _ = memory
+        if not magnitude(row) < LARGEST:
+            start(memory, numbers, size)
+            summarise(memory, size)
+            row[divergences] += 1.0
+            row[log_likelihood] = 0.0
+            for i in range(m):
+                row[innovation + i] = 0.0
+            for i in range(m * m):
+                row[s_place + i] = numbers[r_place + i]
+
+    return restart

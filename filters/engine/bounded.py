@@ -22,10 +22,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places
+from filters.engine.belief import Kernels, memory_places
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.core.truncated import truncated_normal
+from thruster_env.core.streams import truncated_normal
 from thruster_env.model.state_bounds import Bound
 
 TRUNCATION, PROJECTION = "truncation", "projection"
@@ -75,7 +74,7 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
         tell(memory[0])
 
     kept = kernels.extras + kernels.scratch + size
-    return kernels._replace(start=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
+    return kernels._replace(initial=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
 
 
 def constrained(

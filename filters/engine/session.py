@@ -1,4 +1,4 @@
-"""Sessions: a filter that runs in place on one belief, for wrappers and for the filter's pure functions."""
+"""Sessions: a filter that runs in place on one belief, and one that rejects measurements beyond a gate."""
 
 from __future__ import annotations
 
@@ -10,15 +10,25 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.ma import MaskedArray
 
-from filters.engine.belief import Belief, Innovation, LostBelief
-from filters.engine.checks import check_belief, checked_key, vector_like
+from filters.engine.belief import (
+    Belief,
+    Innovation,
+    LostBelief,
+    check_belief,
+    checked_key,
+    memory_places,
+    own_place,
+    vector_like,
+)
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation
-from filters.engine.layout import memory_places, own_place
 from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.core.direct import direct
 from thruster_env.logs.steps import sample_time_place
-from thruster_env.model.diffusion import same_dt
-from thruster_env.model.layout import number_places, with_root
+from thruster_env.model.continuous import same_dt
+from thruster_env.model.shape import number_places, with_root
+
+# Sessions: a filter that runs in place on one belief, for wrappers and for the filter's pure functions.
+
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -308,3 +318,56 @@ class Session:
         """A copy of the last update's innovation."""
         log_likelihood = float(self._row[self._places.log_likelihood])
         return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
+
+
+# Sessions that leave out measurements too far from what the filter expects.
+
+
+if TYPE_CHECKING:
+    from filters.filter import Filter
+
+
+class GatedSession(Session):
+    """A session whose steps leave out channels with |v_i| > gate sqrt(S_ii), as if they were missing.
+
+    Attributes:
+        rejected: how often each channel was left out so far, (m,).
+
+    Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, 3.6.
+    """
+
+    def __init__(self, filter_: Filter, gate: float):
+        """Allocate the memory of a filter; `gate` is in standard deviations."""
+        super().__init__(filter_)
+        self.gate = positive("gate", gate)
+        if not filter_.has_covariance:
+            raise ValueError(f"a gate needs a filter with a covariance, but {filter_.name!r} has none")
+        self.rejected = np.zeros(len(self.innovation), dtype=int)
+        self._kept = tuple(part.copy() for part in self._memory)
+
+    def step(self, u, z) -> None:
+        """Predict with input u (p,), then update with the channels of z (m,) that are within the gate."""
+        self._set(u, z)
+        self.divergences = self._operate(*self._given, PREDICT)
+        for kept, part in zip(self._kept, self._memory, strict=True):
+            kept[...] = part
+        self.divergences = self._operate(*self._given, UPDATE)
+        far = np.abs(self.innovation) > self.gate * np.sqrt(self.innovation_cov.diagonal())
+        if far.any():
+            for kept, part in zip(self._kept, self._memory, strict=True):
+                part[...] = kept
+            self._z[far] = np.nan
+            self.rejected += far
+            self.divergences = self._operate(*self._given, UPDATE)
+
+    def __getstate__(self) -> tuple:
+        """The state of a session, the gate, and the counts."""
+        return super().__getstate__(), self.gate, self.rejected
+
+    def __setstate__(self, state: tuple) -> None:
+        """Continue from the belief."""
+        of_session, gate, rejected = state
+        filter_, divergences, arrays = of_session
+        GatedSession.__init__(self, filter_, gate)
+        self._go_on(divergences, arrays)
+        self.rejected[:] = rejected

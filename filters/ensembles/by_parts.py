@@ -1,24 +1,189 @@
-"""Analyses by parts: of each state with the channels near it, or of each channel in turn with the states near it.
+"""Analyses in parts: each state with the channels near it, or one channel after the other.
 
-The page of such a filter says how members move, and what they expect; its own update moves none.
+The table has a row for each state, and behind these one for each channel with independent noise of variance 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import NormalDist
 from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Kernels
-from filters.ensembles.deterministic import DeterministicUpdateFilter
-from filters.ensembles.localised import LocalisedFilter
-from filters.ensembles.parts import kernels_by_parts
-from filters.ensembles.rotation import with_rotation
-from filters.ensembles.steps import compare
+from filters.algebra.blocks import forward_quotient
+from filters.algebra.matrices import given
+from filters.algebra.members import mean
+from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.points import root
+from filters.engine.belief import Kernels, memory_places, own_place
+from filters.ensembles.ensemble import compare, expect
+from filters.ensembles.stochastic import DeterministicUpdateFilter, LocalisedFilter, with_rotation
+from filters.pages.kernels import Stage, stored
+from filters.pages.members import MembersMemory, kept_size, members_kernels, works_of
 from filters.pages.page import Page
+from thruster_env.core.compiled import inlined
+from thruster_env.graphs.programs import Place
+from thruster_env.model.shape import Functions, Shape
+
+# Rows of the table of an ensemble, a state's or a channel's numbers of all members: moments, and their spread.
+
+
+@inlined
+def row_moments(table, i, size):
+    """Mean and sample variance of a row of the members."""
+    mean, squares = 0.0, 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(size):
+        squares += (table[i, j] - mean) ** 2
+    return mean, squares / (size - 1)
+
+
+@inlined
+def stretch_row(table, i, factor, size):
+    """A row's distances from its mean, times a factor."""
+    mean = 0.0
+    for j in range(size):
+        mean += table[i, j] / size
+    for j in range(table.shape[1]):
+        table[i, j] = mean + factor * (table[i, j] - mean)
+
+
+@inlined
+def relax_row(table, i, before, part, size):
+    """Give back a part of what the standard deviation of a row has lost, of its variance before an update."""
+    _, after = row_moments(table, i, size)
+    if after > 0.0:
+        stretch_row(table, i, 1.0 + part * ((before / after) ** 0.5 - 1.0), size)
+
+
+# Analyses by parts, as loops over the table: of each state by itself, or of one channel after the other.
+
+
+@inlined
+def transform_state(table, i, n, v, z, taper, size):
+    """The transform filter for state i, with R of a channel over its taper."""
+    inner, along, near = np.zeros((size, size)), np.zeros(size), False
+    for k in range(len(v)):
+        if taper[k] > 0.0 and z[k] == z[k]:
+            near = True
+            for j in range(size):
+                along[j] += taper[k] * table[n + k, j] * v[k]
+                for other in range(size):
+                    inner[j, other] += taper[k] * table[n + k, j] * table[n + k, other]
+    mean, _ = row_moments(table, i, size)
+    total = mean
+    for j in range(size):
+        inner[j, j] += size - 1.0
+        total += inner[j, j]
+    if not near:
+        return
+    if not abs(total) < np.inf:  # a belief that is lost
+        table[i, :] = np.nan
+        return
+    values, vectors = np.linalg.eigh(inner)
+    moved = np.full(size, mean)
+    for one in range(size):
+        state, w = 0.0, 0.0
+        for j in range(size):
+            state += vectors[j, one] * (table[i, j] - mean)
+            w += vectors[j, one] * along[j]
+        for j in range(size):
+            moved[j] += state * (w / values[one] + ((size - 1.0) / values[one]) ** 0.5 * vectors[j, one])
+    for j in range(size):
+        table[i, j] = moved[j]
+
+
+@inlined
+def gaussian_moves(y, v, tail, moves, size):
+    """How a channel's y (N,), of variance 1 in R, moves to a measurement v as the adjustment filter has it."""
+    squares = 0.0
+    for j in range(size):
+        squares += y[j] ** 2
+    gain, shrink = squares / (size - 1.0 + squares), ((size - 1.0) / (size - 1.0 + squares)) ** 0.5 - 1.0
+    for j in range(size):
+        moves[j] = gain * v + shrink * y[j]
+
+
+@inlined
+def regress(table, n, y, moves, taper, size):
+    """States moved by their regression on a channel, whose y moves."""
+    squares = 0.0
+    for j in range(size):
+        squares += y[j] ** 2
+    for i in range(n):
+        if taper[i] > 0.0 and squares > 0.0:
+            mean, _ = row_moments(table, i, size)
+            slope = 0.0
+            for j in range(size):
+                slope += (table[i, j] - mean) * y[j]
+            for j in range(size):
+                table[i, j] += slope * taper[i] / squares * moves[j]
+
+
+def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
+    """M^-1 (y - mean(y)) of members and M^-1 (z - mean(y)), with M M' = R: channels with independent noise."""
+    seen, n, m = present(memory.z), memory.shape.n, memory.shape.m
+    y, M = expect(model, memory.x, memory.z), root(uncorrelated(seen, model.R))
+    v = only(seen, wrap(memory.z - mean(y), model.measurement_angles))
+    rows = given(Place("table", n), (m,), member=True, like=memory.x)
+    place = memory.read("rows", scratch_place(page, memory.shape), m)
+    return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, place))}
+
+
+def scratch_place(page: Page, shape: Shape) -> int:
+    """The first place of a filter's row behind what a page keeps."""
+    return memory_places(shape.n, shape.m).extras + kept_size(page, shape)
+
+
+@lru_cache(maxsize=64)
+def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: Callable | None) -> Kernels:
+    """Kernels of a page whose `model.own` has a taper (n, m) of states and channels, relaxation, and a tail.
+
+    The update goes through channels, each of which moves by `moves_of(y, v, tail, moves, size)`; through states if
+    that is None.
+    """
+    plain, n, m = members_kernels(page, functions, shape), shape.n, shape.m
+    look, rows, _ = works_of(page, functions, shape, with_unit_noise, n + m)["update"]
+    tell, summarise, first = plain.update, plain.summarise, scratch_place(page, shape)
+    serial, move = moves_of is not None, gaussian_moves if moves_of is None else moves_of
+    places = page.places(own_place(shape))
+    taper, relaxation, tail = places["taper"], places["relaxation"], places["tail"]
+
+    @inlined
+    def update(memory, z, numbers, size):
+        tell(memory, z, numbers, size)
+        row, table, draws = memory
+        tapers = numbers[taper : taper + n * m].reshape((n, m))
+        v, moves, before = row[first : first + m], np.empty(size), np.empty(n)
+        if numbers[relaxation] > 0.0:
+            for i in range(n):
+                _, before[i] = row_moments(table, i, size)
+        look(row, z, numbers, table, draws, size)
+        if serial:
+            for k in range(m):
+                if z[k] == z[k]:
+                    if k > 0:
+                        look(row, z, numbers, table, draws, size)
+                    y = table[n + k, :size]
+                    move(y, v[k], numbers[tail], moves, size)
+                    regress(table, n, y, moves, tapers[:, k], size)
+        else:
+            for i in range(n):
+                transform_state(table, i, n, v, z, tapers[i], size)
+        if numbers[relaxation] > 0.0:
+            for i in range(n):
+                relax_row(table, i, before[i], numbers[relaxation], size)
+        summarise(memory, size)
+
+    return plain._replace(update=update, table_rows=max(plain.table_rows, rows), scratch=m)
+
+
+# Analyses by parts: of each state with the channels near it, or of each channel in turn with the states near it.
+
 
 LEAST = 1e-3  # tapers below are zero
 

@@ -1,20 +1,228 @@
-"""The class of all ensemble filters: their page, and what controls the spread of the members."""
+"""The base of all ensemble filters: propagation of the members, inflation and its adaptation.
+
+Each takes a function of a page and returns one that does more.
+
+    predict: x_j = mean + t^1/2 (x_j - mean) at the end of the step
+    update:  t = max(1, t + u), u the mode of  (1 + g u) exp(-u^2/(2 deviation^2)),
+             g = d log N(v; 0, (t'/t) A + R)/dt' at t' = t,  A = S - R the forecast's own part of S
+
+One factor t is kept in the belief; it begins at 1. Before each update it is normal with a standard
+deviation that does not shrink, so that it can follow a model whose errors change; its likelihood is linear about
+the last value. An error of the model which is not in Q widens the innovations, and so the ensemble.
+
+With a factor for each state, t_i is that of state i, and its likelihood is that of all channels while it alone
+moves:
+
+    g_i = d log N(v; 0, D A D + R)/dt' at t' = t_i,  D_kk = (1 + c_ik (t'^1/2 - 1))/(1 + c_ik (t_i^1/2 - 1)),
+    c_ik = taper of i and k times |correlation of x_i and y_k| in the forecast
+
+so that of a single state it is the same, if h is linear.
+
+With an inverse gamma prior, p(t') ~ t'^-(a+1) exp(-(a+1) t/t'), whose mode is t, the standard deviation follows
+the measurements, too. It is kept in the belief as the width p = 1/(a+1), behind the factors:
+
+    (deviation/t)^2 = p/((1 - 2p)^2 (1 - 3p)),  p at first that of `adaptive_inflation`, later between it and
+                      that of `least_deviation`
+    update:  t+ = t (1 + e), the mode of (1 + g (t' - t)) p(t');  p+ = p/(1 - 2d + d^2/p),  d = 1 - t/t+,
+             the inverse gamma density with the posterior's mode and its curvature there;  t = max(1, t+)
+
+Sources: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters", for
+one factor; the linear likelihood and factors of states are those of Anderson (2009), "Spatially and temporally
+varying adaptive covariance inflation for ensemble filters", here of all channels at once. The inverse gamma prior:
+El Gharamti (2018), "Enhanced adaptive inflation algorithm for ensemble filters", Monthly Weather Review 146, which
+finds the new deviation from a second point of the posterior instead of its curvature.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from filters.algebra.members import correlations, covariance, mean, on_branch, stretches, variances
+from filters.algebra.operations import divide, factor, inverse, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import outer
+from filters.algebra.samples import dot, log_density
+from filters.algebra.scalars import at_least as at_least_number
+from filters.algebra.scalars import choose, constant, diagonal, exceeds
 from filters.engine.belief import Belief, Kernels
-from filters.ensembles.adaptive import adapted
-from filters.ensembles.inflation import inflated, relaxed
-from filters.ensembles.spread import checked, limits
 from filters.pages.members import members_kernels
-from filters.pages.page_filter import FilterWithPage, Page
-from thruster_env.core.checks import at_least
+from filters.pages.page import Page
+from filters.pages.page_filter import FilterWithPage
+from thruster_env.core.checks import at_least, positive, short_repr, switch
+
+# What controls an ensemble's spread: rules of the parameters, and the prior of factors that adapt.
+
+
+def checked(filter_: Any) -> dict[str, float]:
+    """The parameters of a filter as numbers; raise ValueError that states the rule and the value."""
+    inflation, relaxation = filter_.inflation, positive("relaxation", filter_.relaxation, zero_allowed=True)
+    if relaxation > 1.0:
+        raise ValueError(f"relaxation must be at most 1, but got {short_repr(filter_.relaxation)}")
+    first = positive("adaptive_inflation", filter_.adaptive_inflation, zero_allowed=True)
+    if switch("inflation_by_state", filter_.inflation_by_state) and not first:
+        raise ValueError("adaptive_inflation of a filter with inflation_by_state must be positive, but got 0")
+    least = positive("least_deviation", filter_.least_deviation, zero_allowed=True)
+    if least > first:
+        rule = f"least_deviation must be at most adaptive_inflation, {first:g}"
+        raise ValueError(f"{rule}, but got {short_repr(filter_.least_deviation)}")
+    known = {"adaptive_inflation": first, "least_deviation": least}
+    return {"inflation": positive("inflation", inflation), "relaxation": relaxation, **known}
+
+
+def limits(first: float, least: float) -> Mapping[str, float]:
+    """What pages read: the deviation of a factor, or the widest and narrowest width; nothing without a factor."""
+    if not first:
+        return {}
+    return {"widest": width_of(first), "narrowest": width_of(least)} if least else {"deviation": first}
+
+
+def width_of(deviation: float) -> float:
+    """The width p of an inverse gamma density, below 1/3, with a standard deviation over its mode."""
+
+    def excess(root):
+        p = root * root
+        return root - deviation * (1.0 - 2.0 * p) * max(1.0 - 3.0 * p, 0.0) ** 0.5
+
+    from scipy.optimize import brentq  # loads half of SciPy, for this line
+
+    return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # of the root, so that small ones are exact, too
+
+
+# Control of an ensemble's spread: inflation by a factor a step, and relaxation to the spread before an update.
+
+
+@cache
+def inflated(settle: Callable) -> Callable:
+    """The end of a step, then x = mean + inflation (x - mean)."""
+
+    def settle_inflated(model, x, w):
+        x = settle(model, x, w)
+        return mean(x) + (x - mean(x)) * model.own.inflation
+
+    return settle_inflated
+
+
+@cache
+def relaxed(update: Callable) -> Callable:
+    """An update, then x = mean + (1 + relaxation (b - a)/a) (x - mean), by components.
+
+    b and a are the sample standard deviations before and after the update. Where a component has no spread after
+    it, it keeps none. The means stay.
+    """
+
+    def update_relaxed(model, x, z, e):
+        after, *told = update(model, x, z, e)
+        factors = stretches(variances(x), variances(after), model.own.relaxation)
+        return mean(after) + (after - mean(after)) * factors, *told
+
+    return update_relaxed
+
+
+# What the pages of ensemble filters share: motion, and what a measurement says of the members.
+
+
+def propagate(model, x, u):
+    """One of the model's substeps."""
+    return model.f(x, u)
+
+
+def add_process_noise(model, x, w):
+    """The end of a step."""
+    return on_branch(x + model.Q_root @ w, model.state_angles)
+
+
+def expect(model, x, z):
+    """What a member expects to be measured; zero in channels that are NaN in z."""
+    return on_branch(only(present(z), model.h(x)), model.measurement_angles)
+
+
+def compare(model, x, z):
+    """A member's y less their mean, cov(x, y), innovation v, S, R, log N(v; 0, S).
+
+    Covariances are tapered where a filter has tapers between channels.
+    """
+    seen, y = present(z), expect(model, x, z)
+    R = uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - mean(y), model.measurement_angles))
+    C, A = covariance(x, y), covariance(y, y)
+    if hasattr(model.own, "between"):
+        C, A = C * model.own.taper, sym(A * model.own.between)
+    S = A + R
+    return y - mean(y), C, v, S, R, log_density(v, S, seen)
+
+
+# Inflation that adapts to the innovations: a function of an ensemble's page that returns one that does more.
+
+
+def slopes(model, x, z, v, S):
+    """Return g, or each g_i, of members x before the update, by 1/2 tr((w w' - S^-1) dA/dt'), w = S^-1 v."""
+    seen, w, ones, t = present(z), divide(v, S), constant(1.0, v), model.extras["factor"]
+    A = S - uncorrelated(seen, model.R)
+    # Sums of the rows of M o A, M = w w' - S^-1, for 1/2 tr(M (E A + A E)) of a diagonal E is their sum by E.
+    scores = ((outer(w, w) - inverse(factor(S), seen)) * A) @ ones
+    if not np.shape(t):
+        return dot(scores, ones) / (2.0 * t)
+    c, root = abs(correlations(x, expect(model, x, z))), t**0.5
+    if hasattr(model.own, "taper"):
+        c = c * model.own.taper
+    return ((c / (1.0 + diagonal(root - 1.0) @ c)) @ scores) / (2.0 * root)  # E = dD/dt' where D = I
+
+
+def moved(t, g, deviation):
+    """The mode of the normal prior times the likelihood, at least 1."""
+    # A root of u^2 + u/g - deviation^2, the larger one where g is positive, else the smaller; 1 where g is NaN.
+    product = 2.0 * g * (deviation * deviation)
+    return at_least_number(t + product / (1.0 + (1.0 + 2.0 * g * product) ** 0.5), 1.0)
+
+
+def relative_move(h, p):
+    """Return e where the mode is 1 + e of (1 + h e) times an inverse gamma density of mode 1 and width p."""
+    # The root with the sign of h of (1 - p) h e^2 + (1 - 2 p h) e - p h.
+    along = 1.0 - 2.0 * p * h
+    return 2.0 * p * h / (along + (along * along + 4.0 * p * (1.0 - p) * h * h) ** 0.5)
+
+
+def moved_with_width(t, p, g, narrowest, widest):
+    """The same of an inverse gamma prior, and its width; 1 and the widest where the likelihood is no number."""
+    e = relative_move(t * g, p)  # what follows compares NaN as false
+    d = e / (1.0 + e)
+    p = p / (1.0 - 2.0 * d + d * d / p)
+    p = choose(exceeds(widest - p, 0.0), p, widest)
+    return at_least_number(t * (1.0 + e), 1.0), choose(exceeds(p - narrowest, 0.0), p, narrowest)
+
+
+@cache
+def adapted(page: Page) -> Page:
+    """A page with a factor for each number of `model.own.deviation`, or of the `widest` width."""
+
+    def start(model):
+        own = model.own
+        if hasattr(own, "widest"):
+            return {"factor": constant(1.0, own.widest), "width": own.widest}
+        return {"factor": constant(1.0, own.deviation)}
+
+    def settle(model, x, w):
+        x = page.add_process_noise(model, x, w)
+        return mean(x) + (x - mean(x)) * model.extras["factor"] ** 0.5
+
+    def update(model, x, z, e):
+        after, v, S, level = page.update(model, x, z, e)
+        t, own = model.extras["factor"], model.own
+        g = slopes(model, x, z, v, S)
+        if not hasattr(own, "widest"):
+            return after, v, S, level, {"factor": moved(t, g, own.deviation)}
+        t, p = moved_with_width(t, model.extras["width"], g, own.narrowest, own.widest)
+        return after, v, S, level, {"factor": t, "width": p}
+
+    return page._replace(initial=start, add_process_noise=settle, update=update)
+
+
+# The class of all ensemble filters: their page, and what controls the spread of the members.
+
 
 LARGEST_ENSEMBLE = 1_000_000
 OF_THE_ENGINE = frozenset(  # parameters that no page reads
@@ -40,7 +248,7 @@ class EnsembleFilter(FilterWithPage):
         relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is given back.
         adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast that
             is learnt from the innovations and never below 1, in steps of any length; 0 for none. See
-            `filters.ensembles.adaptive`.
+            `filters.ensembles.ensemble`.
         inflation_by_state: 1 if adaptive_inflation learns a factor for each state, 0 if it is one for all.
         least_deviation: if positive, the factor's prior is an inverse gamma density, and adaptive_inflation is its
             first standard deviation, which measurements change and never take below this; both over the factor.
@@ -92,7 +300,7 @@ class EnsembleFilter(FilterWithPage):
         """The page, with inflation, relaxation, or both, and adaptive inflation if it is chosen."""
         page = self.plain_page
         if inflation:
-            page = page._replace(settle=inflated(page.settle))
+            page = page._replace(add_process_noise=inflated(page.add_process_noise))
         if relaxation:
             page = page._replace(update=relaxed(page.update))
         return adapted(page) if self.adaptive_inflation else page
@@ -104,3 +312,21 @@ class EnsembleFilter(FilterWithPage):
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+
+
+# Ensembles whose update is more than their page: where there is only that, they are refused.
+
+
+def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
+    """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
+    if getattr(filter_, "rotations", 0):
+        raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
+    if filter_.by_parts:
+        rule = f"an ensemble {where} must have a page for its whole update, as 'etkf' has"
+        raise ValueError(f"{rule}, but got {named(filter_)}")
+
+
+def named(filter_: EnsembleFilter) -> str:
+    """The name of a filter, with what makes its update more than its page."""
+    chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "window"))
+    return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)

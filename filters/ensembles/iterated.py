@@ -1,19 +1,265 @@
-"""The iterated ensemble Kalman filter: the measurement function linearised where the members come to lie."""
+"""The iterated ensemble Kalman filter and its smoother over a window of steps.
+
+    window   x_0j the members L steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
+    motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... L, so that y_j = h(x_Lj) is a function of all these
+    update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_L)
+
+Each iteration runs the motion again from where the window then starts; each step keeps the model's constants, such
+as dt. The next step moves x_0 by the first step of the window, drops that, and adds noise of its own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cache, lru_cache
+from typing import ClassVar, NamedTuple
 
 from filters.algebra.geometric import geometric_mean
-from filters.algebra.members import covariance
-from filters.algebra.operations import divide
-from filters.engine.belief import Kernels
-from filters.ensembles.ensemble import EnsembleFilter
-from filters.ensembles.steps import advance, compare, expect, settle
-from filters.ensembles.window import seen_anew, window_kernels
-from filters.pages.page_filter import Page
+from filters.algebra.matrices import given
+from filters.algebra.members import covariance, mean, on_branch
+from filters.algebra.operations import divide, only, present, wrap
+from filters.engine.belief import Kernels, memory_places, own_place
+from filters.ensembles.by_parts import relax_row, row_moments, stretch_row
+from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
+from filters.pages.kernels import Stage, stored
+from filters.pages.members import MembersMemory, stages_of, works_of
+from filters.pages.page import Page
 from thruster_env.core.checks import at_least
+from thruster_env.core.compiled import inlined
+from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.graphs.programs import Place
+from thruster_env.model.shape import Functions, Shape, number_places
+
+# The iterated ensemble filter over a window of steps, whose start and process noise it estimates again.
+
+
+def seen_anew(model, y, z, Y, v, S, R):
+    """Slopes Y T^-1 and innovation z - mean(y) + Y w of members y that the last Y, v and S have moved."""
+    E = covariance(y, Y)
+    D = divide(E, R + geometric_mean(R, S))
+    moved = divide(E + D @ (S - R), S) @ v
+    v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + moved
+    return y - mean(y) + D @ Y, v
+
+
+def pull(Y, v, S, R):
+    """S^-1 v - (S + R # S)^-1 Y: what is correlated with Y moves by its covariance times this."""
+    return divide(v, S) - divide(Y, S + geometric_mean(R, S))
+
+
+class WindowPlaces(NamedTuple):
+    """Where the window lies: rows of the table, then places of the belief's row."""
+
+    window: int  # x_0, then the noise, n rows for each step
+    moved: int  # the same in an iteration, scratch
+    slopes: int  # Y, m rows
+    pull: int  # m rows
+    scratch: int  # of programs
+    steps: int  # how many steps the window has so far
+    inputs: int  # of these steps, and behind each its constants
+    numbers: int  # those of a step, scratch
+    innovation: int  # v of an iteration, scratch
+    innovation_cov: int  # S of an iteration
+
+
+def window_places(shape: Shape, length: int) -> WindowPlaces:
+    """Places for a window of `length` steps."""
+    n, m, rows = shape.n, shape.m, shape.n * (length + 1)
+    moved, first = n + rows, memory_places(n, m).extras
+    slopes, v = moved + rows, first + 1 + length * (shape.inputs + shape.constants)
+    return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v + m + m * m, v, v + m)
+
+
+@cache
+def window_stages(length: int) -> Callable:
+    """Return `stages(page, memory, model)`: motion and moments of a page, the first look at z, and later ones."""
+
+    def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
+        m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
+        row = memory_places(memory.shape.n, m)
+        Y, B = (given(Place("table", at), (m,), member=True, like=memory.x) for at in (places.slopes, places.pull))
+        v = memory.read("rows", places.innovation, m)
+        S = memory.read("rows", places.innovation_cov, m, m, symmetric=True)
+        first, _, first_v, first_S, R, level = compare(model, memory.x, z)
+        later, later_v = seen_anew(model, expect(model, memory.x, z), z, Y, v, S, R)
+        later_S = covariance(later, later) + R
+        told = row.innovation, row.innovation_cov, row.log_likelihood
+        plain = stages_of(page, memory, model)
+        noise = given(Place("table", places.moved), (memory.shape.n,), member=True, like=memory.x)
+        return {
+            **{name: plain[name] for name in ("start", "advance", "summarise")},
+            "draw": stored((model.Q_root @ memory.w,), (noise,)),
+            "settle": stored((on_branch(memory.x + memory.w, model.state_angles),), (memory.x,)),
+            "update": stored(
+                (first, pull(first, first_v, first_S, R), first_v, first_S, first_v, first_S, level),
+                (Y, B, v, S, *told),
+            ),
+            "again": stored((later, pull(later, later_v, later_S, R), later_v, later_S), (Y, B, v, S)),
+        }
+
+    return stages
+
+
+@inlined
+def copy_rows(table, source, target, count):
+    """Rows target ... become rows source ..., the first ones first."""
+    for i in range(count):
+        for j in range(table.shape[1]):
+            table[target + i, j] = table[source + i, j]
+
+
+@inlined
+def pull_row(table, source, target, slopes, pulls, count, size):
+    """Row target becomes row source + its covariance with `count` rows of slopes times rows of pulls."""
+    mean = 0.0
+    for j in range(size):
+        mean += table[source, j] / size
+    for j in range(table.shape[1]):
+        table[target, j] = table[source, j]
+    for k in range(count):
+        slope = 0.0
+        for j in range(size):
+            slope += (table[source, j] - mean) * table[slopes + k, j]
+        slope /= size - 1.0
+        for j in range(table.shape[1]):
+            table[target, j] += slope * table[pulls + k, j]
+
+
+@lru_cache(maxsize=64)
+def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, iterations: int) -> Kernels:
+    """Kernels of a window of `length` steps; the page's `model.own` has inflation and relaxation.
+
+    Both are of all that is estimated, (x_0, w_1 ... w_lag): each prediction stretches it, each update relaxes it.
+    """
+    n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, length)
+    works = works_of(page, functions, shape, window_stages(length), at.scratch)
+    begin, propagate, draw, add_process_noise, moments_of, look, again = (
+        works[name].work for name in ("start", "advance", "draw", "settle", "summarise", "update", "again")
+    )
+    row_places, substeps = memory_places(n, m), number_places(n, m).substeps
+    step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
+    own = page.places(own_place(shape))
+    inflation, relaxation, rows = own["inflation"], own["relaxation"], n * (length + 1)
+    window, moved, slopes, pulls, _, steps, inputs, then_place, _, _ = at
+    constants, constants_place = shape.constants, number_places(n, m).constants
+    count, size_of_step = own_place(shape) + page.own_size, p + shape.constants
+
+    @inlined
+    def start(memory, numbers, size):
+        row, table, draws = memory
+        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PRIOR, row[key_0], row[key_1])
+        begin(row, numbers, numbers, table, draws, size)
+        for k in range(1 + length * size_of_step):
+            row[steps + k] = 0.0
+        copy_rows(table, 0, window, n)
+        for i in range(window + n, window + rows):
+            for j in range(table.shape[1]):
+                table[i, j] = 0.0
+
+    @inlined
+    def move(memory, source, k, numbers, size):
+        """The members by step k of the window, whose start is in rows source ..., its noise behind."""
+        row, table, draws = memory
+        first, then, width = inputs + k * size_of_step, row[then_place : then_place + count], table.shape[1]
+        u = row[first : first + p]
+        for i in range(count):
+            then[i] = numbers[i]
+        for i in range(constants):
+            then[constants_place + i] = row[first + p + i]
+        for i in range(n):
+            for j in range(width):
+                draws[i * width + j] = table[source + (k + 1) * n + i, j]
+        for _ in range(int(numbers[substeps])):
+            propagate(row, u, then, table, draws, size)
+        add_process_noise(row, u, then, table, draws, size)
+
+    @inlined
+    def run_window(memory, source, numbers, size):
+        """The members from the start of the window on."""
+        row, table, _ = memory
+        copy_rows(table, source, 0, n)
+        for k in range(int(row[steps])):
+            move(memory, source, k, numbers, size)
+
+    @inlined
+    def drop(memory):
+        """Leave out the first step of the window."""
+        row, table, _ = memory
+        copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
+        for k in range((length - 1) * size_of_step):
+            row[inputs + k] = row[inputs + size_of_step + k]
+        row[steps] -= 1.0
+
+    @inlined
+    def admit(memory, u, numbers, size):
+        """A step more, whose noise is in rows moved ...; then inflation."""
+        row, table, _ = memory
+        k = int(row[steps])
+        first = inputs + k * size_of_step
+        for i in range(p):
+            row[first + i] = u[i]
+        for i in range(constants):
+            row[first + p + i] = numbers[constants_place + i]
+        copy_rows(table, moved, window + (k + 1) * n, n)
+        row[steps] += 1.0
+        if numbers[inflation] != 1.0:
+            for i in range(window, window + rows):
+                stretch_row(table, i, numbers[inflation], size)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        row[step_place] += 1.0
+        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PROCESS, row[key_0], row[key_1])
+        draw(row, u, numbers, table, draws, size)
+        full, k = row[steps] == length, 0
+        if not full:
+            admit(memory, u, numbers, size)
+        copy_rows(table, window, 0, n)
+        while k < row[steps]:
+            move(memory, window, k, numbers, size)
+            k += 1
+            if full:  # the window starts there from now on
+                full, k = False, 0
+                copy_rows(table, 0, window, n)
+                drop(memory)
+                admit(memory, u, numbers, size)
+                copy_rows(table, window, 0, n)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, draws = memory
+        look(row, z, numbers, table, draws, size)
+        seen = False
+        for k in range(m):
+            seen = seen or z[k] == z[k]
+        if seen:
+            for iteration in range(1, iterations + 1):
+                for i in range(rows):
+                    pull_row(table, window + i, moved + i, slopes, pulls, m, size)
+                    if iteration == iterations and numbers[relaxation] > 0.0:
+                        _, before = row_moments(table, window + i, size)
+                        relax_row(table, moved + i, before, numbers[relaxation], size)
+                run_window(memory, moved, numbers, size)
+                if iteration < iterations:
+                    again(row, z, numbers, table, draws, size)
+            copy_rows(table, moved, window, rows)
+        moments_of(row, row, row, table, draws, size)
+
+    @inlined
+    def summarise(memory, size):
+        row, table, draws = memory
+        moments_of(row, row, row, table, draws, size)
+
+    used = max(at.scratch, *(work.rows for work in works.values()))
+    scratch = m + m * m + count
+    sizes = 1 + length * size_of_step, rows, scratch  # of what is kept of the row and of the table, and scratch
+    return Kernels(n, m, used, max(n, m), start, predict, update, summarise, *sizes)
+
+
+# The iterated ensemble Kalman filter: the measurement function linearised where the members come to lie.
+
 
 MOST_ITERATIONS = 20  # that are written out
 LONGEST_WINDOW = 1000  # steps
@@ -75,7 +321,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     """
 
     name: ClassVar[str] = "ienkf"
-    page: ClassVar[Page] = Page(advance, settle, update)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 3
     window: int = 0

@@ -1,19 +1,83 @@
-"""The stochastic ensemble Kalman filter: each member is drawn to a measurement with noise of its own."""
+"""The stochastic and the deterministic ensemble Kalman filter, and their localisation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cache, lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
 
 from filters.algebra.members import centred
 from filters.algebra.operations import divide
-from filters.ensembles.localised import LocalisedFilter
-from filters.ensembles.steps import advance, compare, settle
-from filters.pages.page_filter import Page
-from thruster_env.core.checks import switch
+from filters.engine.belief import Kernels, memory_places
+from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
+from filters.pages.page import Page
+from thruster_env.core.checks import positive, switch
+from thruster_env.core.compiled import inlined
+from thruster_env.core.streams import FILTER_ROTATION, fill_normals
+
+# Localisation of ensembles: what lies far apart is not correlated, so that few members do for many states.
 
 
-def update(model, x, z, e):
+SUPPORT = (10.0 / 3.0) ** 0.5  # of a taper over its radius: half of what it reaches over
+
+
+def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
+    """A taper of distances: nearly exp(-(distance/radius)^2/2), by up to 0.034 more, and 0 from 3.66 radii on.
+
+    With r = distance/(radius (10/3)^1/2) it is 1 - 5/3 r^2 + 5/8 r^3 + r^4/2 - r^5/4 up to r = 1 and r^5/12 -
+    r^4/2 + 5/8 r^3 + 5/3 r^2 - 5 r + 4 - 2/(3 r) up to 2: a correlation in up to three dimensions.
+
+    Source: Gaspari, Cohn (1999), "Construction of correlation functions in two and three dimensions", (4.10).
+    """
+    r = np.asarray(distance) / (radius * SUPPORT)
+    near = 1.0 + r**2 * (-5.0 / 3.0 + r * (5.0 / 8.0 + r * (0.5 - 0.25 * r)))
+    s = np.maximum(r, 1.0)
+    far = 4.0 - 2.0 / (3.0 * s) + s * (-5.0 + s * (5.0 / 3.0 + s * (5.0 / 8.0 + s * (-0.5 + s / 12.0))))
+    return np.where(r < 1.0, near, np.where(r < 2.0, far, 0.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LocalisedFilter(EnsembleFilter):
+    """Base of the ensemble filters that may be localised.
+
+    Attributes:
+        radius: of the taper by Gaspari and Cohn, in the unit of the model's `positions`; 0 for no localisation.
+    """
+
+    radius: float = 0.0
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        object.__setattr__(self, "radius", positive("radius", self.radius, zero_allowed=True))
+        if self.radius and self.model.positions is None:
+            raise ValueError(f"radius must be 0 for a model without positions, but got {self.radius:g}")
+
+    @property
+    def tapers(self) -> Mapping[str, Any]:
+        """Tapers between states and channels, (n, m), and between channels, (m, m); none without a radius."""
+        positions = self.model.positions
+        if not self.radius or positions is None:
+            return {}
+        (states, measured, _), distances = positions, positions.distances
+        return {
+            "taper": gaspari_cohn(distances(states, measured), self.radius),
+            "between": gaspari_cohn(distances(measured, measured), self.radius),
+        }
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Those of all ensembles, and tapers."""
+        return {**super().parameters, **self.tapers}
+
+
+# The stochastic ensemble Kalman filter: each member is drawn to a measurement with noise of its own.
+
+
+def update_stochastic(model, x, z, e):
     """The measurement z; channels that are NaN are missing."""
     d, C, v, S, _, level = compare(model, x, z)
     e = centred(e) if model.own.centred_perturbations else e
@@ -52,7 +116,7 @@ class EnsembleKalmanFilter(LocalisedFilter):
     """
 
     name: ClassVar[str] = "enkf"
-    page: ClassVar[Page] = Page(advance, settle, update)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_stochastic)
     unrolled: ClassVar[tuple[str, ...]] = ("centred_perturbations",)
     centred_perturbations: int = 0
 
@@ -60,3 +124,142 @@ class EnsembleKalmanFilter(LocalisedFilter):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         switch("centred_perturbations", self.centred_perturbations)
+
+
+# Random rotations of an ensemble about its mean, which change neither mean nor covariance.
+
+
+@inlined
+def reflect(table, rows, first, size, vector):
+    """Reflect each of the first `rows` rows x in the plane normal to v: x -= 2 (x'v / v'v) v.
+
+    v has the entries vector[first] ... vector[size - 1] at their places, and zeros before.
+    """
+    square = 0.0
+    for j in range(first, size):
+        square += vector[j] * vector[j]
+    for i in range(rows):
+        product = 0.0
+        for j in range(first, size):
+            product += table[i, j] * vector[j]
+        factor = 2.0 * product / square
+        for j in range(first, size):
+            table[i, j] -= factor * vector[j]
+
+
+@cache
+def rotator(n: int, m: int) -> Callable:
+    """Return `rotate(memory, size)`: X = X W for members X (n, N), W random and orthogonal with W 1 = 1.
+
+    In the basis whose first axis is (1, ..., 1)/N^1/2, to which one reflection leads and from which it leads back,
+    W is 1 on that axis, and on the other N - 1 a product of reflections in random directions of ever fewer of
+    them, with a random sign at the end: uniform among all rotations and reflections.
+
+    Source: Stewart (1980), "The efficient generation of random orthogonal matrices with an application to
+    condition estimators"; for ensembles: Sakov, Oke (2008), "Implications of the form of the ensemble
+    transformation in the ensemble square root filters".
+    """
+    places = memory_places(n, m)
+    step_place, key_0, key_1 = places.step, places.key_0, places.key_1
+
+    @inlined
+    def rotate(memory, size):
+        row, table, draws = memory
+        root = size**0.5
+        # To the basis and back: v = (1, ..., 1)/N^1/2 - (1, 0, ..., 0).
+        for turn in range(2):
+            for j in range(size):
+                draws[j] = 1.0 / root
+            draws[0] -= 1.0
+            reflect(table, n, 0, size, draws)
+            if turn == 0:
+                for first in range(1, size - 1):
+                    # One counter for each vector of each step.
+                    count = row[step_place] * size + first
+                    fill_normals(draws, size, count, FILTER_ROTATION, row[key_0], row[key_1])
+                    norm = 0.0
+                    for j in range(first, size):
+                        norm += draws[j] * draws[j]
+                    # The reflection that takes this random vector to its first axis is the one in v + |v| e.
+                    draws[first] += norm**0.5 if draws[first] >= 0.0 else -(norm**0.5)
+                    reflect(table, n, first, size, draws)
+                fill_normals(draws, size, row[step_place] * size, FILTER_ROTATION, row[key_0], row[key_1])
+                for j in range(1, size):
+                    if draws[j] < 0.0:
+                        for i in range(n):
+                            table[i, j] = -table[i, j]
+
+    return rotate
+
+
+@lru_cache(maxsize=64)
+def with_rotation(kernels: Kernels) -> Kernels:
+    """An ensemble's kernels with a random rotation after each update; mean and covariance stay."""
+    rotate, update_plainly = rotator(kernels.n, kernels.m), kernels.update
+
+    @inlined
+    def update(memory, z, numbers, size):
+        update_plainly(memory, z, numbers, size)
+        rotate(memory, size)
+
+    return kernels._replace(update=update)
+
+
+# Ensemble filters without perturbed measurements, and the one with half the gain: the deterministic EnKF.
+
+
+def update_deterministic(model, x, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    d, C, v, S, _, level = compare(model, x, z)
+    return x + divide(C, S) @ (v - d * 0.5), v, S, level
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DeterministicUpdateFilter(EnsembleFilter):
+    """Base of the ensemble filters whose update draws nothing.
+
+    Attributes:
+        rotations: 1 for a random rotation of the members about their mean after each update, 0 for none. It keeps
+            them from growing outliers where little or no process noise mixes them.
+    """
+
+    rotations: int = 0
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        switch("rotations", self.rotations)
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        plain = super().kernels()
+        return with_rotation(plain) if self.rotations else plain
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DeterministicEnsembleKalmanFilter(LocalisedFilter, DeterministicUpdateFilter):
+    """Deterministic ensemble Kalman filter: the mean moves by the gain, the members' distances by half of it.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
+                 mean += K innovation,  x_j - mean(x) -= K (y_j - mean(y))/2;  sample covariances, divisor N - 1
+
+    With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
+    where measurements are poor. The update draws nothing: only the process noise of the members is random, and the
+    error of its sample mean and covariance enters the estimate.
+
+    Attributes:
+        radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. With
+            one, entries of cov(x, y) and cov(y, y) are multiplied by the taper of the distance of both
+            (P-localisation).
+
+    The other attributes are those of `DeterministicUpdateFilter`.
+
+    Raises:
+        ValueError: if a parameter is out of its range, or there is a radius for a model without positions.
+
+    Source: Sakov, Oke (2008), "A deterministic formulation of the ensemble Kalman filter".
+    """
+
+    name: ClassVar[str] = "denkf"
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_deterministic)

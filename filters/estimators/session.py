@@ -6,13 +6,13 @@ import copy
 
 import numpy as np
 
-from filters.engine.checks import checked_key, vector_like
+from filters.engine.belief import checked_key, vector_like
 from filters.estimators.checked import Checks, absent, without_missing
 from filters.estimators.estimator import steps_alone
 from thruster_env.core.global_generators import GlobalGenerators, seeded_copy
 from thruster_env.core.modules import said
 from thruster_env.core.streams import GLOBAL_GENERATORS, derived_seed
-from thruster_env.model.diffusion import same_dt
+from thruster_env.model.continuous import same_dt
 
 
 class EstimatorSession:

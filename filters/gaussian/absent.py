@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from filters.gaussian.mixture import Parts, nothing
+from filters.gaussian.mixtures import Parts, nothing
 from thruster_env.core.compiled import inlined
 
 

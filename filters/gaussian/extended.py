@@ -1,26 +1,32 @@
-"""The extended Kalman filter: the Kalman filter of the model linearised along its own estimate."""
+"""The extended Kalman filter and its kin: iterated, with a fading memory, Schmidt's, and the H-infinity filter."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
-from filters.algebra.densities import log_density
-from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from filters.gaussian.square_root import SQUARE_ROOT
-from filters.gaussian.ud import UD
-from filters.pages.page_filter import Page, PageFilter
-from thruster_env.core.checks import one_of
+import numpy as np
+
+from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.samples import log_density
+from filters.baselines import places_of
+from filters.gaussian.forms import SQUARE_ROOT, UD
+from filters.pages.page import Page
+from filters.pages.page_filter import PageFilter
+from thruster_env.core.checks import at_least, between, one_of, positive, vector
+
+# The extended Kalman filter: the Kalman filter of the model linearised along its own estimate.
 
 
-def advance(model, x, P, u):
+def propagate(model, x, P, u):
     """One of the model's substeps."""
     F = model.F(x, u)
     return wrap(model.f(x, u), model.state_angles), sym(F @ P @ F.T)
 
 
-def settle(model, x, P):
+def add_process_noise(model, x, P):
     """The end of a step."""
     return x, sym(P + model.Q)
 
@@ -54,10 +60,209 @@ class ExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ekf"
-    page: ClassVar[Page] = Page(advance, settle, update)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     forms: ClassVar[Mapping[str, Page]] = {"square-root": SQUARE_ROOT, "ud": UD}
     form: str = "covariance"
 
     def __post_init__(self):
         """Check the form; raise ValueError that states the rule and the value."""
         one_of("form", self.form, self.known_forms)
+
+
+# The iterated extended Kalman filter: the measurement is linearised again where the update ends.
+
+
+MOST_ITERATIONS = 20
+
+
+def update_iterated(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    seen, R, at, told = present(z), uncorrelated(present(z), model.R), x, []
+    for i in range(model.own.iterations):
+        H, y = only(seen, model.H(at)), model.h(at)
+        on_tangent = y + H @ (x - at) if i else y
+        v = only(seen, wrap(z - on_tangent, model.measurement_angles))
+        S = sym(H @ P @ H.T + R)
+        K = divide(P @ H.T, S)
+        at = x + K @ v
+        told.append((v, S))
+    v, S = told[0]
+    return wrap(at, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IteratedExtendedKalmanFilter(PageFilter):
+    """Iterated extended Kalman filter: its update is Gauss and Newton's method for the most probable state.
+
+        predict: that of the extended filter
+        update:  x_0 = x,  then for i = 0, 1, ... with H = dh/dx at x_i and K = P H' (H P H' + R)^-1
+                 x_{i+1} = x + K (z - h(x_i) - H (x - x_i)),
+                 at last x = x_i,  P = (I - K H) P (I - K H)' + K R K'  (Joseph) with the last H and K
+
+    The first iteration is the extended filter's update. Innovation, its covariance and the likelihood are those of
+    the first, so that they assess the prediction. The number of iterations is fixed, without a line search: full
+    steps may overshoot where h is strongly nonlinear within the spread of the belief.
+
+    Attributes:
+        iterations: how often the measurement is linearised, 1 to 20; 1 is the extended filter.
+
+    Raises:
+        ValueError: if iterations is not a whole number from 1 to 20.
+
+    Source: Bell, Cathey (1993), "The iterated Kalman filter update as a Gauss-Newton method", IEEE Trans.
+    Automatic Control 38(2).
+    """
+
+    name: ClassVar[str] = "iekf"
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_iterated)
+    unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
+    iterations: int = 5
+
+    def __post_init__(self):
+        """Check the number of iterations."""
+        iterations = at_least("iterations", self.iterations, 1, MOST_ITERATIONS)
+        object.__setattr__(self, "iterations", iterations)
+
+
+# The extended Kalman filter with a fading memory: old measurements count less than its model says.
+
+
+def add_process_noise_fading(model, x, P):
+    """The end of a step."""
+    return x, sym(P * model.own.fading * model.own.fading + model.Q)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FadingMemoryFilter(PageFilter):
+    """Extended Kalman filter with a fading memory.
+
+        predict: x = f(x, u),  P = a^2 F P F' + Q;  update: the extended filter's
+
+    A measurement k steps old counts a^-2k times as much as with a = 1. So the filter follows a model that drifts,
+    even without any Q. P is that of errors which are weighted in this way.
+
+    Attributes:
+        fading: a, from 1, the extended filter, to 10.
+
+    Raises:
+        ValueError: if fading is out of its range.
+
+    Source: Sorenson, Sacks (1971), "Recursive fading memory filtering"; Simon (2006), Optimal State Estimation,
+    section 7.4.
+    """
+
+    name: ClassVar[str] = "fading"
+    page: ClassVar[Page] = Page(propagate, add_process_noise_fading, update)
+    fading: float = 1.01
+
+    def __post_init__(self):
+        """Check the number; raise ValueError that states the rule and the value."""
+        object.__setattr__(self, "fading", between("fading", self.fading, 1.0, 10.0))
+
+
+# The Schmidt-Kalman filter: states whose uncertainty counts, but which measurements do not correct.
+
+
+def update_schmidt(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    seen = present(z)
+    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    K = model.own.corrected @ divide(P @ H.T, S)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SchmidtKalmanFilter(PageFilter):
+    """Schmidt's extended Kalman filter, with states that are considered, not estimated.
+
+        predict: the extended filter's
+        update:  K = J P H' S^-1, where J is the identity without the considered states;
+                 x += K v,  P = (I - K H) P (I - K H)' + K R K'
+
+    A bias that the measurements hardly tell, or tell wrongly, keeps its prior, and P says what that costs. Without
+    considered states this is the extended filter.
+
+    Attributes:
+        considered: indices of these states; -1 is the last one.
+
+    Raises:
+        ValueError: if an index is none of a state.
+
+    Source: Schmidt (1966), "Application of state-space methods to navigation problems"; Simon (2006), Optimal
+    State Estimation, section 10.1.
+    """
+
+    name: ClassVar[str] = "schmidt"
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_schmidt)
+    considered: Any = ()
+
+    def __post_init__(self):
+        """Check the indices; raise ValueError that states the rule and the value."""
+        places = places_of("considered", self.considered, self.model.n)
+        object.__setattr__(self, "considered", places)
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """J."""
+        return {"corrected": np.diag([float(i not in self.considered) for i in range(self.model.n)])}
+
+
+# The H-infinity filter: the least of the largest errors that any noise of some size can cause.
+
+
+def add_process_noise_h_infinity(model, x, P):
+    """The end of a step."""
+    W, P = model.own.weights, sym(P + model.Q)
+    D = eye(x) - sym(W @ P @ W.T) * model.own.theta
+    return x, sym(P + sym(divide(P @ W.T, D) @ (W @ P)) * model.own.theta)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HInfinityFilter(PageFilter):
+    """Extended H-infinity filter: it guards against the worst noise, not the mean one.
+
+        predict: x = f(x, u),  P = F P F' + Q,  then P = (P^-1 - theta W'W)^-1
+        update:  the extended filter's: P = (P^-1 + H' R^-1 H)^-1,  x += P H' R^-1 (z - h(x))
+
+    W = diag(1/scale). Of noise w and v and of first errors e_0 of any kind the sum of |W e|^2 is less than 1/theta
+    times the sum of e_0' P_0^-1 e_0, w' Q^-1 w and v' R^-1 v. With theta = 0 it is the extended filter; as theta
+    grows, P and the gain do. P is no covariance of random errors but larger, and its NEES below n. Where theta is
+    too large for P, as after many steps without a measurement, what is to be inverted is not positive: the filter
+    restarts, and that is counted. The prior is taken as it is.
+
+    Attributes:
+        theta: the bound, above 0.
+        scale: of the errors that matter, (n,), in units of the states; the prior's deviations if None.
+
+    Raises:
+        ValueError: if a number is not positive.
+
+    Source: Simon (2006), Optimal State Estimation, eq. (11.89), in two steps; Banavar (1992), "A game theoretic
+    approach to linear dynamic estimation".
+    """
+
+    name: ClassVar[str] = "h-infinity"
+    page: ClassVar[Page] = Page(propagate, add_process_noise_h_infinity, update)
+    theta: float = 0.01
+    scale: Any = None
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        object.__setattr__(self, "theta", positive("theta", self.theta))
+        if self.scale is not None:
+            scale = vector("scale", self.scale, self.model.n)
+            object.__setattr__(self, "scale", np.array([positive("scale", one) for one in scale]))
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """Theta and W; a state whose scale is zero has no weight."""
+        scale = np.sqrt(np.diag(self.model.prior_cov)) if self.scale is None else self.scale
+        weights = np.divide(1.0, scale, out=np.zeros(self.model.n), where=scale > 0.0)
+        return {"theta": self.theta, "weights": np.diag(weights)}
+
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """W, from the prior's deviations unless there is a scale."""
+        return {"weights": ("prior_cov",)} if self.scale is None else {}

@@ -1,4 +1,16 @@
-"""The Kalman filter, for affine models and for affine approximations of others."""
+"""The Kalman filter: affine models, schedules of operating points, the information form, and the steady gain.
+
+    update: Y = P^-1 + H' R^-1 H,  P = Y^-1,  x += P H' R^-1 v
+
+Every channel adds its own information H' R^-1 H, so many channels and few states are cheap; no gain and no
+inverse of S are needed, which is here for the likelihood only. P must be positive definite throughout. Inverses
+are products W' W of inverse Cholesky factors W, symmetric and positive by construction.
+
+Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
+
+The constants c of the model in use are linear in the input between the points of the schedule, and constant
+beyond them; they are those of the last input until the next, and at first those of u = 0.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +21,63 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.gaussian.information import INFORMATION
-from filters.gaussian.schedule import SCHEDULED
-from filters.pages.page_filter import Page, PageFilter
+from filters.algebra.blocks import inverse_of, zeros
+from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import hats
+from filters.algebra.samples import log_density
+from filters.gaussian import extended
+from filters.gaussian.extended import ExtendedKalmanFilter, add_process_noise, propagate
+from filters.pages.page import Page
+from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, covariance, one_of
 from thruster_env.model.affine import AffineModel, linearize
+
+# The information form of the Kalman filter: the update works on the inverse of the covariance.
+
+
+def update_information(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    seen = present(z)
+    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    W = divide(H.T, R)  # H' R^-1
+    P = inverse_of(sym(inverse_of(P) + W @ H))
+    return wrap(x + P @ (W @ v), model.state_angles), P, v, S, log_density(v, S, seen)
+
+
+INFORMATION = Page(propagate, add_process_noise, update_information)
+
+
+# A Kalman filter whose affine model follows the input: gain scheduling.
+
+
+def constants_at(model, u):
+    """Constants of the affine model at an input."""
+    return model.own.models.T @ hats(u, model.own.inputs)
+
+
+def initial_scheduled(model):
+    """The model at u = 0."""
+    return {"c": constants_at(model, zeros(model.own.models, 1))}
+
+
+def propagate_scheduled(model, x, P, u):
+    """One of the model's substeps."""
+    c = constants_at(model, u)
+    return *extended.propagate(model.at(c), x, P, u), {"c": c}
+
+
+def update_scheduled(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    return extended.update(model.at(model.extras["c"]), x, P, z)
+
+
+SCHEDULED = Page(propagate_scheduled, extended.add_process_noise, update_scheduled, initial=initial_scheduled)
+
+
+# The Kalman filter, for affine models and for affine approximations of others.
+
 
 MOST_POINTS = 200  # of a schedule; programs are written out for them
 
@@ -112,3 +175,82 @@ class KalmanFilter(AffineFilter):
         """The page of the form, or of a schedule."""
         page = super().written_page
         return SCHEDULED._replace(own=page.own) if self.schedule > 1 else page
+
+
+# The steady-state Kalman filter: one gain for all steps, from Riccati's equation.
+
+
+STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
+
+
+def update_steady(model, x, P, z):
+    """The measurement z; channels that are NaN are missing, and so are their columns of the gain."""
+    seen = present(z)
+    H, R, K = only(seen, model.H(x)), uncorrelated(seen, model.R), only(seen, model.own.gain.T).T
+    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SteadyStateKalmanFilter(AffineFilter):
+    """Kalman filter with a constant gain: the limit of the Kalman gain.
+
+        K = P C' (C P C' + R)^-1,  P = A P A' - K C P A' + Q  (Riccati's equation for the predicted covariance)
+        predict: mean = A mean + B u + a
+        update:  mean += K (z - C mean - d), in missing channels without their columns of K
+
+    Like "kf" it runs on an affine model, or on the affine approximation of a model about its operating point. It
+    equals "kf" where that starts from the solution P as its prior covariance.
+
+    The covariance of a belief is that of the errors which this gain leaves: from the prior on A P A' + Q and
+    (I - K C) P (I - K C)' + K R K' (Joseph's form), which holds for any gain. It tends to the solution of
+    Riccati's equation, stays consistent where measurements are missing, and has no influence on the estimate. The
+    gain belongs to one Q and R: a Q or R of a single step is refused.
+
+    Attributes:
+        gain: K, (n, m).
+
+    Raises:
+        ValueError: if a nonlinear model has no operating point, or Riccati's equation has no stabilising solution:
+            unstable and marginally stable modes must be observable, and marginally stable ones driven by Q.
+
+    Source: Anderson, Moore (1979), Optimal Filtering, section 4.4.
+    """
+
+    name: ClassVar[str] = "kf-steady"
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_steady)
+    varying_noise: ClassVar[bool] = False
+
+    def __post_init__(self):
+        """Check the model, and solve for the gain."""
+        super().__post_init__()
+        a, _, _, c, _ = self.kernel_model.matrices()
+        try:
+            fastest = np.abs(np.linalg.eigvals(a - a @ self.gain @ c)).max()
+        except (np.linalg.LinAlgError, ValueError):  # no solution, or one that is not finite
+            fastest = np.inf
+        if not fastest < STABLE:
+            raise ValueError(
+                "a steady-state filter must have a model for which Riccati's equation has a stabilising solution, "
+                f"but got A = {a.tolist()}"
+            )
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """The gain K (n, m)."""
+        from filters.bounds import steady_state  # which runs filters of this package
+
+        model = self.kernel_model
+        a, _, _, c, _ = model.matrices()
+        return steady_state(a, c, model.process_noise_cov, model.measurement_noise_cov)[1]
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The gain."""
+        return {"gain": self.gain}
+
+    @property
+    def follows_from(self) -> Mapping[str, tuple[str, ...]]:
+        """The gain, from all but the prior."""
+        return {"gain": ("process_noise_cov", "measurement_noise_cov", "constants")}

@@ -1,23 +1,218 @@
-"""What filters that run a filter for each of several models share: the models, and their probabilities."""
+"""Several models at once: the interacting multiple model filter, and static model probabilities.
+
+How the filters of the modes are mixed, run and merged is in `filters.gaussian.multiple_models`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from filters.algebra.matrices import given
+from filters.algebra.samples import dot
 from filters.embedded import embedded_model, places_within
-from filters.engine.belief import Belief, Kernels
+from filters.engine.belief import Belief, Kernels, memory_places, own_place, restart_if_lost
 from filters.filter import Filter
-from filters.gaussian.absent import Absent, absent_states
-from filters.gaussian.mixture import parts_of
-from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.core.checks import as_floats, one_of, positive, short_repr, vector
+from filters.gaussian.absent import Absent, absent_states, completer
+from filters.gaussian.mixtures import Parts, blender, log_weigher, logarithm, nothing, parts_of
+from filters.pages.kernels import anything_measured, nothing_to_summarise, stored, works_of
+from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, vector
+from thruster_env.core.compiled import inlined
+from thruster_env.graphs.programs import Place
+from thruster_env.model.shape import Shape, number_places, starts_of
 from thruster_env.model.state_space import StateSpaceModel
+
+# Several filters in one row of numbers, each with a model of its own: they are mixed, run, weighed and merged.
+
+
+LOST = 700.0  # what the log-likelihood of a mode whose filter begins anew is below the least of the others
+
+
+class Mode(NamedTuple):
+    """The filter of a mode, and how many numbers it and its model are."""
+
+    kernels: Kernels
+    length: int
+
+
+@lru_cache(maxsize=64)
+def mode_kernels(
+    modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ...] = (), mixing: Callable | None = None
+) -> Kernels:
+    """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
+
+    The filter's own numbers are p (K,), Pi (K, K) by columns, and those of each mode. Extras: the memory of each
+    mode's filter, then the logarithms of the probabilities. `mixing(p, mu)` gives for a column of Pi the weights
+    of all modes with which one begins a step, and its probability; without it each filter runs by itself.
+    """
+    n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
+    at, own = memory_places(n, m), own_place(shape)
+    first, stride = at.extras, at.extras + max(one.kernels.extras + one.kernels.scratch for one in modes)
+    parts, logs = Parts(first, stride, count), first + count * stride
+    probabilities = logs + count  # what follows is scratch
+    completing = probabilities + count * (3 + belief)  # behind what `_mixer` needs
+    end = completing + (count + belief) * bool(absent)
+    of_states = blender(parts, n, at.mean, at.cov, shape.state_angles)
+    of_innovations = blender(parts, m, at.innovation, at.innovation_cov, shape.measurement_angles, wraps=False)
+    innovation, level, step, lost = at.innovation, at.log_likelihood, at.step, at.divergences
+    of_modes = [own + count + count * count + start for start in starts_of(*(one.length for one in modes))]
+    start_all, predict_all, update_all = _of_all(modes, parts, of_modes)
+    model = number_places(n, m)
+    priors = [(place + model.prior_mean, place + model.prior_cov) for place in of_modes[:-1]]
+    complete = completer(absent, parts, n, of_states, priors, completing)
+    weigh = log_weigher(parts, level)
+
+    @inlined
+    def blend(row, weights, numbers, target):
+        complete(row, weights, numbers)
+        of_states(row, weights, target)
+
+    mix = nothing if mixing is None else _mixer(mixing, parts, belief, logs, own + count, blend)
+
+    @inlined
+    def recall(row):
+        for j in range(count):
+            row[probabilities + j] = math.exp(row[logs + j])
+
+    @inlined
+    def start(memory, numbers, size):
+        row, _, _ = memory
+        for i in range(first, end):
+            row[i] = 0.0
+        for j in range(count):
+            row[logs + j] = logarithm(numbers[own + j])
+        recall(row)
+        start_all(memory, numbers, numbers)
+        blend(row, probabilities, numbers, 0)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        mix(memory, u, numbers)
+        recall(row)
+        predict_all(memory, u, numbers)
+        blend(row, probabilities, numbers, 0)
+        row[step] += 1.0
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        recall(row)
+        begun = 0.0
+        for j in range(count):
+            begun -= row[first + j * stride + lost]
+        update_all(memory, z, numbers)
+        for j in range(count):
+            begun += row[first + j * stride + lost]
+        of_innovations(row, probabilities, innovation)
+        row[level], least = 0.0, -math.inf
+        if anything_measured(z):
+            least = math.inf
+            for j in range(count):
+                part = first + j * stride
+                if not row[part + lost] > 0.0:
+                    least = min(least, row[part + level])
+            for j in range(count):
+                part = first + j * stride
+                if row[part + lost] > 0.0:  # it has begun anew: it says nothing of this measurement
+                    row[part + lost], row[part + level] = 0.0, least - LOST if least < math.inf else -math.inf
+            row[level] = weigh(row, logs, probabilities)
+        if begun > 0.0 and least < math.inf:
+            row[lost] += 1.0  # modes begin anew: of all of them the likelihood is 0, and the whole belief restarts
+        blend(row, probabilities, numbers, 0)
+
+    kept = probabilities - first
+    return Kernels(
+        n, m, n, 0, start, predict, update, nothing_to_summarise, extras=kept, scratch=end - first - kept
+    )
+
+
+def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: int, blend: Callable) -> Callable:
+    """Return `mix(memory, u, numbers)`: the belief with which each filter begins is a mixture of all.
+
+    Of the probabilities mu a column has the ratios to the largest that leads to its mode, which is as good.
+    """
+    first, stride, count = parts
+    ratios, foreseen, shares, mixed = (logs + k * count for k in (1, 2, 3, 4))
+    p, mu = given(Place("numbers", 0), (count,)), given(Place("rows", ratios), (count,))
+    (share,) = works_of(stored(mixing(p, mu), (Place("rows", shares), Place("given", 0))))
+
+    @inlined
+    def mix(memory, u, numbers):
+        row, _, _ = memory
+        for j in range(count):
+            column, top = transitions + j * count, -math.inf
+            for i in range(count):
+                if numbers[column + i] > 0.0:
+                    top = max(top, row[logs + i])
+            if top > -math.inf:
+                for i in range(count):
+                    row[ratios + i] = math.exp(row[logs + i] - top) if numbers[column + i] > 0.0 else 0.0
+                share(row, row[foreseen + j :], numbers[column:])
+                row[foreseen + j] = top + logarithm(row[foreseen + j])
+            else:  # no mode leads to this one: its filter goes on
+                row[foreseen + j] = -math.inf
+                for i in range(count):
+                    row[shares + i] = 1.0 if i == j else 0.0
+            blend(row, shares, numbers, mixed + j * belief)
+        for j in range(count):
+            row[logs + j] = row[foreseen + j]
+            for i in range(belief):
+                row[first + j * stride + i] = row[mixed + j * belief + i]
+
+    return mix
+
+
+def _of_all(modes: tuple[Mode, ...], parts: Parts, numbers: Sequence[int]) -> tuple[Callable, ...]:
+    """Functions (memory, given, numbers) that start, predict and update the filters of all modes."""
+    at: dict[Kernels, list[tuple[int, int, int]]] = {}
+    for j, one in enumerate(modes):
+        at.setdefault(one.kernels, []).append((parts.first + j * parts.stride, numbers[j], numbers[j + 1]))
+    works: tuple[Callable, ...] = nothing, nothing, nothing
+    for kernels, places in at.items():
+        works = _then(works, kernels, tuple(places), parts.stride)
+    return works
+
+
+def _then(before: tuple, kernels: Kernels, places: tuple, stride: int) -> tuple[Callable, ...]:
+    """The same with some modes more, which have the same kernels, by the places of their rows and numbers."""
+    start_others, predict_others, update_others = before
+    begin, move, correct, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
+
+    @inlined
+    def start(memory, given, numbers):
+        start_others(memory, given, numbers)
+        row, table, draws = memory
+        for place, first, last in places:
+            begin((row[place : place + stride], table, draws), numbers[first:last], 0)
+
+    @inlined
+    def predict(memory, u, numbers):
+        predict_others(memory, u, numbers)
+        row, table, draws = memory
+        for place, first, last in places:
+            move((row[place : place + stride], table, draws), u, numbers[first:last], 0)
+
+    @inlined
+    def update(memory, z, numbers):
+        update_others(memory, z, numbers)
+        row, table, draws = memory
+        for place, first, last in places:
+            mode, of_mode = (row[place : place + stride], table, draws), numbers[first:last]
+            correct(mode, z, of_mode, 0)
+            restart(mode, of_mode, 0)
+
+    return start, predict, update
+
+
+# What filters that run a filter for each of several models share: the models, and their probabilities.
+
 
 MOST_MODES = 32
 SUM_TOLERANCE = 1e-9
@@ -192,3 +387,116 @@ def probabilities_of(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarra
         rule = f"{name} must be {' x '.join(map(str, shape))} numbers of at least 0 that sum to 1"
         raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {short_repr(given)}")
     return found
+
+
+# The interacting multiple model filter, for a plant that switches among several models.
+
+
+def mixing(p, mu):
+    """Weights mu_i|j with which mode j begins a step, and its probability c_j; p is column j of Pi."""
+    c = dot(p, mu)
+    return p * mu / c, c
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteractingMultipleModelFilter(MultipleModelFilter):
+    """Interacting multiple models (IMM): the plant is in one of K modes, each with its own model and filter.
+
+        mix:     c_j = sum over i of Pi_ij mu_i,  mu_i|j = Pi_ij mu_i/c_j; the filter of mode j begins with
+                 x0_j = sum of mu_i|j x_i,  P0_j = sum of mu_i|j (P_i + (x_i - x0_j)(x_i - x0_j)')
+        predict: each filter with its model
+        update:  each filter; L_j = N(v_j; 0, S_j),  mu_j = c_j L_j/L,  L = sum of c_j L_j
+        merge:   mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
+
+    mu are the probabilities of the modes (`mode_probabilities`), Pi_ij that of mode j a step after mode i. Unless
+    it is given, Pi = stay I + (1 - stay) 1 p': a step keeps its mode with probability `stay`, and else draws one
+    with probabilities p, which are those of the first step, too. The log-likelihood is log L; innovation and S
+    are those of the mixture before the measurement.
+
+    Modes are models, or changes of `model`, such as `{"measurement_noise_cov": 100 * R}`. Without modes there are
+    two, the model and the same with R times `outlier_scale`, with probabilities 1 - `outlier_rate` and
+    `outlier_rate`: a filter for outliers. What a mode lacks of the model's states the others say (unbiased mixing,
+    `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
+
+    Probabilities are kept as logarithms, so that a mode whose probability is below the least float64 comes back if
+    measurements speak for it. `Belief.extras` holds the memory of the modes' filters, then these logarithms: see
+    `mode_estimates`.
+
+    Attributes:
+        stay: probability that a step keeps its mode without a draw, within 0 and 1.
+        transition: Pi (K, K), whose rows sum to 1, in place of `stay`.
+        outlier_scale: factor on R in the second mode, where no modes are given.
+        outlier_rate: probability of that mode.
+
+    Raises:
+        ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.
+
+    Source: Blom, Bar-Shalom (1988), "The interacting multiple model algorithm for systems with Markovian switching
+    coefficients"; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation,
+    section 11.6.6; unequal states: Granstrom, Willett, Bar-Shalom (2015).
+    """
+
+    name: ClassVar[str] = "imm"
+    mixing: ClassVar[Callable] = staticmethod(mixing)
+    stay: float = 0.9
+    transition: Any = None
+    outlier_scale: float = 100.0
+    outlier_rate: float = 0.05
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        for name, check in (("stay", between), ("outlier_rate", between), ("outlier_scale", positive)):
+            ends = (0.0, 1.0) if check is between else ()
+            object.__setattr__(self, name, check(name, getattr(self, name), *ends))
+        super().__post_init__()
+
+    @property
+    def usual_modes(self) -> Sequence[Mapping[str, Any]]:
+        """The model, and the same with a larger R."""
+        return {}, {"measurement_noise_cov": self.outlier_scale * self.model.measurement_noise_cov}
+
+    @property
+    def usual_probabilities(self) -> Sequence[float] | np.ndarray:
+        """As outliers come, where no modes are given; else all equal."""
+        return (
+            super().usual_probabilities if self.modes is not None else (1.0 - self.outlier_rate, self.outlier_rate)
+        )
+
+    @property
+    def transition_matrix(self) -> np.ndarray:
+        """Pi (K, K): the probability of mode j a step after mode i."""
+        count, given = len(self.mode_filters), self.transition
+        given = self.stay * np.eye(count) + (1.0 - self.stay) * self.p if given is None else given
+        return probabilities_of("transition", given, (count, count))
+
+
+# Multiple model adaptive estimation: which one of several models is right.
+
+
+USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MultipleModelAdaptiveEstimator(MultipleModelFilter):
+    """Multiple model adaptive estimation (MMAE): one of K models is right at all times, and the data say which.
+
+        mu_j is proportional to mu_j L_j,  L_j = N(v_j; 0, S_j); each filter runs by itself
+        mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
+
+    Without modes these are the model with Q times 0.1, 1 and 10. The log-likelihood is that of the mixture, and so
+    are innovation and S; `mode_probabilities` and `mode_estimates` say more. Probabilities are kept as
+    logarithms: a model whose probability has come to nothing comes back if as much evidence speaks for it. All of
+    a run counts, so where the plant switches, take `imm`.
+
+    Raises:
+        ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.
+
+    Source: Magill (1965), "Optimal adaptive estimation of sampled stochastic processes".
+    """
+
+    name: ClassVar[str] = "mmae"
+
+    @property
+    def usual_modes(self) -> Sequence[Mapping[str, Any]]:
+        """The model with a smaller Q, its own, and a larger one."""
+        return [{"process_noise_cov": factor * self.model.process_noise_cov} for factor in USUAL_FACTORS]

@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place
+from filters.engine.belief import Kernels, memory_places, own_place
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.limits import limits
 from filters.horizon.window import kept_places, scratch_places, window_works
 from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.core.compiled import inlined, not_inlined
-from thruster_env.model.layout import number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.shape import Functions, Shape, number_places
 from thruster_env.model.state_bounds import Bound
 
 MOST_PASSES = 100  # beyond those that are asked for, until bounds settle

@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from typing import NamedTuple
 
 from filters.algebra.blocks import careful
-from filters.algebra.densities import dot
+from filters.algebra.matrices import shifted
 from filters.algebra.operations import (
     divide,
     eye,
@@ -29,24 +29,15 @@ from filters.algebra.operations import (
     uncorrelated,
     wrap,
 )
-from filters.algebra.scalars import (
-    choose,
-    constant,
-    count,
-    exceeds,
-    logarithm,
-    shifted,
-)
-from filters.engine.layout import memory_places
+from filters.algebra.samples import dot
+from filters.algebra.scalars import choose, constant, count, exceeds, logarithm
+from filters.engine.belief import memory_places
 from filters.gaussian import extended
 from filters.pages.equations import Equations
-from filters.pages.memory import RowMemory
-from filters.pages.page import Page
-from filters.pages.programs import programs_of, stored
-from filters.pages.stages import Stage
-from filters.smoothers.rts import advance, begin
-from thruster_env.model.layout import starts_of
-from thruster_env.model.shape import Functions, Shape
+from filters.pages.kernels import Stage, programs_of, stored
+from filters.pages.page import Page, RowMemory
+from filters.smoothers.rts import propagate_jacobian, represent_jacobian
+from thruster_env.model.shape import Functions, Shape, starts_of
 
 HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
 OWN = tuple(
@@ -214,8 +205,8 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         return [
             stored(tell(model, memory.x, memory.P, memory.z), told),
             stored((centred, cost_of(centred, P)), (d, at.seen_cost)),
-            stored(begin(model, x, P), (mean, F)),
-            stored(advance(model, mean, F, memory.u), (mean, F)),
+            stored(represent_jacobian(model, x, P), (mean, F)),
+            stored(propagate_jacobian(model, mean, F, memory.u), (mean, F)),
             stored((noise * 0.0, model.Q), (noise, noise_cov)),
             stored(
                 (
@@ -235,5 +226,5 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
         ]
 
-    page = Page(extended.advance, extended.settle, extended.update, own=OWN)
+    page = Page(extended.propagate, extended.add_process_noise, extended.update, own=OWN)
     return Works(*programs_of(page, functions, shape, stages).works)

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 
 if TYPE_CHECKING:
     from filters.learned.file import TrainedEstimator

@@ -12,7 +12,7 @@ import filters
 from filters.learned.estimator import LearnedEstimator, Track
 from filters.learned.networks import compressed, starting_at_zero
 from filters.registry import make_filter
-from filters.tensors.belief import TensorBelief
+from filters.tensors.filter import TensorBelief
 
 
 class TrackedBelief(TensorBelief):

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from filters.tensors.algebra import wrapped_where
+from filters.tensors.stages import wrapped_where
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.core.derivatives import jacobian
-from thruster_env.core.tuples import matrix_writer, vector_reader, vector_writer
+from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
 from thruster_env.logs.steps import AnyStepModel
-from thruster_env.model.layout import constants_reader, number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
 
 

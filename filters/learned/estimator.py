@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from filters.estimators.estimator import Output
 from filters.learned.equations import Equations
 from thruster_env.core.checks import as_floats, at_least, one_of
-from thruster_env.core.torch_threads import one_thread
+from thruster_env.core.threads import one_thread
 from thruster_env.model.state_space import StateSpaceModel
 
 MOST = 10_000  # members, or hidden states

@@ -13,15 +13,61 @@ from filters.engine.session import Session
 from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from filters.logs.clock import by_the_clock, noise_by_rates
-from filters.restarts import FirstRestart, Restarts
+from filters.live import Live
 from filters.smoothers.smooth import smoothed
+from filters.starts import FirstRestart, Restarts
 from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.replay import ReplayEnv
+from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import Log
+from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
+
+# A filter over a log on its own stamps: by the clock, as `filter.live()` goes.
+
+
+def by_the_clock(
+    filter_: Filter,
+    key: np.ndarray,
+    log: Log,
+    noise: Callable[[float], np.ndarray] | None,
+) -> tuple[Estimates, Restarts | None]:
+    """What `filters.run` gives of one trajectory, of a log on its own stamps, and its restarts.
+
+    Args:
+        filter_: of a model whose sample time is one of its constants.
+        key: random key (2,).
+        log: on its own stamps.
+        noise: Q by the length of a step [s]; None for one in proportion to it.
+
+    Raises:
+        ValueError: for a model of one sample time, or another package's estimator.
+    """
+    if isinstance(filter_, ForeignFilter):
+        raise ValueError(f"a log on its own stamps must be for a filter of ours, but got {filter_.name!r}")
+    live = Live(filter_, noise=noise, resolution=log.resolution)
+    times, z = log.times.tolist(), log.measurements
+    live.start(0.0, z[0], key)
+    rows = [live.told()]
+    for k, u in enumerate(log.inputs, 1):
+        live.predict_to(times[k], u)
+        live.update(times[k], None, z[k])
+        rows.append(live.told())
+    return estimates_of(rows, live.divergences), live.restarts
+
+
+def noise_by_rates(
+    plant: ContinuousModel | None, model: StateSpaceModel, dt: float
+) -> Callable[[float], np.ndarray] | None:
+    """Q by the length of a step [s], of a plant in continuous time whose noise at dt is still the model's.
+
+    Of a model with another Q, as tuning gives, it is None: in proportion to the length.
+    """
+    if plant is None or not np.array_equal(plant.noise(dt), model.process_noise_cov):
+        return None
+    return plant.noise
+
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -90,7 +136,7 @@ def estimate(
     Args:
         log: recorded run, or the path of a file.
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
-        model: of the log, as `thruster_env.env.replay.ReplayEnv` takes it: a model, what makes or offers one,
+        model: of the log, as `thruster_env.env.record.ReplayEnv` takes it: a model, what makes or offers one,
             or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.

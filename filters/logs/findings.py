@@ -5,18 +5,22 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from math import isnan
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from filters.consistency.blow_up import root_mean_square
-from filters.consistency.nees import whitened
-from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
-from filters.logs.estimate import SKIPPED, LogEstimate
+from filters.consistency.nees import LAGS, Whiteness, blow_up_sentence, root_mean_square, whitened, whiteness_of
+from filters.logs.estimate import SKIPPED, LogEstimate, estimate_with
+from filters.monitoring.monitor import Alarm, Monitor
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import at_least
-from thruster_env.logs.columns import STATE
+from thruster_env.logs.columns import STATE, plain, suffix
+from thruster_env.logs.findings import GAP, SPOILING, sentences
+from thruster_env.logs.grid import date_text, time_text
 from thruster_env.model.quantities import Quantity
 
 
@@ -111,3 +115,185 @@ def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
         return Residual(quantity, np.nan, np.nan, 0)
     largest = float(abs(there).max()) or 1.0  # by which sums stay finite where a model blows up
     return Residual(quantity, root_mean_square(there), float((there / largest).mean() * largest), there.size)
+
+
+# The results of a filter's run over a log, in words.
+
+
+ALPHA = 0.05  # below which a p-value speaks against white innovations
+
+
+def verdict(found: LogEstimate, told: LogFindings) -> list[str]:
+    """Findings in the log, then what the innovations say about filter and model.
+
+    Where a prediction is a thousand times further off than the channel moves, the model blows up between samples,
+    and its Q and R are not to blame.
+    """
+    said = sentences(found.log.findings) + ([found.restarts.sentence] if found.restarts else [])
+    spoilt = [one for one in found.log.findings if one.kind in SPOILING]
+    if any(one.kind == GAP for one in spoilt):
+        said.append("At a gap the filter predicts with the last input held.")
+    if not told.rows:
+        return [
+            *said,
+            f"Nothing was measured in the rows that count, from {told.first} on: there are no innovations.",
+        ]
+    if all(isnan(one.rmse) for one in told.predictions):
+        silent = "This estimator gives no innovation, so there is no NIS, no whiteness and no likelihood."
+        return [*said, silent]
+    names = [one.name for one in found.log.measured]
+    blown = blow_up_sentence(found.innovations[told.first :], found.log.measurements, names, found.log.dt)
+    if blown:
+        return [*said, blown]
+    if isnan(told.mean_nis):
+        return [*said, "This filter gives no covariance, so there is no NIS and no likelihood."]
+    low, high = told.nis_band
+    some = "The mean NIS is in its 95 % band."
+    if told.mean_nis > high:
+        some = "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
+    elif told.mean_nis < low:
+        some = "The innovations are smaller than the filter expects: its Q or R is too large."
+    if told.whiteness is not None and told.whiteness.p_value < ALPHA:
+        some += " They are not white: the filter could have known some of them."
+    if spoilt:
+        kinds = list(dict.fromkeys(one.kind for one in spoilt))
+        some += f" But this is with what was found in the log ({', '.join(kinds)}): mend that first."
+    return [*said, some]
+
+
+# Alarms of a monitor over a log, and the channel without which they are gone.
+
+
+class LogAlarms(NamedTuple):
+    """What a monitor says of a log; steps of alarms are rows of it."""
+
+    monitor: Monitor
+    first: int  # the row at which the tests begin
+    alarms: tuple[Alarm, ...]
+    without: tuple[int, ...] | None  # statistical alarms without each channel; None where that was not asked for
+
+    @property
+    def at_fault(self) -> int | None:
+        """The channel without which the fewest alarms are left, if at most half are; None without one."""
+        found = self.without
+        if not found or not self.alarms:
+            return None
+        order = sorted(range(len(found)), key=found.__getitem__)
+        clear = len(order) < 2 or found[order[0]] < found[order[1]]
+        return order[0] if clear and 2 * found[order[0]] <= len(_statistical(self.alarms)) else None
+
+
+def alarms_of(found: LogEstimate, monitor: Monitor, first: int = 0, *, isolate: bool = False) -> LogAlarms:
+    """The alarms of an estimate of a log.
+
+    Args:
+        found: from `filters.logs.estimate.estimate`.
+        monitor: the tests.
+        first: the row at which they begin, once the filter has settled.
+        isolate: whether to run the filter without each channel, too, and count the alarms of the others.
+
+    Raises:
+        ValueError: for a filter without a covariance, and to isolate the only channel.
+    """
+    if not found.filter.has_covariance:
+        raise ValueError(f"a monitor needs a filter with a covariance, but {found.filter.name!r} has none")
+    measurements = found.log.measurements
+    without = None
+    if isolate:
+        channels = measurements.shape[1]
+        if channels < 2:
+            raise ValueError("a faulty channel can be isolated among two or more, but the filter has one")
+        without = tuple(len(_statistical(_without(found, monitor, first, one))) for one in range(channels))
+    return LogAlarms(monitor, first, tuple(_alarms(found, monitor, first)), without)
+
+
+def _alarms(found: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
+    seen = found.innovations[first:], found.innovation_covs[first:], found.log.measurements[first:]
+    return [one._replace(step=one.step + first, since=one.since + first) for one in monitor.alarms(*seen)]
+
+
+def _without(found: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
+    """Alarms of a filter that does not see a channel."""
+    measurements = found.log.measurements.copy()
+    measurements[:, channel] = np.nan
+    again = estimate_with(found.filter, replace(found.log, measurements=measurements), noise=found.noise)
+    return [one for one in _alarms(again, monitor, first) if one.channel != channel]
+
+
+def _statistical(alarms: Sequence[Alarm]) -> list[Alarm]:
+    return [one for one in alarms if one.test not in ("stuck", "missing")]
+
+
+def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
+    """Alarms of a channel that follow each other within some steps, by their first."""
+    found: list[list[Alarm]] = []
+    for one in alarms:
+        last = next((some for some in reversed(found) if some[-1].channel == one.channel), None)
+        if last is not None and one.step - last[-1].step <= memory:
+            last.append(one)
+        else:
+            found.append([one])
+    return found
+
+
+def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
+    """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
+
+    It begins with its first alarm; where the sensor is stuck or missing, with that, which explains the others.
+    """
+    one = next((alarm for alarm in some if alarm.test in ("stuck", "missing")), some[0])
+    unit = f" {channel.unit}" if channel.unit else ""
+    what = {
+        "outlier": f"an outlier {one.size:+.3g}{unit} off",
+        "variance": f"noise with {one.size:.2g} times the expected variance",
+        "stuck": "equal readings",
+        "missing": "no readings",
+    }.get(one.test, f"a bias of {one.size:+.3g}{unit}")
+    dt = float(np.median(np.diff(times)))
+    at = [time_text(times[step], dt, 5) for step in (one.since, one.step, some[-1].step)]
+    since = "" if one.test == "outlier" else f" since {at[0]} s, found"
+    found = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[one.step])} ({one.test})"
+    others = list(dict.fromkeys(alarm.test for alarm in some if alarm is not one))
+    if not others:
+        return found
+    return f"{found}; {len(some) - 1} more until {at[2]} s ({', '.join(others)})"
+
+
+# An estimate of a log as columns of a file.
+
+
+def columns_of(found: LogEstimate, told: LogAlarms | None = None) -> dict[str, np.ndarray]:
+    """Columns (K + 1,) by header: time, inputs and measurements, then the filter's output, all by symbol.
+
+    Of a state or output "omega_m" it is "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; of a channel "thrust"
+    "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N". With
+    a monitor "alarm_thrust" counts the tests that raise an alarm at a row.
+    """
+    log, model = found.log, found.model
+    columns = {"time_s": log.start + log.times}
+    for one, values in zip(log.input_quantities, log.inputs.T, strict=True):
+        columns[header_of("input", one)] = np.append(values, np.nan)
+    for one, values in zip(log.measured, log.measurements.T, strict=True):
+        columns[header_of("measured", one)] = values
+    for key in compared(found):
+        columns[header_of("reference", log.referred[key])] = log.references[key]
+    for one, mean, std in zip(model.states, found.means.T, found.stds.T, strict=True):
+        columns[header_of("", one)], columns[header_of("std", one)] = mean, std
+    for symbol, output in model.outputs.items():
+        quantity = output.quantity._replace(symbol=symbol)
+        columns[header_of("", quantity)], columns[header_of("std", quantity)] = found.output(symbol)
+    deviations = np.sqrt(np.maximum(np.einsum("kii->ki", found.innovation_covs), 0.0))
+    for one, values, std in zip(log.measured, found.innovations.T, deviations.T, strict=True):
+        columns[header_of("innovation", one)], columns[header_of("innovation_std", one)] = values, std
+    if told is not None:
+        for channel, one in enumerate(log.measured):
+            rows = [alarm.step for alarm in told.alarms if alarm.channel == channel]
+            counts = np.bincount(rows, minlength=log.steps + 1)
+            columns[header_of("alarm", one._replace(unit=""))] = counts.astype(np.float64)
+    return columns
+
+
+def header_of(what: str, quantity: Quantity) -> str:
+    """The header of a column: "std_omega_m_rad_per_s"."""
+    parts = (what, plain(quantity.symbol), suffix(quantity.unit))
+    return "_".join(part for part in parts if part)

@@ -10,20 +10,16 @@ from typing import NamedTuple
 from filters.algebra.matrices import Matrix, given, in_order
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import quotient, wrap
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place
+from filters.engine.belief import Kernels, memory_places, own_place
 from filters.pages.equations import Equations, PagedModel
-from filters.pages.memory import NumbersMemory
-from filters.pages.page import Page
-from filters.pages.programs import stored, with_kept
-from filters.pages.stages import Stage, as_calls, as_programs
+from filters.pages.kernels import Stage, as_calls, as_programs, stored, with_kept
+from filters.pages.page import NumbersMemory, Page
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.graphs import TooLarge
 from thruster_env.graphs.loops import cut
 from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of
-from thruster_env.model.layout import LANES, constants_reader, number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
 
 # Operations and sums of a stage: beyond, instructions take longer to compile than calls.
 MOST, MOST_SUMS = 14_000, 600
@@ -32,7 +28,7 @@ MOST, MOST_SUMS = 14_000, 600
 class MembersMemory(NumbersMemory):
     """The memory of an ensemble.
 
-    rows     the row of `filters.engine.layout`: its extras are what the filter keeps beside its members
+    rows     the row of `filters.engine.belief`: its extras are what the filter keeps beside its members
     given    u or z
     numbers  the model's, then the filter's own
     table    a row for each component of the members x, then scratch
@@ -57,13 +53,13 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     told = places.innovation, places.innovation_cov, places.log_likelihood
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
     started = page.started(model)
-    kept = model.kept = memory.keep(started)
+    kept = model.extras = memory.keep(started)
     moved, *rest, changed = with_kept(page.update(model, x, memory.z, memory.e))
     of_belief = memory.mean, memory.P
     return {
         "start": stored((prior, started), (x,), kept),
-        "advance": stored((page.advance(model, x, memory.u),), (x,)),
-        "settle": stored((page.settle(model, x, memory.w),), (x,)),
+        "advance": stored((page.propagate(model, x, memory.u),), (x,)),
+        "settle": stored((page.add_process_noise(model, x, memory.w),), (x,)),
         "analyse": stored((moved,), (x,)),
         "update": stored((moved, *rest, *moments(model, moved), changed), (x, *told, *of_belief), kept),
         "summarise": stored(moments(model, x), of_belief),

@@ -10,10 +10,9 @@ import numpy as np
 
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.sources import is_array
-from thruster_env.graphs.branches import on_every_side
+from thruster_env.graphs.branches import along, on_every_side
 from thruster_env.graphs.graphs import Graph, Number
 from thruster_env.graphs.programs import Place, values_of
-from thruster_env.graphs.slopes import along
 from thruster_env.graphs.tracing import traced
 from thruster_env.model.shape import Functions, Shape, constants_are_array
 

@@ -1,32 +1,22 @@
-"""A page of a particle filter as kernels of the engine: what it says of a particle is done for each of them.
-
-    x, kept = start(model, w),  w ~ N(0, I)
-    if the ESS is below its threshold: particles are resampled,  x, kept = renew(model, x, mean, P, e)
-    x, kept = settle(model, advance(model, x, u), w), advance once for each of the model's substeps
-    x, log_w, v, S, kept = update(model, x, log_w, z, e),  log_w the logarithms of the weights,  e ~ N(0, I)
-
-`kept` is a dictionary of what is kept besides x and log_w, and is left out where nothing is; a `P` is the
-covariance of a particle. The sum of e^log_w after an update is the likelihood, by which weights are then divided.
-A page with a `foresee` has particles resampled in the update, by the weights log_w + level:
-
-    mu, level, v, S = foresee(model, x, log_w, z),  mu is renewed with its own mean and P,
-    x, log_w, kept = update(model, mu, log_w, z, e),  log_w the logarithm of the sum of those weights, less that of
-                                                      N and less the level
-"""
+"""Particle filters in compiled code: stages of a page, and systematic resampling."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Callable
+from functools import cache, lru_cache
+from math import prod
 
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place
+from filters.algebra.matrices import Matrix, given
+from filters.algebra.members import on_branch
+from filters.algebra.operations import wrap
+from filters.algebra.samples import effective_size, normalised, weighted_covariance, weighted_mean, weights
+from filters.algebra.scalars import at_least
+from filters.engine.belief import Kernels, memory_places, own_place
 from filters.pages.equations import PagedModel
-from filters.pages.kernels import anything_measured
+from filters.pages.kernels import Stage, anything_measured, stored, with_kept
 from filters.pages.members import MembersMemory, predictor, works_of
 from filters.pages.page import Page
-from filters.particles.resampling import SCRATCH_ROWS, systematic_resampler
-from filters.particles.stages import Layout, stages_of
 from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.streams import (
     FILTER_KERNEL,
@@ -36,8 +26,146 @@ from thruster_env.core.streams import (
     fill_normals,
     uniform_block,
 )
-from thruster_env.model.layout import number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.graphs.programs import Place
+from thruster_env.model.shape import Functions, Shape, number_places
+
+# Where a page of a particle filter finds everything, and what it stores.
+
+
+LOWEST = -1e300  # of logarithms of weights
+
+
+class Layout:
+    """Where everything lies.
+
+    Attributes:
+        x, logarithm, weight: rows of the table, of which the weights are scratch, and lie behind what is kept.
+        kept: what is kept besides, in the table or the row.
+        size: the place of the ESS.
+        rows, extras: how many rows of the table and numbers of the row belong to the belief.
+    """
+
+    def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
+        """Give each its place."""
+        n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
+        self.x, self.logarithm = memory.x, given(Place("table", n), (), member=True, like=memory.x)
+        self.size, self.kept = Place("rows", first), {}
+        memory.end, rows = first + 1, n + 1
+        self.start = with_kept(page.initial(model, memory.w))  # type: ignore[misc]
+        for name, one in self.start[-1].items():
+            if name in page.per_particle:
+                place = Place("table", rows)
+                self.kept[name] = given(place, one.shape, symmetric=one.symmetric, member=True, like=memory.x)
+                rows += prod(one.shape)
+            else:
+                self.kept[name] = memory.another(one, symmetric=one.symmetric)
+        self.rows, self.extras, self.weight = rows, memory.end - first, Place("table", rows)
+        model.extras = self.kept
+
+    def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:
+        """Particles with their angles on one branch, their mean and their covariance."""
+        x = on_branch(x, model.state_angles, w)
+        cov = weighted_covariance(x, w)
+        return x, wrap(weighted_mean(x, w), model.state_angles), cov if P is None else cov + weighted_mean(P, w)
+
+
+def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
+    """What a page of a particle filter stores; see `filters.particles.kernels`."""
+    at = Layout(page, memory, model)
+    x, log_w, kept = at.x, at.logarithm, at.kept
+    innovation, cov, likelihood = memory.told
+    of_each = {
+        "start": (on_branch(at.start[0], model.state_angles), *at.start[1:]),
+        "advance": page.propagate(model, x, memory.u),
+        "settle": page.add_process_noise(model, x, memory.w),
+    }
+    if page.rejuvenate:
+        of_each["renew"] = page.rejuvenate(model, x, memory.mean, memory.P, memory.w)
+    stages = {name: stored(found, (x,), kept) for name, found in of_each.items()}
+    stages["choose"] = stored((weights(log_w),), (at.weight,))
+    stages["summarise"] = stored(at.moments(model, x, weights(log_w), kept.get("P")), (x, *memory.belief))
+    if page.lookahead:
+        mu, level, v, S = page.lookahead(model, x, log_w, memory.z)
+        w, first = normalised(log_w + level)
+        found: dict[Matrix | Place, Matrix] = {
+            x: mu,
+            log_w: -level,
+            innovation: v,
+            cov: S,
+            at.weight: w,
+            likelihood: first,
+        }
+        if page.rejuvenate:
+            found |= dict(zip(memory.belief, at.moments(model, mu, w, None)[1:], strict=True))
+        stages["foresee"] = stored(tuple(found.values()), tuple(found))
+        log_w = log_w + memory.read("rows", likelihood.at)
+    x, log_w, *told, changed = with_kept(page.update(model, x, log_w, memory.z, memory.e))
+    w, level = normalised(log_w)
+    x, *moments = at.moments(model, x, w, changed.get("P"))
+    log_w = at_least(log_w - level, LOWEST)  # a particle that expects no number has hardly any weight
+    results = x, log_w, level, effective_size(w), *moments, *told, changed
+    places: tuple[Matrix | Place, ...] = (
+        at.x,
+        at.logarithm,
+        likelihood,
+        at.size,
+        *memory.belief,
+        *(innovation, cov)[: len(told)],
+    )
+    return {**stages, "update": stored(results, places, kept)}
+
+
+# Systematic resampling of columns of a table, by weights in one of its rows.
+
+
+SCRATCH_ROWS = 3
+
+
+@cache
+def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
+    """Return `resample(table, size, u)`: rows 0 ... rows - 1 of N columns drawn by weight, for u in (0, 1).
+
+    New column j is the old column i in whose weight (u + j)/N of the sum of weights lies: i is drawn N w_i times
+    rounded up or down, and N w_i times on average. `SCRATCH_ROWS` rows from `scratch` on are written over; what
+    pads the table becomes a copy of the first column.
+
+    Source: Kitagawa (1996), "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models",
+    J. Computational and Graphical Statistics 5(1), appendix.
+    """
+    sums, parents, new = range(scratch, scratch + SCRATCH_ROWS)
+
+    @inlined
+    def resample(table, size, u):
+        total = 0.0
+        for i in range(size):
+            total += table[weights, i]
+            table[sums, i] = total
+            table[parents, i] = 0.0
+        if not total > 0.0:
+            return
+        # Where old column i starts among the new ones. One that is not drawn starts where the next one does,
+        # which writes over it: without a branch on chance this takes a third of the time.
+        parts = size / total
+        for i in range(1, size):
+            first = int(table[sums, i - 1] * parts - u + 1.0)
+            if first < size:
+                table[parents, first] = i
+        parent = 0.0
+        for j in range(size):
+            parent = table[parents, j] if table[parents, j] > parent else parent
+            table[parents, j] = parent
+        for i in range(rows):
+            for j in range(size):
+                table[new, j] = table[i, int(table[parents, j])]
+            for j in range(size):
+                table[i, j] = table[new, j]
+            for j in range(size, table.shape[1]):
+                table[i, j] = table[new, 0]
+
+    return resample
+
+
+# A page of a particle filter as kernels of the engine: what it says of a particle is done for each of them.
 
 
 @lru_cache(maxsize=64)
@@ -55,7 +183,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     innovation, cov, r_place, mean_place = places.innovation, places.innovation_cov, source.r, places.mean
     logarithm, size_place = n, layout.size.at
     threshold = page.places(own_place(shape)).get("resampling_threshold", 0)
-    move = systematic_resampler(n + 1 if page.foresee else layout.rows, layout.weight.at, scratch)
+    move = systematic_resampler(n + 1 if page.lookahead else layout.rows, layout.weight.at, scratch)
     (begin, _, drawn), (correct, _, proposed) = works["start"], works["update"]
     choose, moments, predict = works["choose"].work, works["summarise"].work, predictor(works, shape)
 
@@ -90,8 +218,8 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         choose(row, row, numbers, table, draws, size)
         resampled(memory, numbers, size)
 
-    chosen_anew = resampled if page.foresee else chosen
-    if page.renew:
+    chosen_anew = resampled if page.lookahead else chosen
+    if page.rejuvenate:
         renew, spread = works["renew"].work, works["renew"].draws
         choose_first = chosen_anew if resample else nothing
 
@@ -125,7 +253,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         row[likelihood] = 0.0
 
     first = nothing_foreseen
-    if page.foresee:
+    if page.lookahead:
         foresee = works["foresee"].work
 
         @inlined
@@ -151,7 +279,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
 
     rows = max(scratch + SCRATCH_ROWS, *(one.rows for one in works.values()))
     return Kernels(
-        *(n, m, rows, max(n, m), start, predict if page.foresee else predict_chosen, update, summarise),
+        *(n, m, rows, max(n, m), start, predict if page.lookahead else predict_chosen, update, summarise),
         extras=layout.extras,
         extra_kept_rows=layout.rows - n,
     )

@@ -1,4 +1,4 @@
-"""The bootstrap particle filter: a weighted sample of states, whose distribution may have any shape."""
+"""Particle filters: bootstrap, auxiliary, with the optimal proposal, and Rao-Blackwellised."""
 
 from __future__ import annotations
 
@@ -6,15 +6,160 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from filters.baselines.baselines import places_of
-from filters.engine.belief import Kernels
-from filters.ensembles.steps import advance, settle
-from filters.pages.page_filter import Page
+import numpy as np
+
+from filters.algebra.blocks import hstack, pick, zeros
+from filters.algebra.members import on_branch
+from filters.algebra.operations import divide, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import outer, root, square
+from filters.algebra.samples import log_density, weighted_covariance, weighted_mean, weighted_square, weights
+from filters.baselines import places_of
+from filters.engine.belief import Belief, Kernels
+from filters.ensembles.ensemble import add_process_noise, propagate
+from filters.gaussian import extended
+from filters.pages.page import Page
+from filters.particles import weighted
 from filters.particles.kernels import particle_kernels
-from filters.particles.proposal import OPTIMAL
-from filters.particles.renewal import draw, smooth, spread
-from filters.particles.weighted import ResampledFilter, expect, fit, start
+from filters.particles.weighted import (
+    ResampledFilter,
+    WeightedFilter,
+    draw,
+    expect,
+    fit,
+    initial_weighted,
+    smooth,
+    spread,
+)
 from thruster_env.core.checks import one_of
+from thruster_env.core.streams import FILTER_PROPOSAL, GROUP, fill_normals
+from thruster_env.model.shape import padded
+
+# The auxiliary particle filter: particles are chosen by how well their prediction fits the measurement.
+
+
+def initial_auxiliary(model, w):
+    """A particle of the prior, without noise."""
+    return weighted.initial_weighted(model, w), {"noise": zeros(model.Q, len(w))}
+
+
+def add_process_noise_auxiliary(model, x, w):
+    """The end of a step, of which the noise is kept."""
+    noise = model.Q_root @ w
+    return on_branch(x + noise, model.state_angles), {"noise": noise}
+
+
+def lookahead(model, x, log_w, z):
+    """A particle without its noise, log N(z; h(mu), R + V), and innovation and S of all with noise."""
+    seen, mu = present(z), x - model.extras["noise"]
+    y, v, S = expect(model, x, log_w, z)
+    without = only(seen, model.h(mu))
+    V = weighted_square(wrap(y - without, model.measurement_angles), weights(log_w))
+    rest = only(seen, wrap(z - without, model.measurement_angles))
+    return mu, log_density(rest, V + uncorrelated(seen, model.R), seen), v, S
+
+
+def update_auxiliary(model, x, log_w, z, e):
+    """The measurement z: particles mu that were chosen, with the noise of the places to which they went.
+
+    `log_w` is the logarithm of the mean of all lambda, over N(z; h(mu), R + V).
+    """
+    x = x + model.extras["noise"]  # which was not resampled
+    return x, log_w + fit(model, only(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AuxiliaryParticleFilter(WeightedFilter):
+    """Auxiliary particle filter: parents are drawn by how well their noise-free prediction fits z.
+
+        predict: mu_j = f(x_j, u),  x_j = mu_j + noise_j,  noise_j ~ N(0, Q); both are kept
+        update:  V = sum of w_j (h(x_j) - h(mu_j))(h(x_j) - h(mu_j))'
+                 lambda_j = w_j N(z; h(mu_j), R + V), parents i(j) drawn by lambda (systematic)
+                 x_j = mu_i(j) + noise_j,  w_j = N(z; h(x_j), R)/N(z; h(mu_i(j)), R + V), normalised
+                 regularised: x_j += c h e_j before it is weighed,  e_j ~ N(0, covariance of mu by lambda)
+                 L = (sum of lambda_j) (mean of w_j before normalisation)
+        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
+
+    The look-ahead needs the measurement, which is known in the update only. The prediction therefore keeps each
+    particle's noise; the update removes it, draws parents by mu, and adds it again: the noise does not depend on
+    the draw, as the method requires. Before an update a belief equals the bootstrap filter's. Directly after the
+    prior or another update there is no noise, and parents are drawn by exact weights.
+
+    V, the covariance that the noise causes in the measurement, keeps the weights w_j bounded where the noise is
+    large: with V = 0, the textbook choice, a few particles that mu had ruled out would take all the weight.
+
+    The log-likelihood is log L; innovation, S and restarts are the bootstrap filter's. `Belief.members` is
+    (2 n + 1, N): particles, log weights, noise. `Belief.extras` holds the effective sample size.
+
+    Attributes are those of `WeightedFilter`, c its regularisation and h as in `ParticleFilter`.
+
+    Source: Pitt, Shephard (1999), "Filtering via simulation: auxiliary particle filters", section 3, where the
+    first stage's density is free; the likelihood: Pitt (2002), "Smooth particle filters for likelihood evaluation
+    and maximisation".
+    """
+
+    name: ClassVar[str] = "apf"
+    page: ClassVar[Page] = Page(
+        propagate,
+        add_process_noise_auxiliary,
+        update_auxiliary,
+        initial=initial_auxiliary,
+        rejuvenate=spread,
+        lookahead=lookahead,
+        per_particle=("noise",),
+    )
+
+
+# The optimal proposal: particles are drawn by what is measured, and weighted by how well it was predicted.
+
+
+def initial_optimal(model, w):
+    """A particle of the prior, without noise."""
+    x, kept = initial_auxiliary(model, w)
+    return x, {"noise_cov": sym(zeros(model.Q, len(w), len(w))), **kept}
+
+
+def add_process_noise_optimal(model, x, w):
+    """The end of a step, of which the noise and its Q are kept: a later update may meet another Q."""
+    x, kept = add_process_noise_auxiliary(model, x, w)
+    return x, {"noise_cov": model.Q, **kept}
+
+
+def propose(model, x, d, Q, z, e):
+    """Particles x = mu + d and their noise d ~ N(0, Q), moved by the measurement z; logarithms of their weights.
+
+    Conditioning d on z in the manner of an ensemble filter, with a perturbation of z for each particle, makes of a
+    sample of the prior one of the proposal. Without noise, and with Q = 0, nothing moves.
+    """
+    seen, mu = present(z), x - d
+    H, R = only(seen, model.H(mu)), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - model.h(mu), model.measurement_angles))
+    S = sym(H @ Q @ H.T + R)
+    d = d + divide(Q @ H.T, S) @ (v - H @ d - only(seen, model.R_root @ e))
+    x = mu + d
+    rest = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    return x, d, log_density(v, S, seen) + log_density(rest, R, seen) - log_density(v - H @ d, R, seen)
+
+
+def update_optimal(model, x, log_w, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    _, v, S = expect(model, x, log_w, z)
+    x, d, level = propose(model, x, model.extras["noise"], model.extras["noise_cov"], z, e)
+    return (
+        x,
+        log_w + level,
+        v,
+        S,
+        {"noise": zeros(model.Q, len(x)), "noise_cov": sym(zeros(model.Q, len(x), len(x)))},
+    )
+
+
+OPTIMAL = Page(
+    propagate, add_process_noise_optimal, update_optimal, initial=initial_optimal, per_particle=("noise",)
+)
+
+
+# The bootstrap particle filter: a weighted sample of states, whose distribution may have any shape.
+
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
@@ -84,7 +229,7 @@ class ParticleFilter(ResampledFilter):
     """
 
     name: ClassVar[str] = "pf"
-    page: ClassVar[Page] = Page(advance, settle, update, start=start, renew=spread)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update, initial=initial_weighted, rejuvenate=spread)
     proposal: str = "prior"
     resampling: str = "systematic"
     smoothed: Any = ()
@@ -118,12 +263,150 @@ class ParticleFilter(ResampledFilter):
         """The page of the choices."""
         page = super().written_page
         if self.proposal == "optimal":
-            page = OPTIMAL._replace(renew=page.renew, own=page.own)
+            page = OPTIMAL._replace(rejuvenate=page.rejuvenate, own=page.own)
         if self.resampling == "gaussian":
-            return page._replace(renew=draw)
-        return page._replace(renew=smooth) if self.smoothed and self.regularisation else page
+            return page._replace(rejuvenate=draw)
+        return page._replace(rejuvenate=smooth) if self.smoothed and self.regularisation else page
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         model, resample = self.kernel_model, self.resampling == "systematic"
         return particle_kernels(self.written_page, model.functions, model.shape, resample)
+
+
+# The Rao-Blackwellised particle filter: some states are sampled, a Kalman filter per particle has the others.
+
+
+def sample(x, P, e, sampled):
+    """Draw the sampled states of N(x, P); mean and covariance of all, if these are known.
+
+    With the sampled states first, P = [A 0; B C] [A 0; B C]', and [x_s; x_l] = mean + [A; B] e leaves C C'.
+    """
+    n, count = len(x), len(sampled)
+    order = (*sampled, *(i for i in range(n) if i not in sampled))
+    back, places = tuple(map(order.index, range(n))), tuple(range(n))
+    L = root(pick(P, order, order))
+    AB, C = pick(L, back, places[:count]), pick(L, back, places[count:])
+    if count == n:
+        return x + AB @ e, {"P": P * 0.0}
+    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}  # of e the first ones count
+
+
+def initial_rao_blackwell(model, w):
+    """A particle of the prior."""
+    return sample(model.prior_mean, square(model.prior_root), w, model.own.sampled)
+
+
+def propagate_rao_blackwell(model, x, u):
+    """One of the model's substeps."""
+    x, P = extended.propagate(model, x, model.extras["P"], u)
+    return x, {"P": P}
+
+
+def add_process_noise_rao_blackwell(model, x, w):
+    """The end of a step."""
+    x, P = extended.add_process_noise(model, x, model.extras["P"])
+    x, kept = sample(x, P, w, model.own.sampled)
+    return on_branch(x, model.state_angles), kept
+
+
+def spread_rao_blackwell(model, x, mean, P, e):
+    """Copies of a particle, whose sampled states get a kernel's covariance, of which the next step draws."""
+    flags = model.own.flags
+    return x, {"P": model.extras["P"] + sym(P * outer(flags, flags)) * model.own.kernel}
+
+
+def update_rao_blackwell(model, x, log_w, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    x, P, v, S, level = extended.update(model, x, model.extras["P"], z)
+    w = weights(log_w)
+    v = on_branch(v, model.measurement_angles, w)
+    mean, cov = weighted_mean(v, w), weighted_covariance(v, w) + weighted_mean(S, w)
+    return x, log_w + level, wrap(mean, model.measurement_angles), cov, {"P": P}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RaoBlackwellisedParticleFilter(ResampledFilter):
+    """Rao-Blackwellised particle filter: some states are sampled, a Kalman filter per particle has the others.
+
+    A particle is a mean x_j of all states and a P_j that is zero in the rows and columns of the sampled ones:
+
+        predict: if ESS < threshold N, resample the particles by weight (systematic), and all w_j = 1/N;
+                 regularised: P_j += (c h)^2 cov of the sampled states, h as in `ParticleFilter` for their number
+                 x_j = f(x_j, u),  P_j = F_j P_j F_j' + Q,  F_j = df/dx at x_j
+                 with the sampled states s first and l the others,  P_j = [A 0; B C] [A 0; B C]':
+                 x_s += A e_j,  x_l += B e_j,  e_j ~ N(0, I),  P_j of l = C C'
+        update:  each particle by the extended filter, with h and H at x_j;
+                 w_j = w_j N(v_j; 0, S_j)/L,  L = sum of w_j N(v_j; 0, S_j)
+        belief:  mean = sum of w_j x_j,
+                 cov = sum of w_j P_j + sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
+
+    The Kalman filters are exact where, with the sampled states given, f and h are affine in the others, whatever
+    Q: the joint P_j holds what the step of the sampled states tells of the others. There particles have to cover
+    few states, and it takes fewer of them than `pf` does. Elsewhere each particle linearises by itself. If all
+    states are sampled, this is `pf`.
+
+    The log-likelihood is log L; innovation and S are those of the mixture before the measurement. `Belief.members`
+    is (n + 1 + n^2, N): x_j, log weight, and P_j by rows, of which those on and below the diagonal are used.
+    `Belief.extras` holds the ESS.
+
+    Attributes:
+        sampled: indices of the sampled states, at least one; -1 is the last.
+
+    The other attributes are those of `ResampledFilter`, c its regularisation.
+
+    Raises:
+        ValueError: if a parameter is out of its range.
+
+    Source: Schon, Gustafsson, Nordlund (2005), "Marginalized particle filters for mixed linear/nonlinear
+    state-space models"; Doucet, de Freitas, Murphy, Russell (2000), "Rao-Blackwellised particle filtering for
+    dynamic Bayesian networks".
+    """
+
+    name: ClassVar[str] = "rbpf"
+    page: ClassVar[Page] = Page(
+        propagate_rao_blackwell,
+        add_process_noise_rao_blackwell,
+        update_rao_blackwell,
+        initial=initial_rao_blackwell,
+        rejuvenate=spread_rao_blackwell,
+        per_particle=("P",),
+    )
+    unrolled: ClassVar[tuple[str, ...]] = ("sampled",)
+    ensemble_size: int = 100
+    sampled: Any = (0,)
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        places = places_of("sampled", self.sampled, self.model.n)
+        if not places:
+            raise ValueError("sampled must be a list of indices, at least one, but got none")
+        object.__setattr__(self, "sampled", places)
+
+    @property
+    def spread_states(self) -> int:
+        """How many states the kernel spreads."""
+        return len(self.sampled)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """What the page and resampling read: of the kernel its share of the covariance of sampled states."""
+        given = super().parameters
+        return {**given, "kernel": given["width"] ** 2, "flags": [i in self.sampled for i in range(self.model.n)]}
+
+    def sample(self, belief: Belief) -> np.ndarray:
+        """A state (n, N) drawn from each particle's N(x_j, P_j), and the row of log weights."""
+        n, size = self.model.n, self.ensemble_size
+        values, vectors = np.linalg.eigh(self.particle_covariances(belief))
+        draws = np.zeros(padded(n * size, GROUP))
+        fill_normals(draws, n * size, belief.step, FILTER_PROPOSAL, *belief.key)
+        e = np.sqrt(np.maximum(values, 0.0)) * draws[: n * size].reshape(size, n)
+        drawn = belief.members[:n] + np.einsum("jab,jb->aj", vectors, e)
+        return np.concatenate([drawn, belief.members[n : n + 1]])
+
+    def particle_covariances(self, belief: Belief) -> np.ndarray:
+        """The covariances P_j (N, n, n) of the particles of a belief."""
+        n, size = self.model.n, self.ensemble_size
+        lower = np.tril(belief.members[n + 1 :].reshape(n, n, size).transpose(2, 0, 1))
+        return lower + np.tril(lower, -1).transpose(0, 2, 1)

@@ -1,6 +1,8 @@
-"""What particle filters share: what a weighted sample expects to be measured, and its size.
+"""Weighted samples as a belief: moments, effective size, and the regularised kernel of resampled particles.
 
-What a page of a particle filter is, `filters.particles.kernels` says.
+Sources: Musso, Oudjane, Le Gland (2001), "Improving regularised particle filters"; Kotecha, Djuric (2003),
+"Gaussian particle filtering"; Liu, West (2001), "Combined parameter and state estimation in simulation-based
+filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d))^2 of `smooth`.
 """
 
 from __future__ import annotations
@@ -9,19 +11,52 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from filters.algebra.densities import log_density
+from filters.algebra.members import mean as mean_of
 from filters.algebra.members import on_branch
 from filters.algebra.operations import only, present, uncorrelated, wrap
-from filters.algebra.samples import weighted_covariance, weighted_mean, weights
+from filters.algebra.points import outer, root
+from filters.algebra.samples import log_density, weighted_covariance, weighted_mean, weights
 from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
-from filters.pages.page_filter import FilterWithPage, Page
+from filters.pages.page import Page
+from filters.pages.page_filter import FilterWithPage
 from filters.particles.kernels import particle_kernels
-from filters.particles.renewal import kernel_width
 from thruster_env.core.checks import at_least, finite, positive
 
+# What is done with resampled particles, copies of one another, of a sample with some mean and covariance P.
 
-def start(model, w):
+
+def spread(model, x, mean, P, e):
+    """Particles that are copies of one, spread by a kernel with a part of the covariance of all."""
+    return x + root(P) @ e * model.own.width
+
+
+def kernel_width(count: int, size: int) -> float:
+    """The width h = (4/(d + 2))^(1/(d + 4)) N^(-1/(d + 4)) of a kernel for N particles in d dimensions.
+
+    It makes the mean integrated square error of the density least where that is Gaussian.
+
+    Source: Silverman (1986), Density Estimation for Statistics and Data Analysis, section 4.3.2.
+    """
+    return (4.0 / ((count + 2.0) * size)) ** (1.0 / (count + 4.0))
+
+
+def draw(model, x, mean, P, e):
+    """Particles of a Gaussian, in the place of others."""
+    return mean + root(P) @ e
+
+
+def smooth(model, x, mean, P, e):
+    """The states that are `smoothed` drawn together by a, and spread so that their covariance stays."""
+    own = model.own
+    L = root(P * outer(own.smoothed, own.smoothed))
+    return x - own.smoothed * (x - mean_of(x)) * own.drawn + L @ e * own.width
+
+
+# What particle filters share: what a weighted sample expects to be measured, and its size.
+
+
+def initial_weighted(model, w):
     """A particle of the prior."""
     return model.prior_mean + model.prior_root @ w
 
@@ -81,7 +116,7 @@ class WeightedFilter(FilterWithPage):
     def written_page(self) -> Page:
         """The page, with the kernel where that does something."""
         page = super().written_page
-        return page if self.regularisation else page._replace(renew=None)
+        return page if self.regularisation else page._replace(rejuvenate=None)
 
     @property
     def size(self) -> int:

@@ -9,17 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from filters.engine.belief import Kernels
+from filters.engine.belief import Kernels, memory_places, restart_if_lost
 from filters.engine.compile import new_memory
-from filters.engine.layout import memory_places
-from filters.engine.restart import restart_if_lost
-from filters.ensembles.ensemble import EnsembleFilter
-from filters.ensembles.page_is_all import named
+from filters.ensembles.ensemble import EnsembleFilter, named
 from filters.pages.members import analysis_of
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
-from thruster_env.core.tuples import joiner, vector_part, written_out
-from thruster_env.model.layout import number_places
+from thruster_env.model.shape import number_places
 from thruster_env.model.state_space import StateSpaceModel
 
 

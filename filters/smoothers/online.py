@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from filters.engine.batch_session import Beliefs
+from filters.engine.batch import Beliefs
 from filters.engine.session import Session
 from filters.filter import Filter
 from filters.pages.page_filter import PageFilter
-from filters.smoothers.backwards import passes
-from filters.smoothers.relations import relation_of
+from filters.smoothers.points import relation_of
+from filters.smoothers.rts import passes
 from thruster_env.core.checks import at_least
 
 

@@ -11,30 +11,43 @@ its page of a smoother, a `Relation`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
+
+import numpy as np
 
 from filters.algebra.blocks import careful
 from filters.algebra.operations import eye, quotient, sym, wrap
-from filters.gaussian.schedule import constants_at
+from filters.engine.batch import Estimates
+from filters.engine.belief import memory_places
+from filters.gaussian.kalman import constants_at
+from filters.pages.equations import Equations
+from filters.pages.kernels import Stage, programs_of, stored, together
+from filters.pages.page import Page, RowMemory
+from filters.pages.page_filter import PageFilter
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.threads import spread
+from thruster_env.model.shape import Functions, Shape, number_places
 
 
 class Relation(NamedTuple):
     """A page of a smoother: from x and P at a step to the next one, and the link between the two."""
 
-    begin: Callable  # begin(model, x, P): what is predicted
-    advance: Callable  # advance(model, *predicted, u), in each of the model's substeps
+    represent: Callable  # represent(model, x, P): what is predicted
+    propagate: Callable  # propagate(model, *predicted, u), in each of the model's substeps
     link: Callable  # link(model, x, P, *predicted): predicted x, G and the bracket
 
 
 # The page of filters that linearise
 
 
-def begin(model, x, P):
+def represent_jacobian(model, x, P):
     """The mean, and the Jacobian of no substep."""
     return x, eye(P)
 
 
-def advance(model, x, F, u):
+def propagate_jacobian(model, x, F, u):
     """One of the model's substeps."""
     return model.f(x, u), model.F(x, u) @ F
 
@@ -47,13 +60,13 @@ def link(model, x, P, mean, F):
     return mean, G, sym(A @ P @ A.T) + sym(G @ model.Q @ G.T)
 
 
-def advance_scheduled(model, x, F, u):
+def propagate_scheduled_jacobian(model, x, F, u):
     """One of the substeps of the affine model at an input."""
-    return advance(model.at(constants_at(model, u)), x, F, u)
+    return propagate_jacobian(model.at(constants_at(model, u)), x, F, u)
 
 
-LINEARISED = Relation(begin, advance, link)
-SCHEDULED = Relation(begin, advance_scheduled, link)
+LINEARISED = Relation(represent_jacobian, propagate_jacobian, link)
+SCHEDULED = Relation(represent_jacobian, propagate_scheduled_jacobian, link)
 
 
 def back(model, x, P, linked, later):
@@ -61,3 +74,149 @@ def back(model, x, P, linked, later):
     (mean, G, C), (later_x, later_P) = linked, later
     x = wrap(x + G @ wrap(later_x - mean, model.state_angles), model.state_angles)
     return x, sym(C + sym(G @ later_P @ G.T))
+
+
+# Passes backwards over what a filter estimated, by its `Relation`: the smoother of Rauch, Tung and Striebel.
+
+
+ROUNDING = 1e-12  # of angles that were wrapped [rad]
+Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
+
+
+def smooth_backwards(
+    filter_: PageFilter,
+    relation: Relation,
+    estimates: Estimates,
+    inputs: np.ndarray,
+    lag: int,
+    process_noise: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means (B, K + 1, n) and covariances given `lag` later measurements, from a filter's estimates.
+
+    A pass starts `lag` steps after each step; the last lag + 1 steps share one. Nothing is carried back over a
+    restart from the prior.
+
+    Args:
+        filter_: the filter, whose `kernel_model` and `numbers` are used.
+        relation: of two successive states.
+        estimates: of the filter, from `filters.run`.
+        inputs: (B, K, p).
+        lag: number of later measurements, 0 ... K.
+        process_noise: rows (Q, its root) of each step, of `filters.engine.batch.noise_rows`; none for the model's.
+    """
+    model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
+    # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
+    apart = np.abs(difference(estimates.means, model.prior_mean, angles))
+    means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
+    is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
+    given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
+    numbers = filter_.numbers[None]
+    if len(process_noise):
+        numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_places(model.n, model.m).q
+        numbers[:, q : q + process_noise.shape[1]] = process_noise
+    return passes(filter_, relation)(given, inputs, lag, numbers)
+
+
+def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
+    """Return the function that makes the smoother's passes.
+
+    It takes what a filter estimated, the inputs, the lag, and the numbers that the filter read: (1, count) of all
+    steps or (K, count) of each; those of the filter if None.
+    """
+    functions, shape, of_filter = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers[None]
+    run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
+
+    def smoothed(
+        given: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        numbers = of_filter if numbers is None else numbers
+        means, covs = np.empty_like(given[0]), np.empty_like(given[1])
+        work = partial(run_part, given, inputs, numbers, lag, means, covs)
+        work(0, 1) if len(means) == 1 else spread(work, len(means))
+        return means, covs
+
+    return smoothed
+
+
+@lru_cache(maxsize=64)
+def _smoother(
+    relation: Relation, page: Page, functions: Functions, shape: Shape, interpreting: bool
+) -> CompiledOrPython:
+    """The pass over runs, of programs of a relation."""
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        x, p = memory.x, memory.P
+        begun = together(relation.represent(model, x, p))
+        flying = [memory.another(one) for one in begun]
+        linked = relation.link(model, x, p, *flying)
+        links = [memory.another(one, symmetric=one.symmetric) for one in linked]
+        later = memory.another(x), memory.another(p, symmetric=True)
+        advanced = together(relation.propagate(model, *flying, memory.u))
+        return [
+            stored(begun, flying),
+            stored(advanced, flying),
+            stored(linked, links),
+            stored(back(model, x, p, links, later), (x, p)),
+        ]
+
+    memory, works, _ = programs_of(page, functions, shape, stages)
+    first_step, substep, connect, correct = works
+    n, length, belief, mean_place = shape.n, memory.end, shape.n + shape.n**2, memory_places(shape.n, shape.m).mean
+    later_place, width = length - belief, belief + n * n  # behind the link, which is predicted mean, gain, bracket
+    link_place, substeps = later_place - width, number_places(n, shape.m).substeps
+    fingerprint = function_fingerprint(*works, within=__name__)
+
+    @inlined
+    def put(row, at, means, covs, b, k):
+        for i in range(n):
+            row[at + i] = means[b, k, i]
+            for j in range(n):
+                row[at + n + i * n + j] = covs[b, k, i, j]
+
+    @inlined
+    def copy(target, at, source, first, count):
+        for i in range(count):
+            target[at + i] = source[first + i]
+
+    def smooth(given, inputs, numbers, lag, means, out_covs, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        filtered, covs, restarted = given
+        steps = inputs.shape[1]
+        u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)
+        now = np.zeros(numbers.shape[1])  # each thread its own: slices of arrays that threads share cost counts
+        for b in range(first, last):
+            for k in range(steps):
+                if k < numbers.shape[0]:
+                    for i in range(now.shape[0]):
+                        now[i] = numbers[k, i]
+                for i in range(u.shape[0]):
+                    u[i] = inputs[b, k, i]
+                put(row, mean_place, filtered, covs, b, k)
+                first_step(row, u, now)
+                for _ in range(int(now[substeps])):
+                    substep(row, u, now)
+                connect(row, u, now)
+                total = 0.0
+                for i in range(belief):
+                    total += abs(row[link_place + i])
+                if restarted[b, k + 1] or not total < 1e300:
+                    for i in range(belief):
+                        row[link_place + i] = 0.0
+                    copy(row, link_place + belief, row, mean_place + n, n * n)
+                copy(links, k * width, row, link_place, width)
+            for end in range(lag, steps + 1):
+                put(row, later_place, filtered, covs, b, end)
+                for k in range(end, end - lag - 1, -1):
+                    if k < end:
+                        for i in range(n):
+                            row[mean_place + i] = filtered[b, k, i]
+                        copy(row, link_place, links, k * width, width)
+                        correct(row, u, now)
+                        copy(row, later_place, row, mean_place, belief)
+                    if end == steps or k == end - lag:
+                        for i in range(n):
+                            means[b, k, i] = row[later_place + i]
+                            for j in range(n):
+                                out_covs[b, k, i, j] = row[later_place + n + i * n + j]
+
+    return CompiledOrPython(smooth)

@@ -13,11 +13,11 @@ from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.page_filter import PageFilter
-from filters.restarts import warn_of_restarts
-from filters.smoothers.backwards import smooth_backwards
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.modes import smoothed_modes
-from filters.smoothers.relations import relation_of
+from filters.smoothers.points import relation_of
+from filters.smoothers.rts import smooth_backwards
+from filters.starts import warn_of_restarts
 from thruster_env.core.checks import at_least
 
 

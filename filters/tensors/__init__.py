@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -30,6 +30,6 @@ def torch(filter_: Filter, **arguments: Any) -> TensorFilter:
     form = getattr(filter_, "form", "")
     if form == "ud":
         raise ValueError(f"a filter on tensors must have another form, such as 'square-root', but got {form!r}")
-    from filters.tensors.filter import TensorFilter  # torch takes seconds to import
+    from filters.tensors.filter import TensorFilter
 
     return TensorFilter(filter_, **arguments)

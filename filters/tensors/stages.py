@@ -1,7 +1,13 @@
-"""A page's stages as functions of tensors: of a belief, an input, a measurement, and the numbers of a model."""
+"""A page's stages as functions of tensors: of a belief, an input, a measurement, and the numbers of a model.
+
+torch's autograd then differentiates it. A vector of which each member of an ensemble has one is a matrix
+(..., rows, members). An operation that nothing is said of here, such as a function of the model, computes on
+tensors itself.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -9,19 +15,259 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filters.algebra import blocks, geometric, matrices, members, operations, points, scalars
+from filters.algebra import samples as densities
 from filters.algebra.matrices import Matrix, Operation, in_order, never
 from filters.pages.equations import PagedModel
-from filters.pages.kernels import stages_of
+from filters.pages.kernels import Stage, stages_of
 from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as members_stages
-from filters.pages.memory import NumbersMemory, RowMemory
-from filters.pages.page import Page
-from filters.pages.stages import Stage
-from filters.tensors.algebra import work_out
+from filters.pages.page import NumbersMemory, Page, RowMemory
+from thruster_env.core.angles import TURN
+from thruster_env.core.matrices import RESOLUTION
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, normal_block
 from thruster_env.graphs.programs import Place
-from thruster_env.model.layout import LANES, padded
-from thruster_env.model.shape import Shape
+from thruster_env.model.shape import LANES, Shape, padded
+
+# What pages of filters say, worked out of tensors: a batch (..., rows, columns) in the place of each matrix.
+
+
+def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:
+    """Values of matrices of a graph, in an order of `matrices.in_order`, given those that are known.
+
+    Args:
+        order: all that is wanted, after what it is made of.
+        known: tensors (..., *shape) for matrices that are given.
+        like: a tensor of the dtype and on the device of all.
+    """
+    values: dict[Matrix, Any] = dict(known)
+    for one in order:
+        if one not in values:
+            arguments = (_with(a, one, values) if isinstance(a, Matrix) else a for a in one.arguments)
+            if one.operation in CONSTANT:
+                size = one.arguments[0].shape
+                values[one] = torch.as_tensor(one.operation.compute(np.zeros(size)), dtype=like.dtype).to(
+                    like.device
+                )
+            elif one.operation in OF_SHAPE:
+                values[one] = OF_SHAPE[one.operation](len(one.shape) + one.member, *arguments)
+            else:
+                values[one] = RULES.get(one.operation, one.operation.compute)(*arguments)
+    return values
+
+
+def _with(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
+    """The value of an argument; a number, or a vector beside those of members, gets the result's dimensions."""
+    found, missing = values[a], len(one.shape) + one.member - len(a.shape) - a.member
+    return found[(..., *[None] * missing)] if one.operation in BY_ENTRIES and missing else found
+
+
+def _wrapped(x: Tensor) -> Tensor:
+    return x - TURN * torch.ceil((x - math.pi) / TURN)
+
+
+def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
+    return a @ b if dimensions == 2 else (a @ b[..., None])[..., 0]
+
+
+def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
+    """The quotient C S^-1 by L L' = S."""
+    right = c.mT if dimensions == 2 else c[..., None]
+    found = torch.cholesky_solve(right, root)
+    return found.mT if dimensions == 2 else found[..., 0]
+
+
+def _only(dimensions: int, seen: Tensor, a: Tensor) -> Tensor:
+    return torch.where(seen if dimensions == 1 else seen[..., None], a, 0.0)
+
+
+def wrapped_where(x: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    """Vectors x (..., n), their angles (flags) in (-pi, pi]."""
+    return _on_one_branch(1, x, angles) if any(angles) else x
+
+
+def _on_one_branch(dimensions: int, x: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    return torch.where(_flags(dimensions, angles, x), _wrapped(x), x)
+
+
+def _on_one_side(dimensions: int, y: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    middle = torch.atan2(y.sin().sum(-1, keepdim=True), y.cos().sum(-1, keepdim=True))
+    return torch.where(_flags(dimensions, angles, y), middle + _wrapped(y - middle), y)
+
+
+def _flags(dimensions: int, angles: tuple[bool, ...], like: Tensor) -> Tensor:
+    flags = torch.tensor(angles, device=like.device)
+    return flags if dimensions == 1 else flags[:, None]
+
+
+def _symmetric(a: Tensor) -> Tensor:
+    return 0.5 * (a + a.mT)
+
+
+def _uncorrelated(seen: Tensor, r: Tensor) -> Tensor:
+    alone = torch.eye(r.shape[-1], dtype=torch.bool, device=r.device)
+    return torch.where(seen[..., :, None] & seen[..., None, :] | alone, r, 0.0)
+
+
+def factor(s: Tensor) -> Tensor:
+    """The lower triangular L with L L' = s; NaN where s is not positive definite."""
+    lower, failed = torch.linalg.cholesky_ex(s)
+    return torch.where((failed == 0)[..., None, None], lower, math.nan)
+
+
+def density(v: Tensor, root: Tensor, seen: Tensor) -> Tensor:
+    """Log N(v; 0, L L') of the entries that are seen, for L = root, (...)."""
+    scaled = _forward_quotient(root, v)
+    logs = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)) + densities.LEVEL
+    return -0.5 * (scaled * scaled).sum(-1) - torch.where(seen, logs, 0.0).sum(-1)
+
+
+def _forward_quotient(lower: Tensor, v: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(lower, v[..., None], upper=False)[..., 0]
+
+
+def root(p: Tensor) -> Tensor:
+    """`points.root`, column by column."""
+    resolution = RESOLUTION * torch.finfo(p.dtype).eps / torch.finfo(torch.float64).eps
+    columns: list[Tensor] = []
+    for j in range(p.shape[-1]):
+        rest = p[..., j:, j]
+        for column in columns:
+            rest = rest - column[..., j:] * column[..., j, None]
+        singular = rest[..., :1] <= resolution * p[..., j, j, None]
+        pivot = torch.where(singular, 1.0, rest[..., :1]).sqrt()
+        below = torch.where(singular, 0.0, rest / pivot)
+        columns.append(torch.nn.functional.pad(below, (j, 0)))
+    return torch.stack(columns, dim=-1)
+
+
+def where(condition: Tensor, a: Tensor, b: Tensor, dimensions: int) -> Tensor:
+    """`a` or `b`, each with so many dimensions beside those of the batch, which the condition has alone."""
+    return torch.where(condition[(..., *[None] * dimensions)], a, b)
+
+
+def _reciprocal(a: Tensor) -> Tensor:
+    """1/a; infinite, and without a slope, where a is zero, so that what is not chosen has no NaN for a slope."""
+    return torch.where(a == 0, math.inf, 1.0 / torch.where(a == 0, 1.0, a))
+
+
+def _triangle(a: Tensor) -> Tensor:
+    """`blocks.triangle`, row by row."""
+    rows, columns = list(a.unbind(-2)), []
+    for i, row in enumerate(rows):
+        square = (row * row).sum(-1, keepdim=True)
+        length = torch.where(square > 0, square, 1.0).sqrt()
+        direction = torch.where(square > 0, row / length, 0.0)
+        below = [(direction * other).sum(-1, keepdim=True) for other in rows[i + 1 :]]
+        rows[i + 1 :] = [other - part * direction for other, part in zip(rows[i + 1 :], below, strict=True)]
+        column = torch.cat([torch.where(square > 0, length, 0.0), *below], -1)
+        columns.append(torch.nn.functional.pad(column, (i, 0)))
+    return torch.stack(columns, -1)
+
+
+def _joined(dimension: int, a: Tensor, b: Tensor) -> Tensor:
+    batch = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    return torch.cat([one.expand(*batch, -1, -1) for one in (a, b)], dimension)
+
+
+def _hats(u: Tensor, nodes: Tensor) -> Tensor:
+    """`points.hats`: of neighbours the part of the way between them."""
+    part = ((u - nodes[..., :-1]) / nodes.diff(dim=-1)).clamp(0.0, 1.0)
+    return torch.nn.functional.pad(part, (1, 0), value=1.0) - torch.nn.functional.pad(part, (0, 1))
+
+
+def _covariance(x: Tensor, y: Tensor) -> Tensor:
+    """The sample covariance of members, with the divisor N - 1."""
+    return _deviations(x) @ _deviations(y).mT / (x.shape[-1] - 1)
+
+
+def _deviations(x: Tensor) -> Tensor:
+    return x - x.mean(-1, keepdim=True)
+
+
+def _stretches(before: Tensor, after: Tensor, part: Tensor) -> Tensor:
+    """`members.stretches`; where nothing is left there is no slope."""
+    there = after > 0
+    ratio = torch.where(there & (before > 0), before, 1.0) / torch.where(there, after, 1.0)
+    lost = torch.where(before > 0, ratio.sqrt(), 0.0) - 1.0
+    return torch.where(there, 1.0 + part[..., None] * lost, 1.0)
+
+
+def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
+    """`geometric.geometric_mean`."""
+    if a.shape[-1] == 1:
+        return (a * b).sqrt()
+    of_a, of_b = _unit(factor(a)), _unit(factor(b))
+    a, b = a / of_a, b / of_b
+    for _ in range(geometric.rounds(a.shape[-1])):
+        both = a + b
+        of = factor(both)
+        unit = _unit(of)
+        a, b = both / unit, _symmetric(_quotient(2, a, of) @ b) * unit
+    return a * (of_a * of_b).sqrt()
+
+
+def _unit(root: Tensor) -> Tensor:
+    """A matrix over this has determinant 1, of its root."""
+    return (2.0 * torch.diagonal(root, dim1=-2, dim2=-1).log().mean(-1)).exp()[..., None, None]
+
+
+BY_ENTRIES = {matrices.add, matrices.subtract, matrices.scale, matrices.entries_product, scalars.choose}
+CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of their arguments alone
+OF_SHAPE: dict[Operation, Callable] = {
+    matrices.multiply: _product,
+    operations.quotient: _quotient,
+    operations.only: _only,
+    operations.on_one_branch: _on_one_branch,
+    points.on_one_side: _on_one_side,
+    members.on_one_branch: _on_one_side,
+}
+"""Rules that first take whether the result is a vector or a matrix."""
+RULES: dict[Operation, Callable] = {
+    matrices.transposed: lambda a: a.mT,
+    matrices.reciprocal: _reciprocal,
+    operations.mirrored: _symmetric,
+    operations.congruence: lambda a, p, pa: _symmetric(a @ pa),
+    operations.present: lambda z: z == z,
+    operations.uncorrelated: _uncorrelated,
+    operations.factor: factor,
+    operations.inverse: lambda root, seen: torch.cholesky_inverse(root),
+    densities.density: density,
+    densities.dot: lambda a, b: (a * b).sum(-1),
+    points.root: root,
+    points.outer: lambda a, b: a[..., :, None] * b[..., None, :],
+    points.square: lambda a: a @ a.mT,
+    points.first: lambda a: a[..., 0],
+    points.others: lambda a: a[..., 1:],
+    scalars.choose: torch.where,
+    scalars.exceeds: lambda a, value: a > value,
+    scalars.is_number: lambda a: a == a,
+    scalars.trace: lambda a: torch.diagonal(a, dim1=-2, dim2=-1).sum(-1),
+    scalars.count: lambda seen: seen.sum(-1),  # a whole number, which leaves the precision of others
+    scalars.exponential: torch.exp,
+    scalars.at_most: lambda v, value: torch.clamp(v, max=value),
+    scalars.at_least: lambda a, value: torch.where(a > value, a, value),
+    scalars.diagonal: torch.diag_embed,
+    points.hats: _hats,
+    blocks.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
+    blocks.triangle: _triangle,
+    blocks.hstack: lambda a, b: _joined(-1, a, b),
+    blocks.vstack: lambda a, b: _joined(-2, a, b),
+    blocks.part: lambda a, top, left, rows, columns: a[..., top : top + rows, left : left + columns],
+    blocks.zeros: lambda a, *shape: a.new_zeros(shape),
+    blocks.factor_of: lambda lower: lower,
+    blocks.forward_quotient: _forward_quotient,
+    blocks.triangle_quotient: lambda a, lower: torch.linalg.solve_triangular(lower, a, upper=False, left=False),
+    members.mean: lambda x: x.mean(-1),
+    members.variances: lambda x: x.var(-1),
+    members.cross_covariance: _covariance,
+    members.scatter: lambda x: _covariance(x, x),
+    members.centred: lambda e: _deviations(e) * (e.shape[-1] / (e.shape[-1] - 1.0)) ** 0.5,
+    members.stretches: _stretches,
+    geometric.geometric_mean: _geometric_mean,
+}
+"""Rules of others; sums, products and powers are those of tensors."""
+
 
 NORMALS = Place("draws", 0)
 Draw = Callable[[int, int], Tensor]

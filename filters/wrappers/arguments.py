@@ -1,20 +1,178 @@
-"""From a wrapper's plain arguments to a filter and the model that it assumes."""
+"""From a wrapper's plain arguments to a filter and the model that it assumes.
+
+    x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
+
+The method `measured_inputs(model)` of an env says which of its channels are such inputs a, and which are the
+model's measurements z. A filter predicts with the last measured a, and updates with z.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib
+import inspect
+import warnings
+from collections.abc import Callable, Mapping
 from os import PathLike, fspath
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from filters.augmented import Unknown, augmented_model
 from filters.estimators.find import is_foreign
 from filters.filter import Filter
-from filters.registry import filter_type
-from filters.wrappers.models import made, maker_of
-from filters.wrappers.tuned import tuned_filter
+from filters.registry import filter_type, make_filter
+from filters.tuned_file import (
+    AUGMENTED,
+    FACTORS,
+    NOISE,
+    PRIOR,
+    check_same_model,
+    check_same_quantities,
+    compared,
+    read_tuned_file,
+)
 from thruster_env.core.checks import short_repr
+from thruster_env.model.split import Split
 from thruster_env.model.state_space import StateSpaceModel
+
+# Where a wrapper's model comes from: the env, a factory that the caller names, or the caller.
+
+
+def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:
+    """A model's name in messages, and its source: the env, the "module:factory" named, or itself.
+
+    Raises ValueError if there is none.
+    """
+    if model is None:
+        make = offered(env, "state_space_model")
+        if make is None:
+            rule = "an env that offers no state_space_model must come with a model"
+            raise ValueError(f"{rule}, but got {env} alone: pass model=...")
+        return f"the model of {env.unwrapped}", make
+    if isinstance(model, StateSpaceModel):
+        return "the model", model
+    module, _, name = str(model).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError):
+        raise ValueError(
+            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
+        ) from None
+    return f"model {model!r}", found
+
+
+def offered(env, name: str) -> Any:
+    """The attribute of an env, or of a wrapper around it; None if none has it."""
+    if isinstance(env, gym.Env) and env.has_wrapper_attr(name):
+        return env.get_wrapper_attr(name)
+    return getattr(env.unwrapped, name, None)
+
+
+def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
+    """The model made with some arguments; ValueError if there is none."""
+    try:
+        found = make(**arguments)
+    except TypeError as error:
+        raise ValueError(f"{what} must take the given arguments: {error}") from None
+    if not isinstance(found, StateSpaceModel):
+        raise ValueError(f"{what} must be a StateSpaceModel, but it is {short_repr(found)}")
+    return found
+
+
+# The filter of a tuned file, with the model of the env or of the caller.
+
+
+def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
+    """Make the filter of a tuned file, for a model that takes the tuned Q, R and parameters.
+
+    Names in the file are never imported: the model is the env's own, or given by the caller, and must be
+    the file's. A file that contains its plant as data is compared with the env's plant, if no model is
+    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files older than version
+    4 are compared only by the plant.
+
+    Args:
+        env: the wrapped env.
+        model: as `EstimateState` takes it.
+        file: the path.
+
+    Raises:
+        ValueError: with the differences, if the model is another one; or if the file is invalid.
+    """
+    content = read_tuned_file(file)
+    plant, check = content.get("plant"), getattr(env.unwrapped, "check_tuned_for", None)
+    if model is None and check is not None:
+        with compared(content, file):
+            check(plant, file)
+    entry, tuned_for = content["filter"], content.get("model")
+    dt = None if plant is not None else sample_time(env)
+    factors = [f"{name} {value:g}" for name, value in entry["model"].get(FACTORS, {}).items() if value != 1.0]
+    if factors:
+        said = f"{file} was tuned on a model that is wrong on purpose: here, too, its filter assumes"
+        warnings.warn(f"{said} {', '.join(factors)} times the plant's own", stacklevel=4)
+
+    def fits(found: StateSpaceModel) -> None:
+        if tuned_for is not None:
+            with compared(content, file):
+                check_same_quantities(tuned_for, found, dt, file)
+
+    by_digest = tuned_for is not None and plant is None
+    found = _with_numbers(*maker_of(env, model), entry["model"], fits, by_digest)
+    if tuned_for is not None and by_digest:
+        with compared(content, file):
+            check_same_model(tuned_for, found, dt, file)
+    return make_filter(entry["name"], found, **entry["numbers"])
+
+
+def sample_time(env) -> float | None:
+    """An env's `dt` [s], None if it has none."""
+    dt = getattr(env.unwrapped, "dt", None)
+    return float(dt) if isinstance(dt, float | int) and not isinstance(dt, bool) and dt > 0 else None
+
+
+def _with_numbers(
+    what: str,
+    make: Callable | StateSpaceModel,
+    numbers: Mapping,
+    fits: Callable[[StateSpaceModel], None],
+    by_digest: bool,
+) -> StateSpaceModel:
+    """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
+
+    Constants that the file has as states become states. Other parameters are left out only where the model's
+    digest then shows whether that makes another model.
+    """
+    unknown = {name: Unknown.of_numbers(*one) for name, one in numbers.get(AUGMENTED, {}).items()}
+
+    def augmented(found: StateSpaceModel) -> StateSpaceModel:
+        return augmented_model(found, unknown) if unknown else found
+
+    if isinstance(make, StateSpaceModel):
+        found = augmented(make)
+        fits(found)
+        return _with_noise(found, numbers)
+    own = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR, AUGMENTED)}
+    if by_digest:
+        own = {name: value for name, value in own.items() if name in _arguments_of(make)}
+    plain = augmented(made(what, make, own))
+    fits(plain)  # before Q and R of other sizes are
+    return _with_noise(plain, numbers) if by_digest or unknown else made(what, make, numbers)
+
+
+def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
+    changes = {name: numbers[name] for name in NOISE}
+    if PRIOR in numbers:
+        changes["prior_cov"] = numbers[PRIOR] * model.prior_cov
+    return model.replace(**changes)
+
+
+def _arguments_of(make: Callable) -> set[str]:
+    """Names of the arguments that a function takes, none if it does not tell."""
+    try:
+        return set(inspect.signature(make).parameters)
+    except (TypeError, ValueError):  # some are written in C
+        return set()
+
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
@@ -112,3 +270,57 @@ def _box(name: str, space: gym.Space) -> gym.spaces.Box:
     if not isinstance(space, gym.spaces.Box):
         raise ValueError(f"the {name} space must be a Box, but got {space}")
     return space
+
+
+# Measured inputs of a model, such as an attitude from an AHRS, appended to the action.
+
+
+HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
+
+
+def split_of(env, model: StateSpaceModel) -> Split:
+    """The split of an env's channels for a model; without the hook all channels are measurements."""
+    found = getattr(env.unwrapped, HOOK, lambda model: None)(model)
+    return Split((), tuple(range(model.m)), model.m) if found is None else found
+
+
+class WithMeasuredInputs:
+    """A session, or the beliefs of all copies, that takes all measurements and uses some of them as inputs.
+
+    If such a measurement is missing, the last one is used, and zero before the first.
+
+    Attributes:
+        used: the inputs of the last step, the action and what was measured.
+    """
+
+    used: np.ndarray | None = None
+
+    def __init__(self, runs, split: Split):
+        """Take what runs the filter, a session or beliefs; `start` comes next."""
+        self._runs, self._inputs, self._measurements = runs, list(split.inputs), list(split.measurements)
+        self._last: np.ndarray | None = None
+
+    def __getattr__(self, name: str):
+        """The estimate and everything else are those of the session or the beliefs."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._runs, name)
+
+    def start(self, *arguments) -> None:
+        """Start with a key and a measurement, or copies (which, keys, measurements)."""
+        *which, keys, z = arguments
+        first = np.nan_to_num(z[..., self._inputs])
+        last = first if not which or self._last is None else self._last
+        if which:
+            last[which[0]] = first[which[0]]
+        self._last = last
+        self._runs.start(*which, keys, z[..., self._measurements])
+
+    def step(self, u, z: np.ndarray, **idle) -> None:
+        """Predict with the action and the inputs measured at the step's beginning, and update."""
+        last = self._last
+        assert last is not None  # `start` comes first
+        self.used = np.concatenate([u, last], axis=-1)
+        self._runs.step(self.used, z[..., self._measurements], **idle)
+        now = z[..., self._inputs]
+        self._last = np.where(np.isnan(now), last, now)

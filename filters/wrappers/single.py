@@ -9,22 +9,23 @@ import gymnasium as gym
 import numpy as np
 from numpy.ma import MaskedArray
 
-from filters.engine.checks import checked_actions
+from filters.engine.belief import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
-from filters.restarts import FirstRestart
 from filters.smoothers.online import WithSmoother
+from filters.starts import FirstRestart
 from filters.wrappers.arguments import (
     APPENDED,
     OBSERVATIONS,
     EstimatorInSpec,
     ModelInSpec,
+    WithMeasuredInputs,
     check_spaces,
     filter_for,
     given_filter,
+    split_of,
 )
-from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from thruster_env.core.checks import as_floats, one_of, short_repr
 from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.streams import draw_key, filter_generator
@@ -43,7 +44,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "belief": the mean, then the standard deviations, (2 n,).
 
     Entries that the env appends to its measurement (validity flags, a reference signal) stay at the end of
-    the observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m
+    the observation. Some channels of an env may be inputs of the model (`filters.wrappers.arguments`): m
     includes them in the observation, but not in the innovation.
 
     The info dictionary gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m)

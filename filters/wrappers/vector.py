@@ -10,17 +10,24 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from filters.engine.batch_session import Beliefs
-from filters.engine.checks import checked_actions
+from filters.engine.batch import Beliefs
+from filters.engine.belief import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
-from filters.restarts import FirstRestarts
 from filters.smoothers.online import WithSmoother
-from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
-from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
+from filters.starts import FirstRestarts
+from filters.wrappers.arguments import (
+    APPENDED,
+    OBSERVATIONS,
+    WithMeasuredInputs,
+    check_spaces,
+    filter_for,
+    given_filter,
+    split_of,
+)
 from thruster_env.core.checks import as_floats, one_of, short_repr
 from thruster_env.core.keys import EpisodeKeys, reset_mask
 from thruster_env.core.streams import filter_generator

@@ -15,7 +15,7 @@ class OfArrays:
         self.Q, self.R = model.process_noise_cov, model.measurement_noise_cov
         self.Q_root, self.prior_root = covariance_root(self.Q), covariance_root(model.prior_cov)
         self.state_angles, self.measurement_angles = model.shape.state_angles, model.shape.measurement_angles
-        self.kept = {}
+        self.extras = {}
 
     def at(self, constants):
         return OfArrays(self._model, self.own, tuple(constants))
@@ -50,17 +50,17 @@ def run_page(filter_, inputs, measurements):
 
     def kept(results):
         *values, changed = results if isinstance(results[-1], dict) else (*results, {})
-        equations.kept = equations.kept | changed
+        equations.extras = equations.extras | changed
         return values
 
-    if page.start is not None:
-        equations.kept = page.start(equations)
+    if page.initial is not None:
+        equations.extras = page.initial(equations)
     for k, z in enumerate(measurements):
         if k > 0:
-            flying = [x, p] if page.begin is None else together(page.begin(equations, x, p))
+            flying = [x, p] if page.represent is None else together(page.represent(equations, x, p))
             for _ in range(model.substeps):
-                flying = kept(together(page.advance(equations, *flying, inputs[k - 1])))
-            x, p = kept(page.settle(equations, *flying))
+                flying = kept(together(page.propagate(equations, *flying, inputs[k - 1])))
+            x, p = kept(page.add_process_noise(equations, *flying))
         x, p, *told = kept(page.update(equations, x, p, z))
         found.append((x, p, *told))
     return [np.array(part) for part in zip(*found, strict=True)]

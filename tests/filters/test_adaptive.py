@@ -13,7 +13,7 @@ from filters import (
     run,
     thruster_model,
 )
-from filters.adaptive.sage_husa import bounded_step
+from filters.adaptive import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
 from tests.oracles import kalman_update

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
-from filters.algebra import densities, operations
+from filters.algebra import operations
+from filters.algebra import samples as densities
 from filters.algebra.calls import calls_of
-from filters.algebra.densities import heavier, log_density, outlier_weight, tail_of
-from filters.algebra.derivatives import slopes_of
 from filters.algebra.matrices import Matrix, evaluate, given, in_order
 from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
 from filters.algebra.points import first, on_circle, ones, others, outer, root, square, units
-from filters.algebra.scalars import at_least, choose, exceeds
+from filters.algebra.samples import heavier, log_density, outlier_weight, tail_of
+from filters.algebra.scalars import at_least, choose, exceeds, slopes_of
 from thruster_env.graphs.programs import Place
 
 RNG = np.random.default_rng(0)

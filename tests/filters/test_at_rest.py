@@ -8,8 +8,9 @@ import torch
 
 import filters
 from filters import StateSpaceModel, make_filter, run
+from filters.differentiated.runs import ModelSlopes
 from filters.likelihood import likelihood
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.sensitivity import sensitivity
 from tests.models import simulated
 
 DT = 0.1

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model
-from filters.baselines.inverse import component_solver
+from filters.baselines import component_solver
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 

@@ -12,7 +12,7 @@ from filters.consistency.intervals import mean_interval
 from filters.smoothers.online import WithSmoother
 from tests.models import KEY, scalar_model, simulated, wide_model
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.truncated import truncated_normal
+from thruster_env.core.streams import truncated_normal
 
 INF = np.inf
 PAGES = (

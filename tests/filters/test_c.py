@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, make_filter, run, thruster_model
-from filters.c.programs import programs_of
-from filters.c.project import write_project
-from filters.c.single import single_error
-from filters.c.source import c_filter
-from filters.logs.columns import columns_of
+from filters.c.programs import programs_of, single_error
+from filters.c.project import c_filter, write_project
 from filters.logs.estimate import estimate_with
+from filters.logs.findings import columns_of
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
@@ -24,7 +22,7 @@ from tests.slow import slow_but
 from thruster_env.auv.model import auv_model
 from thruster_env.core.angles import difference
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.replay import ReplayEnv
+from thruster_env.env.record import ReplayEnv
 from thruster_env.graphs.c_source import literal, statements_of
 from thruster_env.graphs.graphs import Graph, arctan2, where
 from thruster_env.graphs.programs import Place, program_of

@@ -9,10 +9,7 @@ import pytest
 
 from benchmarks.c_code import measures
 from filters import make_filter, run, thruster_model
-from filters.c.board import BOARD, BUILD, EMULATE, MEMORY
-from filters.c.project import write_project
-from filters.c.sizes import sizes_of
-from filters.c.source import c_filter
+from filters.c.project import BOARD, BUILD, EMULATE, MEMORY, c_filter, sizes_of, write_project
 from tests.filters.test_c import ENSEMBLES, OWN, WARNINGS, built, made, printed
 from tests.models import lonely_model, simulated
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import run
-from filters.c.source import c_filter
+from filters.c.project import c_filter
 from tests.filters.test_c import SANITIZERS, WARNINGS, assert_same, built, estimated, made
 from tests.filters.test_ensemble_pages import PartlyFilter
 from tests.filters.test_pages import wide_pendulum

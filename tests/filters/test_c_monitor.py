@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 
 from filters import run, thruster_model
-from filters.c.project import write_project
-from filters.c.sizes import sizes_of
-from filters.c.source import c_filter
-from filters.logs.alarms import alarms_of
-from filters.logs.columns import columns_of
+from filters.c.project import c_filter, sizes_of, write_project
 from filters.logs.estimate import estimate_with
+from filters.logs.findings import alarms_of, columns_of
 from filters.monitoring import Monitor
 from filters.monitoring.monitor import TESTS
 from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
 from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.replay import ReplayEnv
+from thruster_env.env.record import ReplayEnv
 
 MAIN = """\
 #include "one.h"

@@ -6,8 +6,7 @@ import subprocess
 import pytest
 
 from filters import StateSpaceModel, make_filter
-from filters.c.project import write_project
-from filters.c.source import c_filter
+from filters.c.project import c_filter, write_project
 from filters.monitoring.monitor import monitor_of
 from tests.models import scalar_model
 

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
-from filters.consistency.intervals import mean_interval, rmse_intervals, rmse_ratios
-from filters.consistency.nees import check_squares
-from filters.consistency.uniformity import uniformity
+from filters.consistency.intervals import mean_interval, rmse_intervals, rmse_ratios, uniformity
+from filters.consistency.nees import check_squares, whiteness
 from filters.consistency.verdicts import whiteness_sentence
-from filters.consistency.whiteness import whiteness
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
 

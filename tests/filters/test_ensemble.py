@@ -9,13 +9,7 @@ from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, ru
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, normals, relative_errors
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import (
-    FILTER_MEASUREMENT,
-    FILTER_PRIOR,
-    FILTER_PROCESS,
-    episode_keys,
-    filter_keys,
-)
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
 from thruster_env.model import simulate
 
 

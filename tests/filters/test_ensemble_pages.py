@@ -10,25 +10,19 @@ import pytest
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.algebra.members import mean
 from filters.algebra.operations import divide
-from filters.differentiated.differentiable import differentiable
-from filters.ensembles.ensemble import EnsembleFilter
-from filters.ensembles.steps import advance, compare, settle
+from filters.differentiated.runs import differentiable
+from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
+from filters.pages.kernels import with_kept
 from filters.pages.page import Page
-from filters.pages.programs import with_kept
 from tests.filters.of_arrays import OfArrays, parameters_of
-from tests.filters.test_pages import turn_if, turning_pendulum, wide_pendulum
+from tests.filters.test_pages import turn_if, wide_pendulum
+from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import random_affine, simulated, wide_model
 from tests.slow import slow_but
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import (
-    FILTER_MEASUREMENT,
-    FILTER_PRIOR,
-    FILTER_PROCESS,
-    episode_keys,
-    fill_normals,
-)
-from thruster_env.model.layout import LANES, padded
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, fill_normals
+from thruster_env.model.shape import LANES, padded
 
 SIZE = 11
 CHOICES = {
@@ -66,7 +60,7 @@ def run_page(filter_, key, inputs, measurements):
     own = parameters_of(page, np.array(filter_.own_parameters))
     columns = {name: one[:, None] for name, one in own._asdict().items() if np.ndim(one) == 1}
     equations = OfMembers(model, own._replace(**columns))
-    equations.kept = page.started(equations)
+    equations.extras = page.started(equations)
     width, found = padded(filter_.size, LANES), []
 
     def normals(rows, step, stream):
@@ -79,10 +73,10 @@ def run_page(filter_, key, inputs, measurements):
     for k, z in enumerate(measurements):
         if k > 0:
             for _ in range(model.substeps):
-                x = page.advance(equations, x, inputs[k - 1][:, None])
-            x = page.settle(equations, x, normals(model.n, k, FILTER_PROCESS))
+                x = page.propagate(equations, x, inputs[k - 1][:, None])
+            x = page.add_process_noise(equations, x, normals(model.n, k, FILTER_PROCESS))
         told = page.update(equations, x, z[:, None], normals(model.m, k, FILTER_MEASUREMENT))
-        x, v, s, level, equations.kept = with_kept(told)
+        x, v, s, level, equations.extras = with_kept(told)
         mean = x.mean(axis=1)
         wrapped = np.where(equations.state_angles, np.angle(np.exp(1j * mean)), mean)
         found.append((wrapped, np.cov(x).reshape(model.n, model.n), v[:, 0], s, level))
@@ -154,7 +148,7 @@ class PartlyFilter(EnsembleFilter):
     """A user's ensemble filter."""
 
     name: ClassVar[str] = "partly"
-    page: ClassVar[Page] = Page(advance, settle, update_in_part)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update_in_part)
     part: float = 0.5
 
 
@@ -174,7 +168,9 @@ def test_a_filter_of_ones_own_is_its_page_and_by_name_too():
 class WrongFilter(PartlyFilter):
     """A filter whose innovation is one of each member."""
 
-    page: ClassVar[Page] = Page(advance, settle, lambda model, x, z, e: (x, z - model.h(x), model.R, mean(z @ z)))
+    page: ClassVar[Page] = Page(
+        propagate, add_process_noise, lambda model, x, z, e: (x, z - model.h(x), model.R, mean(z @ z))
+    )
 
 
 def test_what_is_of_all_members_must_not_be_of_each():

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from filters import EstimateState, make_filter, run
-from filters.estimators.filterpy import FilterPyEstimator
-from filters.estimators.stonesoup import StoneSoupEstimator
+from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
-UNSCENTED = "filters.estimators.filterpy:unscented"
+UNSCENTED = "filters.estimators.libraries:unscented"
 
 
 def assert_equal(one, other, rtol):

@@ -6,20 +6,18 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
+from filters.consistency.nees import whiteness, whiteness_of
 from filters.consistency.verdicts import is_white, whiteness_sentence
-from filters.consistency.whiteness import whiteness, whiteness_of
 from filters.estimators.estimator import Estimator
-from filters.estimators.filterpy import FilterPyEstimator
-from filters.estimators.stonesoup import StoneSoupEstimator
+from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from filters.logs.estimate import estimate
-from filters.logs.findings import findings
-from filters.logs.verdict import verdict
+from filters.logs.findings import findings, verdict
 from tests.models import scalar_model, simulated
 from tests.thruster_env.core.test_angles import STEPS, data_of, rotated, turning
 from thruster_env.core.angles import difference
 from thruster_env.logs.log import Log
 
-UNSCENTED = "filters.estimators.filterpy:unscented"
+UNSCENTED = "filters.estimators.libraries:unscented"
 pytestmark = pytest.mark.usefixtures("as_python")
 
 

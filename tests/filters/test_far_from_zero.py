@@ -11,8 +11,9 @@ import torch
 
 import filters
 from filters import StateSpaceModel, make_filter, run
-from filters.c.source import c_filter
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.c.project import c_filter
+from filters.differentiated.runs import ModelSlopes
+from filters.sensitivity import sensitivity
 from tests.models import simulated
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian, step_of, stretch

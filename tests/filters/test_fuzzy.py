@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model
-from filters.gaussian.fuzzy import BLENDINGS
-from filters.gaussian.rules import memberships
+from filters.gaussian.mixtures import BLENDINGS
+from filters.gaussian.sigma_points import memberships
 from tests.models import pendulum, random_affine, simulated
 from tests.oracles import kalman_update
 from thruster_env.core.streams import filter_keys

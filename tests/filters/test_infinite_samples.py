@@ -6,7 +6,7 @@ import pytest
 
 import filters
 from filters import EstimateState, EstimateStates, StateSpaceModel, make_filter, run, smooth
-from filters.engine.batch_session import Beliefs
+from filters.engine.batch import Beliefs
 from thruster_env.core.streams import filter_keys
 
 FINITE, KEY = "must be .*finite", (0, 0)

@@ -7,8 +7,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import invgamma, multivariate_normal
 
 from filters import make_filter, run
-from filters.ensembles.adaptive import relative_move
-from filters.ensembles.spread import width_of
+from filters.ensembles.ensemble import relative_move, width_of
 from tests.filters.test_adaptive_inflation import drifting
 from tests.models import KEY, plane_model, simulated
 from thruster_env.core.compiled import interpreted

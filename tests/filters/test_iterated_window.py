@@ -8,8 +8,8 @@ import pytest
 from scipy.linalg import inv, sqrtm
 
 from filters import StateSpaceModel, make_filter, run
-from filters.c.source import c_filter
-from filters.ensembles.recording import record_members
+from filters.c.project import c_filter
+from filters.ensembles.rank_histogram import record_members
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.tensors import torch
 from tests.filters.test_ensemble_twins import step, whole

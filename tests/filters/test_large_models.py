@@ -7,20 +7,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior, run
+from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior, run, thruster_model
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
 from filters.smoothers.smooth import smooth
-from tests.models import (
-    OF_EACH_KIND,
-    lonely_model,
-    pendulum,
-    random_affine,
-    simulated,
-    thruster_model,
-    varying_noise,
-    wide_model,
-)
+from tests.models import OF_EACH_KIND, lonely_model, pendulum, random_affine, simulated, varying_noise, wide_model
 from tests.slow import slow_but
 from tests.thruster_env.core.test_angles import turned, turning, turntable
 from thruster_env.core import equal_functions, matrices, sources

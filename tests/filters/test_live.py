@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import expm
 
 from filters import make_filter, thruster_model
-from filters.restarts import FirstRestart
+from filters.starts import FirstRestart
 from tests.slow import slow_but
-from thruster_env.model.continuous import ContinuousModel
-from thruster_env.model.diffusion import noise_for_dt
+from thruster_env.model.continuous import ContinuousModel, noise_for_dt
 from thruster_env.model.state_space import StateSpaceModel
 
 A = np.array([[0.0, 1.0], [-4.0, -0.6]])

@@ -8,13 +8,13 @@ import pytest
 from scipy.linalg import sqrtm
 
 from filters import StateSpaceModel, make_filter, run, smooth
-from filters.c.source import c_filter
-from filters.ensembles.localised import gaspari_cohn
+from filters.c.project import c_filter
+from filters.ensembles.stochastic import gaspari_cohn
 from filters.tensors import torch
 from tests.filters.test_c import assert_same, built, estimated
 from tests.models import KEY, simulated, wide_model
 from thruster_env.core.compiled import interpreted
-from thruster_env.model.positions import Positions
+from thruster_env.model.quantities import Positions
 
 DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_localised.json").read_text())
 LOCAL = "enkf", "denkf", "ensrf", "letkf"

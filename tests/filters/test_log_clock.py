@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from filters import make_filter
-from filters.logs.alarms import alarms_of
-from filters.logs.clock import by_the_clock
-from filters.logs.estimate import estimate
+from filters.logs.estimate import by_the_clock, estimate
+from filters.logs.findings import alarms_of
 from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
-from thruster_env.env.replay import ReplayEnv
-from thruster_env.logs.grid import Series
+from thruster_env.env.record import ReplayEnv
+from thruster_env.logs.grid import Series, at_own_stamps
 from thruster_env.logs.log import Log
-from thruster_env.logs.own_stamps import at_own_stamps
 from thruster_env.logs.read import read_log
 from thruster_env.logs.steps import in_steps
 from thruster_env.model.continuous import in_discrete_time

@@ -7,10 +7,9 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from filters import make_filter, run, smooth
-from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate
 from filters.logs.figure import draw_log, log_figure
-from filters.logs.findings import compared, findings
+from filters.logs.findings import columns_of, compared, findings
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log

@@ -7,7 +7,7 @@ import pytest
 
 from filters import KalmanFilter, StateSpaceModel, make_filter, run
 from filters.likelihood import likelihood
-from filters.pages.page_filter import Page
+from filters.pages.page import Page
 from filters.pages.traced import Traced
 from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
@@ -193,7 +193,7 @@ def test_runs_that_lie_together_begin_with_what_a_filter_keeps_at_its_start():
 def counting(model, x, P, z):
     """The template's update, which counts, forgets what it counted, and keeps a root of Q."""
     done = Template.page.update(model, x, P, z)
-    return *done, {"count": model.kept["count"] * 0.0, "root": model.Q_root * 2.0}
+    return *done, {"count": model.extras["count"] * 0.0, "root": model.Q_root * 2.0}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,7 +203,7 @@ class Keeping(Template):
     page = Page(
         *Template.page[:2],
         counting,
-        start=lambda model: {"count": model.own.bandwidth, "root": model.prior_root},
+        initial=lambda model: {"count": model.own.bandwidth, "root": model.prior_root},
     )
 
 

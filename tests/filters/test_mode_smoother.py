@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, make_filter, run, smooth, smooth_modes
-from filters.smoothers.backwards import passes
-from filters.smoothers.mode_steps import merged, told
-from filters.smoothers.relations import relation_of
+from filters.smoothers.modes import merged, told
+from filters.smoothers.points import relation_of
+from filters.smoothers.rts import passes
 from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point

@@ -9,11 +9,10 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers its envs
 from filters import EstimateState, EstimateStates
-from filters.logs.alarms import alarms_of, episode_sentence, episodes
-from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate_with
+from filters.logs.findings import alarms_of, columns_of, episode_sentence, episodes
 from filters.monitoring.monitor import TESTS, Alarm, Monitor, monitor_of
-from filters.monitoring.thresholds import (
+from filters.monitoring.recursion import (
     chi_square,
     cusum_run_length,
     cusum_threshold,

@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from filters import StateSpaceModel, make_filter, run
-from filters.gaussian.mixture import Parts, blender
+from filters.gaussian.mixtures import Parts, blender
 from pages.filter_models import followed, half_lost
 from tests.models import pendulum
 from tests.thruster_env.core.test_angles import turning

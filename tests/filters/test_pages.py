@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
-from filters.differentiated.differentiable import KINDS, differentiable
+from filters.differentiated.runs import KINDS, ModelSlopes, differentiable
 from filters.likelihood import information, likelihood
 from filters.pages.page_filter import PageFilter
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units

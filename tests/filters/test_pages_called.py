@@ -8,10 +8,10 @@ import pytest
 
 from filters import run
 from filters.differentiated import recursion
-from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
+from filters.differentiated.runs import differentiable
 from filters.likelihood import likelihood
-from filters.pages.at_points import called_at_points
+from filters.pages.equations import called_at_points
 from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
 from tests.filters.test_differentiated import units

@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from filters import KalmanFilter, StateSpaceModel, make_filter, run, smooth
-from filters.c.source import c_filter
+from filters.c.project import c_filter
 from filters.tensors import torch
 from tests.models import KEY, plane_model, simulated, wide_model
 from tests.slow import slow_but

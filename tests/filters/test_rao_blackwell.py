@@ -10,12 +10,7 @@ from filters import RaoBlackwellisedParticleFilter, StateSpaceModel, affine_mode
 from tests.models import KEY, line_model, plane_model, simulated
 from tests.oracles import assert_normal, normals
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import (
-    FILTER_MEASUREMENT,
-    FILTER_PRIOR,
-    FILTER_PROCESS,
-    uniform_block,
-)
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, uniform_block
 from tuning.experiments import mixed_linear
 
 Q = np.array([[0.04, 0.01, -0.01], [0.01, 0.03, 0.008], [-0.01, 0.008, 0.02]])  # of s, a, b: s and the others too

@@ -14,8 +14,7 @@ import pytest
 import filters
 from filters import EstimateState, RestartWarning, StateSpaceModel, make_filter, restarts_of
 from filters.logs.estimate import estimate_with
-from filters.logs.findings import findings
-from filters.logs.verdict import verdict
+from filters.logs.findings import findings, verdict
 from filters.wrappers.vector import EstimateStates
 from thruster_env.env.model_env import ModelEnv
 from thruster_env.logs.log import Log

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from filters import make_filter, smooth, thruster_model
-from filters.engine.layout import memory_places
-from filters.ensembles.rotation import rotator
+from filters.engine.belief import memory_places
+from filters.ensembles.stochastic import rotator
 from thruster_env.core.compiled import compiled
 
 N = 9

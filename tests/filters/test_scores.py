@@ -5,14 +5,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from filters.consistency.scores import (
+from filters.consistency.intervals import (
     covered,
     ensemble_crps,
     ensemble_ranks,
     expected_gaussian_crps,
     gaussian_crps,
+    uniformity,
 )
-from filters.consistency.uniformity import uniformity
 from filters.consistency.verdicts import ranks_verdict
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model
-from filters.engine.side_by_side import GROUPS
+from filters.engine.compile import GROUPS
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from thruster_env.model.layout import LANES
+from thruster_env.model.shape import LANES
 
 BLOCK = GROUPS * LANES
 COUNTS = [1, LANES - 1, LANES, LANES + 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]

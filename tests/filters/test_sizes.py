@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
-from filters.engine.restart import LARGEST, row_magnitude
+from filters.engine.belief import LARGEST, row_magnitude
 from filters.registry import FILTERS
 from tests.models import KEY, random_affine, small
 from tests.oracles import kalman_filter

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from filters.monitoring import Monitor, tuned_monitor
-from filters.monitoring.stored import monitor_data, monitor_for
+from filters.monitoring.monitor import monitor_data, monitor_for
 from tests.tuned_files import rewrite, write_untuned
 
 NAN = math.nan

@@ -3,8 +3,7 @@
 import numpy as np
 
 from filters.consistency.report import longest_stretches
-from filters.consistency.symptoms import HEAVY, STUCK
-from filters.consistency.verdicts import sentences
+from filters.consistency.verdicts import HEAVY, STUCK, sentences
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.evaluate import check_consistency

@@ -14,10 +14,10 @@ from filters.algebra.samples import (
     weighted_square,
     weights,
 )
+from filters.pages.kernels import Stage, as_calls
 from filters.pages.members import of_members
-from filters.pages.stages import Stage, as_calls
-from filters.particles.resampling import systematic_resampler
-from thruster_env.core.exponential import exponential
+from filters.particles.kernels import systematic_resampler
+from thruster_env.core.streams import exponential
 from thruster_env.graphs.programs import OF_MEMBERS, Place
 
 SIZE = 11

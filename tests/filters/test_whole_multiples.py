@@ -8,7 +8,7 @@ import pytest
 
 import filters
 from filters import StateSpaceModel, make_filter, run
-from filters.c.single import single_error
+from filters.c.programs import single_error
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
 

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from filters import make_filter, run
-from filters.c.single import _Single
-from filters.tensors.graphs import order_of
-from filters.tensors.graphs import values_of as tensors_of
+from filters.c.programs import _Single
+from filters.tensors.equations import order_of
+from filters.tensors.equations import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
 from thruster_env.core.compiled import compiled
 from thruster_env.core.streams import filter_keys

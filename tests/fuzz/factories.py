@@ -10,8 +10,7 @@ import time
 import numpy as np
 
 from tests.thruster_env.core.test_equal_functions import FACTORIES
-from thruster_env.core.captured import captured_numbers, differ_in_numbers_alone, with_numbers
-from thruster_env.core.equal_functions import first_equal
+from thruster_env.core.equal_functions import captured_numbers, differ_in_numbers_alone, first_equal, with_numbers
 
 NOT_COPIED = "from_text", "with_large_array", "with_members_of_a_local_class", "with_cache", "with_matrix"
 SAME_CODE = [one for one in FACTORIES if one.__name__ not in NOT_COPIED]

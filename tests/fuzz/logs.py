@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.logs.figure import draw_findings
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.log import Log, cut_at_gaps
 from thruster_env.logs.read import read_log
-from thruster_env.logs.write import write_columns, write_log
+from thruster_env.logs.write import draw_findings, write_columns, write_log
 from thruster_env.model.affine import affine_model
 from tuning.problems.log_problem import LogProblem
 

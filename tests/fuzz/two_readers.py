@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from filters.c.project import write_project
-from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate_with
+from filters.logs.findings import columns_of
 from filters.registry import make_filter
 from tests.fuzz.logs import MODEL
 from thruster_env.core.compiled import interpreted
-from thruster_env.env.replay import ReplayEnv
+from thruster_env.env.record import ReplayEnv
 
 ROWS = 25
 DT = 0.01

@@ -12,7 +12,7 @@ from collections import Counter
 import numpy as np
 
 from filters import run, smooth
-from filters.logs.clock import by_the_clock
+from filters.logs.estimate import by_the_clock
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
 from thruster_env.core.compiled import interpreted
 from thruster_env.logs.log import Log

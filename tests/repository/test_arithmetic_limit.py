@@ -19,7 +19,7 @@ from benchmarks.counting import (
 )
 from benchmarks.workloads import normals, step_by_size, step_of_env, step_of_filter, step_of_members, times
 from filters import make_filter, thruster_model
-from thruster_env.core import arrays
+from thruster_env.core import matrices as arrays
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_PROCESS, normal_block
 from thruster_env.thruster.dynamics import substep

@@ -20,15 +20,12 @@ from filters.wrappers.arguments import OBSERVATIONS
 from pages import filter_gaussian, filter_horizon, filter_particles
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
 from thruster_env.thruster.effects.uncertainty import DISTRIBUTIONS
-from thruster_env.thruster.env import BowThrusterEnv
+from thruster_env.thruster.env import BowThrusterEnv, BowThrusterLinearEnv, BowThrusterVectorEnv
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import PRESETS
-from thruster_env.thruster.tasks import BowThrusterLinearEnv
-from thruster_env.thruster.vector_env import BowThrusterVectorEnv
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "plant.md").read_text()

@@ -9,8 +9,8 @@ import pytest
 
 from filters.registry import FILTERS
 from pages import ranking_estimators, ranking_horizon, ranking_particles
-from pages.page import with_tables
 from pages.ranking_tables import DISCUSSED, TABLES, by_default, main, ratios_of, scenarios
+from thruster_env.core.text_tables import with_tables
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.seeds import held_out_seeds

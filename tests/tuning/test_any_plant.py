@@ -13,12 +13,11 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from tuning.cli import consistency
 from tuning.cli.tables import choice_table
-from tuning.cli.tuning_report import gains
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
-from tuning.evaluation.tuned import summary
+from tuning.evaluation.summary import summary
 from tuning.evaluation.worth import worth
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
@@ -26,6 +25,7 @@ from tuning.reporting import leaderboard
 from tuning.reporting.consistency_figures import consistency_figure
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.figures import comparison_figure
+from tuning.reporting.gains import gains
 from tuning.reporting.panels import plotted_states
 from tuning.reporting.parts import advice, held_out_section
 from tuning.reporting.subject import Subject

@@ -15,7 +15,7 @@ import pytest
 
 import tuning
 from filters import EstimateState
-from filters.c.source import c_filter
+from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.cli.tuning_report import as_json as tuning_as_json

@@ -9,7 +9,7 @@ import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState, make_filter, run
 from tests.slow import slow_but
 from tests.tuned_files import write_untuned
-from thruster_env.auv.manoeuvres import MANOEUVRES
+from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.core.streams import episode_keys
 from tuning.auv.find import find_scenario
 from tuning.auv.scale import computed_scale

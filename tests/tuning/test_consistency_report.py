@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
-from filters.consistency.intervals import Interval, mean_interval, rmse_ratios
+from filters.consistency.intervals import Interval, gaussian_crps, mean_interval, rmse_ratios
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import consistency_report
-from filters.consistency.scores import gaussian_crps
 from filters.consistency.verdicts import (
     comparison_sentence,
     confidence,
@@ -20,7 +19,7 @@ from filters.consistency.verdicts import (
     sentences,
 )
 from filters.engine.batch import Estimates
-from filters.ensembles.recording import Members, record_members
+from filters.ensembles.rank_histogram import Members, record_members
 from tests.models import scalar_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys

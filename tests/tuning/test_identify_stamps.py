@@ -12,13 +12,13 @@ import tuning
 from filters import Unknown, augmented_model, make_filter
 from filters.engine.batch import run
 from filters.likelihood import likelihood
-from filters.logs.clock import by_the_clock
+from filters.logs.estimate import by_the_clock
 from tests.filters.test_live import A, oscillator
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.steps import in_any_steps, in_steps
-from thruster_env.model.diffusion import noise_of_densities
+from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.validation import validate

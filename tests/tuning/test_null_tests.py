@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from tests.tuning.test_identify import FREE, TRUTH, pendulum, recorded
+from tests.filters.test_sensitivity import pendulum
+from tests.tuning.test_identify import FREE, TRUTH, recorded
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from thruster_env.thruster.logged import Recorder
 from thruster_env.thruster.plant import make_plant

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import tuning
-from thruster_env.core.characters import verbatim
+from thruster_env.core.text_tables import verbatim
 from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity
 from tuning.api.progress import working

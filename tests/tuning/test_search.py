@@ -20,10 +20,11 @@ from tuning.search.new_trials import enqueue_new
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.outcome import best_trial, violation
 from tuning.search.plan import Plan
+from tuning.search.pruning import BLOCK
 from tuning.search.samplers import SAMPLERS, make_sampler
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import BLOCK, measure
+from tuning.search.trials import measure
 from tuning.thruster.find import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))

@@ -1,31 +1,159 @@
-"""The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
+"""The vehicle's equations of motion: kinematics, dynamics and operating points.
 
-Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, on which weight and buoyancy
-depend, they are the smallest closed system; yaw and position, to the north, to the east and down, complete the
-state.
-
-    nu' = M^-1 F(nu, phi, theta, u)
-    (phi, theta, psi)' = T(phi, theta) (p, q, r)
-    (x, y, z)' = R(phi, theta, psi) (u, v, w)
+Roll phi, pitch theta, yaw psi [rad]; the earth's axes are north, east, down, the body's ahead, starboard, down. An
+attitude is (cos phi, sin phi, cos theta, sin theta). Euler angles end at theta = +-90 deg, where the rates of phi
+and psi are infinite. Source: Fossen (2011), "Handbook of Marine Craft Hydrodynamics and Motion Control", 2.2.
 """
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
+import numpy as np
+
 from thruster_env.auv.forces import accelerated, forces, forces_tangent
-from thruster_env.auv.kinematics import (
-    angle_rates,
-    angle_rates_tangent,
-    attitude_of,
-    attitude_tangent,
-    down,
-    down_tangent,
-    in_body_axes,
-    in_body_axes_tangent,
-    in_earth_axes,
-    in_earth_axes_tangent,
-)
+from thruster_env.auv.parameters import VehicleParameters, derive_constants
 from thruster_env.core.compiled import inlined
 from thruster_env.core.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
+from thruster_env.core.streams import cosine_and_sine
+
+# Attitude and path of a vehicle: Euler angles, transformations between body and earth, their tangents.
+
+
+@inlined
+def attitude_of(phi, theta):
+    """(cos phi, sin phi, cos theta, sin theta)."""
+    c_phi, s_phi = cosine_and_sine(phi)
+    c_theta, s_theta = cosine_and_sine(theta)
+    return c_phi, s_phi, c_theta, s_theta
+
+
+@inlined
+def attitude_tangent(attitude, d_phi, d_theta):
+    """Directional derivative of `attitude_of`."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    return -s_phi * d_phi, c_phi * d_phi, -s_theta * d_theta, c_theta * d_theta
+
+
+@inlined
+def down(attitude):
+    """The direction downwards in the body's axes: (-sin theta, cos theta sin phi, cos theta cos phi)."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    return -s_theta, c_theta * s_phi, c_theta * c_phi
+
+
+@inlined
+def down_tangent(attitude, d_attitude):
+    """Directional derivative of `down`."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    dc_phi, ds_phi, dc_theta, ds_theta = d_attitude
+    return -ds_theta, dc_theta * s_phi + c_theta * ds_phi, dc_theta * c_phi + c_theta * dc_phi
+
+
+@inlined
+def angle_rates(attitude, p, q, r):
+    """Rates of roll, pitch and yaw [rad/s] of a body that turns with p, q, r [rad/s].
+
+    phi' = p + psi' sin theta,  theta' = q cos phi - r sin phi,  psi' = (q sin phi + r cos phi)/cos theta
+    """
+    c_phi, s_phi, c_theta, s_theta = attitude
+    turning = (q * s_phi + r * c_phi) / c_theta
+    return p + turning * s_theta, q * c_phi - r * s_phi, turning
+
+
+@inlined
+def angle_rates_tangent(attitude, d_attitude, q, r, dp, dq, dr):
+    """Directional derivative of `angle_rates`."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    dc_phi, ds_phi, dc_theta, ds_theta = d_attitude
+    per_cosine = 1.0 / c_theta
+    turning = (q * s_phi + r * c_phi) * per_cosine
+    d_turning = dq * s_phi + q * ds_phi + dr * c_phi + r * dc_phi - turning * dc_theta
+    d_turning = d_turning * per_cosine
+    d_rolling = dp + d_turning * s_theta + turning * ds_theta
+    return d_rolling, dq * c_phi + q * dc_phi - dr * s_phi - r * ds_phi, d_turning
+
+
+@inlined
+def _levelled(attitude, u, v, w):
+    """A vector in axes that turn with the body's heading only: ahead, to starboard and down."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    below = v * s_phi + w * c_phi
+    return u * c_theta + below * s_theta, v * c_phi - w * s_phi, below * c_theta - u * s_theta
+
+
+@inlined
+def in_earth_axes(attitude, psi, u, v, w):
+    """Components to the north, to the east and down of a vector (u, v, w) in the body's axes."""
+    c_psi, s_psi = cosine_and_sine(psi)
+    ahead, aside, below = _levelled(attitude, u, v, w)
+    return ahead * c_psi - aside * s_psi, ahead * s_psi + aside * c_psi, below
+
+
+@inlined
+def in_earth_axes_tangent(attitude, d_attitude, psi, d_psi, velocity, d_velocity):
+    """Directional derivative of `in_earth_axes`; the vector and its change are (u, v, w)."""
+    u, v, w = velocity
+    du, dv, dw = d_velocity
+    c_phi, s_phi, c_theta, s_theta = attitude
+    dc_phi, ds_phi, dc_theta, ds_theta = d_attitude
+    c_psi, s_psi = cosine_and_sine(psi)
+    ahead, aside, _ = _levelled(attitude, u, v, w)
+    below, d_below = v * s_phi + w * c_phi, dv * s_phi + v * ds_phi + dw * c_phi + w * dc_phi
+    d_ahead = du * c_theta + u * dc_theta + d_below * s_theta + below * ds_theta - aside * d_psi
+    d_aside = dv * c_phi + v * dc_phi - dw * s_phi - w * ds_phi + ahead * d_psi
+    return (
+        d_ahead * c_psi - d_aside * s_psi,
+        d_ahead * s_psi + d_aside * c_psi,
+        d_below * c_theta + below * dc_theta - du * s_theta - u * ds_theta,
+    )
+
+
+@inlined
+def in_body_axes(attitude, psi, north, east, below):
+    """Components ahead, to starboard and down in the body's axes of a vector in the earth's."""
+    c_phi, s_phi, c_theta, s_theta = attitude
+    c_psi, s_psi = cosine_and_sine(psi)
+    ahead, aside = north * c_psi + east * s_psi, east * c_psi - north * s_psi
+    across = ahead * s_theta + below * c_theta
+    return ahead * c_theta - below * s_theta, aside * c_phi + across * s_phi, across * c_phi - aside * s_phi
+
+
+@inlined
+def in_body_axes_tangent(attitude, d_attitude, psi, d_psi, vector, d_vector):
+    """Directional derivative of `in_body_axes`; the vector and its change are (north, east, down)."""
+    (north, east, below), (d_north, d_east, d_below) = vector, d_vector
+    c_phi, s_phi, c_theta, s_theta = attitude
+    dc_phi, ds_phi, dc_theta, ds_theta = d_attitude
+    c_psi, s_psi = cosine_and_sine(psi)
+    ahead, aside = north * c_psi + east * s_psi, east * c_psi - north * s_psi
+    d_ahead = d_north * c_psi + d_east * s_psi + aside * d_psi
+    d_aside = d_east * c_psi - d_north * s_psi - ahead * d_psi
+    across = ahead * s_theta + below * c_theta
+    d_across = d_ahead * s_theta + ahead * ds_theta + d_below * c_theta + below * dc_theta
+    return (
+        d_ahead * c_theta + ahead * dc_theta - d_below * s_theta - below * ds_theta,
+        d_aside * c_phi + aside * dc_phi + d_across * s_phi + across * ds_phi,
+        d_across * c_phi + across * dc_phi - d_aside * s_phi - aside * ds_phi,
+    )
+
+
+@inlined
+def planar_kinematics(nu, psi):
+    """The papers' rates of x, y, z [m/s] and psi [rad/s], which turn by yaw alone.
+
+        x' = u cos psi - v sin psi,  y' = u sin psi + v cos psi,  z' = w,  psi' = r
+
+    True for phi = theta = 0 only: a vehicle that dives by pitching stays at its depth here. Source: Ngatini,
+    Nurhadi (2019), equations 1 to 4.
+    """
+    u, v, w, _, _, r = nu
+    c_psi, s_psi = cosine_and_sine(psi)
+    return u * c_psi - v * s_psi, u * s_psi + v * c_psi, w, r
+
+
+# The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
 
 
 @inlined
@@ -170,3 +298,67 @@ velocity_euler_jacobian = euler_jacobian(velocity_rates_tangent, 6)
 motion_euler_jacobian = euler_jacobian(motion_rates_tangent, 8)
 navigation_euler_jacobian = euler_jacobian(navigation_rates_tangent, 12)
 drifting_euler_jacobian = euler_jacobian(drifting_rates_tangent, 14)
+
+
+# Operating range of a vehicle: the thrust of a speed, the range of its states, the integration step.
+
+
+ONE_STEP_ACCURACY = 1e-4  # of each state's range, over one sample time
+
+
+def cruise_thrust(p: VehicleParameters, speed: float) -> float:
+    """Thrust [N] that holds a speed [m/s] straight ahead: -(Xu + Xuu |u|) u."""
+    return -(p.Xu + p.Xuu * abs(speed)) * speed
+
+
+def top_speed(p: VehicleParameters, thrust: float) -> float:
+    """Speed [m/s] straight ahead that a thrust [N] holds; ValueError for a vehicle without drag."""
+    linear, square = -p.Xu, -p.Xuu
+    if min(linear, square) < 0.0 or linear == square == 0.0:
+        raise ValueError(f"Xu and Xuu must be a drag, negative or zero and not both zero, but got {p.Xu}, {p.Xuu}")
+    return 2.0 * thrust / (linear + math.sqrt(linear**2 + 4.0 * square * thrust))
+
+
+def operating_range(p: VehicleParameters, thrust: float) -> np.ndarray:
+    """Largest state (12,) of normal operation under thrusts up to so much [N]; the smallest is its opposite.
+
+    Only u is never negative. Manoeuvres with both planes within 5 deg stay inside, and a swing in roll of 3 deg.
+    Velocities are parts of the top speed, pitch and yaw rates parts of that over the radius of gyration.
+    """
+    speed = top_speed(p, thrust)
+    turning = 0.09 * speed / math.sqrt(max(p.Iy, 1e-9) / p.m)
+    return np.array([speed, *(2 * [0.15 * speed]), 0.3, turning, turning, 0.05, 0.6, math.pi, *(3 * [10.0])])
+
+
+@lru_cache(maxsize=64)
+def required_substeps(p: VehicleParameters, dt: float, thrust: float, plane: float) -> int:
+    """Fewest Runge-Kutta steps a sample time that hold the one-step accuracy over the operating range.
+
+    A step with that many substeps is compared with one of twice as many, from the corners of the range and 100
+    states between them, under thrusts up to `thrust` [N] and planes within `plane` [rad].
+
+    Raises ValueError if 64 substeps do not suffice: dt is then far too long for the vehicle.
+    """
+    high = operating_range(p, thrust)[:8]
+    rng = np.random.default_rng(0)
+    part = np.hstack([rng.uniform(-1.0, 1.0, (8, 100)), rng.choice([-1.0, 1.0], (8, 100))])
+    part[0] = np.abs(part[0])
+    force = np.abs(rng.uniform(-1.0, 1.0, 200)) * thrust, np.zeros(200)
+    u = (*force, *(rng.choice([-1.0, 1.0], (2, 200)) * plane))
+    limit = ONE_STEP_ACCURACY * 2.0 * high[:, None]
+
+    def moved(count):
+        c, x = derive_constants(p, dt / count), tuple(part * high[:, None])
+        for _ in range(count):
+            x = motion_substep(x, u, c)
+        return np.array(x)
+
+    count = 1
+    with np.errstate(all="ignore"):
+        before = moved(count)
+        while count <= 64:
+            after = moved(2 * count)
+            if (np.abs(after - before) <= limit).all():
+                return count
+            count, before = 2 * count, after
+    raise ValueError(f"dt must be short enough for 64 Runge-Kutta steps to follow the vehicle, but got {dt!r}")

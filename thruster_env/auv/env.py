@@ -1,22 +1,127 @@
-"""`SegorogeniAUV-v0`: thrust and two planes in, noisy measurements out, the state hidden."""
+"""`SegorogeniAUV-v0` and its tasks, as single and vector envs, and how they are drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv.engine import memory as at
-from thruster_env.auv.engine.copies import Copies
-from thruster_env.auv.modelled import ModelledVehicle
+from thruster_env.auv.engine import encoding as at
+from thruster_env.auv.engine.simulation import Copies
 from thruster_env.auv.plant import Plant, make_plant
-from thruster_env.auv.rendering.env import RenderedVehicle
-from thruster_env.auv.task import make_task
-from thruster_env.core.arguments import arguments_of, takes_arguments_of
+from thruster_env.auv.rendering.renderer import Moment, Renderer
+from thruster_env.auv.task import make_depth_task, make_task
+from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
-from thruster_env.env.env import PlantEnv
-from thruster_env.env.report import ReportRows
+from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
+from thruster_env.env.model_env import ModelledEnv
+from thruster_env.env.vector_env import PlantVectorEnv
+from thruster_env.model.split import Split, split
+from thruster_env.render.renderer import MODES
+
+# What every env and vector env of the vehicle offers to filters.
+
+
+if TYPE_CHECKING:
+    from thruster_env.auv.rendering import Overlay
+    from thruster_env.model.state_space import StateSpaceModel
+
+
+class ModelledVehicle(ModelledEnv):
+    """An env with a `plant` that offers its model to filters; changes are those of `model.model_of_plant`.
+
+    Unless `states` says otherwise, that is the smaller of "motion" (8 states) and "navigation" (12) that predicts
+    all channels: of the default sensors, which have compass and depth, "navigation".
+    """
+
+    plant_name = "a vehicle"
+    plant: Plant
+
+    def model_maker(self) -> Callable[..., StateSpaceModel]:
+        """`model.model_of_plant`."""
+        from thruster_env.auv.model import model_of_plant
+
+        return model_of_plant
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """See `thruster_env.env.model_env`; for "velocities" roll and pitch are as measured, else level."""
+        attitude = "measured" if {"phi", "theta"} <= set(self.plant.channels) else "level"
+        return super().state_space_model(**{"attitude": attitude} | changes)
+
+    def measured_inputs(self, model: StateSpaceModel) -> Split | None:
+        """Which channels are a model's inputs beside the action, by symbol; None where there are none."""
+        return split(model, len(self.plant.inputs), self.plant.channels)
+
+    def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
+        """See `plant_data.check_same_plant`."""
+        from thruster_env.auv.plant import check_same_plant
+
+        return check_same_plant(tuned_for, self.plant, file)
+
+    def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+        """The belief that a rendered vehicle shows beside the truth: the states it has, by their symbols."""
+        from thruster_env.auv.rendering import Overlay
+
+        names = {state.symbol: i for i, state in enumerate(model.states)}
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0)).tolist()
+        shown = {"x": "x", "y": "y", "depth": "z", "phi": "phi", "theta": "theta", "psi": "psi", "u": "u"}
+        known = {name: names[symbol] for name, symbol in shown.items() if symbol in names}
+        values = {name: float(mean[i]) for name, i in known.items()}
+        spreads = {f"{name}_std": std[i] for name, i in known.items() if f"{name}_std" in Overlay._fields}
+        return Overlay(label, **values, **spreads)
+
+
+# How a vehicle env draws itself.
+
+
+class RenderedVehicle(RenderedEnv):
+    """An env with a vehicle as `plant` and a path in its `task`."""
+
+    task: Any
+    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
+
+    def make_renderer(self) -> Renderer:
+        """What draws the vehicle on its way."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
+        return Renderer(
+            self.render_mode,
+            path=self.task.path.points,
+            max_thrust=self.plant.max_thrust,
+            max_plane=self.plant.max_plane,
+            dt=self.plant.dt,
+            frames_per_second=self.metadata["render_fps"],
+            size=self.render_size,
+        )
+
+    def moment_of(self, report: list[float]) -> Moment:
+        """What the renderer adds of a report: truth, measurements, the path abreast, and what acts."""
+        channels, state = self.plant.channels, report[at.STATE : at.STATE + at.N]
+
+        def measured(symbol: str) -> float | None:
+            return report[at.READINGS + channels.index(symbol)] if symbol in channels else None
+
+        return Moment(
+            time=report[TIME],
+            x=state[at.X],
+            y=state[at.Y],
+            depth=state[at.Z],
+            phi=state[at.PHI],
+            theta=state[at.THETA],
+            psi=state[at.PSI],
+            u=state[at.U],
+            measured_depth=measured("z"),
+            measured_u=measured("u"),
+            reference_depth=state[at.Z] - report[at.TRUE_ERRORS + 1],
+            reference_u=self.task.speed,
+            thrust=report[at.INPUTS],
+            stern=report[at.INPUTS + 2],
+            rudder=report[at.INPUTS + 3],
+        )
+
+
+# `SegorogeniAUV-v0`: thrust and two planes in, noisy measurements out, the state hidden.
 
 
 class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
@@ -128,3 +233,95 @@ def at_depth(plant: Plant, depth: float) -> Plant:
     mean = plant.initial_mean.copy()
     mean[at.Z] = depth
     return plant._replace(initial_mean=mean)
+
+
+# The other envs: a path to follow, and steps of the depth.
+
+
+class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
+    """An autonomous underwater vehicle: follow a path in three dimensions at a speed.
+
+    As `SegorogeniAUVEnv`, except for these:
+
+    ## Observation space
+    Channels and validity flags, then the path:
+
+    | num | observation | min | max | unit |
+    |---|---|---|---|---|
+    | -6 | depth of the path abreast of the vehicle | -inf | inf | m |
+    | -5 | distance to starboard of the path | -inf | inf | m |
+    | -4 | distance below the path | -inf | inf | m |
+    | -3 | sine of yaw less the path's course | -inf | inf | - |
+    | -2 | its cosine | -inf | inf | - |
+    | -1 | u less the speed to keep | -inf | inf | m/s |
+
+    These compare the path with what the vehicle itself can know, never with the true state: yaw, depth and speed
+    as measured, with noise, and a position by dead reckoning from measured velocities and attitude, from the known
+    start. So they drift as the vehicle's own navigation does, by decimetres in half a minute with the default
+    sensors, and more with others. `info["path_errors"]` and the reward have the true ones. Where a filter's
+    estimate is in the observation, `control.depth_and_course` compares that with the path in their place, and with
+    the depth.
+
+    ## Reward
+    Errors are measured to the point of the path abreast of the vehicle, so the time does not matter; the speed has
+    its own term.
+
+    ## Arguments
+    `path` is "IV" by default; see `thruster_env.auv.task.make_task`. Episodes are truncated after 600 steps (30
+    s).
+    """
+
+    observes_errors = True
+
+    @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"], defaults={"path": "IV"})
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
+        """Build the plant; see the class for the arguments."""
+        self._build(arguments, make_task(**arguments_of(make_task, arguments)), (render_mode, render_size))
+
+
+class SegorogeniAUVDepthEnv(SegorogeniAUVEnv):
+    """An autonomous underwater vehicle: follow steps of the depth up and down, on a straight course north.
+
+    As `SegorogeniAUVPathEnv`, whose observation it has; the path's depth steps by `step_size` (2 m) up or down
+    at random every `hold_time` (15 s), within twice of that about `depth` (6 m), where the vehicle starts.
+    Observation k compares with the depth of time k + 1, the one that the reward of the next step compares with.
+    Episodes are truncated after 1200 steps (60 s).
+
+    ## Arguments
+    The list is that of `thruster_env.auv.plant.make_plant` and of `thruster_env.auv.task.make_depth_task`;
+    `render_mode` and `render_size` come on top.
+    """
+
+    observes_errors = True
+
+    @takes_arguments_of(make_plant, make_depth_task, leaving_out=["substeps"])
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
+        """Build the plant; see the class for the arguments."""
+        self._build(
+            arguments, make_depth_task(**arguments_of(make_depth_task, arguments)), (render_mode, render_size)
+        )
+
+
+# The vector envs: all copies advanced by one compiled call, noise included.
+
+
+class SegorogeniAUVVectorEnv(ModelledVehicle, PlantVectorEnv):
+    """Vector env of `SegorogeniAUV-v0`; see `PlantVectorEnv`.
+
+    `num_envs`, `max_episode_steps` and `autoreset_mode` are those of `PlantVectorEnv`, the others those of the
+    single env.
+    """
+
+    single_env: ClassVar[type[SegorogeniAUVEnv]] = SegorogeniAUVEnv
+
+
+class SegorogeniAUVPathVectorEnv(SegorogeniAUVVectorEnv):
+    """Vector env of `SegorogeniAUVPath-v0`."""
+
+    single_env = SegorogeniAUVPathEnv
+
+
+class SegorogeniAUVDepthVectorEnv(SegorogeniAUVVectorEnv):
+    """Vector env of `SegorogeniAUVDepth-v0`."""
+
+    single_env = SegorogeniAUVDepthEnv

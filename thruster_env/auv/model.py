@@ -1,4 +1,13 @@
-"""The vehicle as a `StateSpaceModel` that a filter assumes, with six to fourteen states."""
+"""The vehicle as a `StateSpaceModel` that a filter assumes, with six to fourteen states.
+
+They act for one step, as the action does, and are not measurements of the model. Their noise drives the model's
+states, so that
+
+    Q = Q_plant + B R_a B',   B = df/d(phi, theta) straight ahead,
+
+with the covariance R_a of these two channels, unless Q is given. By the righting moments it affects roll rates
+most.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +18,61 @@ from dataclasses import dataclass
 import numpy as np
 
 from thruster_env.auv import dynamics
-from thruster_env.auv.channels import CHANNELS, MEASURED, channels_of, suite
-from thruster_env.auv.kinematics import angle_rates, attitude_of, in_earth_axes
-from thruster_env.auv.measured_attitude import derivative_by_attitude, split_channels
-from thruster_env.auv.operating import cruise_thrust, operating_range
+from thruster_env.auv.channels import (
+    ATTITUDE_INPUTS,
+    CHANNELS,
+    CURRENT_STATES,
+    MEASURED,
+    STATES,
+    SYMBOLS,
+    channels_of,
+    suite,
+)
+from thruster_env.auv.dynamics import angle_rates, attitude_of, cruise_thrust, in_earth_axes, operating_range
 from thruster_env.auv.parameters import VehicleParameters, checked
 from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
-from thruster_env.auv.quantities import ATTITUDE_INPUTS, CURRENT_STATES, STATES, SYMBOLS
 from thruster_env.core.checks import covariance, one_of, positive
 from thruster_env.core.compiled import inlined
-from thruster_env.core.factors import scaled
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.matrices import scaled
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.env.channels import functions_of
+from thruster_env.env.copies import functions_of
+from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
+
+# Roll and pitch, measured by an AHRS, as inputs of the model of six velocities.
+
+
+TILT = 1e-4  # rad
+
+
+def split_channels(channels: tuple[str, ...], states: str, attitude: str) -> tuple[list[int], list[int]]:
+    """Places of the channels that are inputs of a model, phi and theta, and of those that it measures.
+
+    Raises ValueError if an attitude that is to be measured is not.
+    """
+    names = [quantity.symbol for quantity in ATTITUDE_INPUTS]
+    if states != "velocities" or attitude != "measured":
+        return [], list(range(len(channels)))
+    if not set(names) <= set(channels):
+        raise ValueError(
+            f"sensors of a measured attitude must measure phi and theta, but got {', '.join(channels)}"
+        )
+    told = [channels.index(name) for name in names]
+    return told, [i for i in range(len(channels)) if i not in told]
+
+
+def derivative_by_attitude(move: Callable, state: np.ndarray, inputs: list[float], plant: Plant) -> np.ndarray:
+    """Derivative (n, 2) of a whole step with respect to its last inputs, roll and pitch (central differences)."""
+
+    def moved(tilt: np.ndarray) -> np.ndarray:
+        x, u = state.tolist(), [*inputs[:-2], *tilt.tolist()]
+        for _ in range(plant.substeps):
+            x = move(x, u, plant.constants)
+        return np.array(x)
+
+    return np.transpose([(moved(tilt) - moved(-tilt)) / (2.0 * TILT) for tilt in TILT * np.eye(2)])
 
 
 @dataclass(frozen=True)
@@ -159,7 +208,7 @@ def auv_model(
             states predict.
         integration: "runge-kutta", or "euler" as in the papers.
         attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
-            the sensors measure them, see `thruster_env.auv.measured_attitude`, "level" for zeros.
+            the sensors measure them, see `thruster_env.auv.model`, "level" for zeros.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
         operating_speed: speed straight ahead about which a Kalman filter linearises the model [m/s].
         current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
@@ -278,3 +327,41 @@ def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
     whole = np.diag(np.append(np.zeros(len(cov)), [of_current] * len(CURRENT_STATES)))
     whole[: len(cov), : len(cov)] = cov
     return whole[:n, :n]
+
+
+# The vehicle in continuous time: its rates and spectral densities, from which follows a model for any dt.
+
+
+RATES = {
+    "velocities": dynamics.velocity_rates,
+    "motion": dynamics.motion_rates,
+    "navigation": dynamics.navigation_rates,
+    "current": dynamics.drifting_rates,
+}
+"""By the states of `thruster_env.auv.model.MODELS`."""
+
+
+@makes_functions
+def rates_of(states: str, torque_is_input: bool, attitude_is_input: bool) -> Callable:
+    """The rates of a model, as a function of its own inputs."""
+    inputs = tuple_of(forces_of(states, torque_is_input, attitude_is_input))
+    return written_out("rates", "x, u, c", f"move(x, {inputs}, c)", move=RATES[states])
+
+
+def continuous_auv(**arguments) -> ContinuousModel:
+    """The vehicle in continuous time, from plain arguments that JSON can hold.
+
+    The spectral densities of its noise are those whose Q of a step `dt` is `process_noise_cov`: `at(dt)` is
+    `thruster_env.auv.model.auv_model(**arguments)`, and `at` of another sample time is its model, with Q by
+    `thruster_env.model.continuous.noise_for_dt`.
+
+    Args:
+        **arguments: those of `auv_model`; `integration` must be "runge-kutta".
+
+    Raises:
+        ValueError: if an argument is wrong, and for a Q that no white noise has.
+    """
+    model = auv_model(**arguments)
+    states = next(name for name, steps in MODELS.items() if steps.count == model.n)
+    symbols = [one.symbol for one in model.input_quantities]
+    return ContinuousModel.of(model, rates_of(states, "K_prop" in symbols, "phi" in symbols))

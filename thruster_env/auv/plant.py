@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.auv.channels import CHANNELS, MAX_CHANNELS, Instrument, default_instrument, suite
-from thruster_env.auv.effects.current import Current, make_current
-from thruster_env.auv.effects.sensors import VEHICLE_SENSOR_EFFECTS, NearSurface
-from thruster_env.auv.forces import Constants
-from thruster_env.auv.operating import required_substeps
-from thruster_env.auv.parameters import VehicleParameters, derive_constants
-from thruster_env.auv.presets import preset_parameters
-from thruster_env.auv.quantities import COMMANDS, INPUTS, STATES
-from thruster_env.core.checks import (
-    at_least,
-    between,
-    covariance,
-    finite,
-    one_of,
-    positive,
-    short_repr,
-    vector,
+from thruster_env.auv.channels import (
+    CHANNELS,
+    COMMANDS,
+    INPUTS,
+    MAX_CHANNELS,
+    STATES,
+    Instrument,
+    default_instrument,
+    suite,
 )
+from thruster_env.auv.dynamics import required_substeps
+from thruster_env.auv.effects import VEHICLE_SENSOR_EFFECTS, Current, NearSurface, make_current
+from thruster_env.auv.forces import Constants
+from thruster_env.auv.parameters import VehicleParameters, derive_constants
+from thruster_env.auv.presets import PRESETS, preset_parameters
+from thruster_env.core.checks import at_least, between, covariance, finite, one_of, positive, short_repr, vector
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.missing import SampleEvery
+from thruster_env.env.plant_data import Entries, check_same, mappings
 from thruster_env.model.quantities import Quantity
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
@@ -224,3 +225,62 @@ def state(name: str, value) -> np.ndarray:
     if np.abs(given).max() > LARGEST_STATE:
         raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
     return given
+
+
+# A vehicle as data for JSON, for files that record their plant.
+
+
+ENTRIES = Entries(
+    ("preset", "dt", "sensors", "propeller_torque"),
+    (
+        "preset",
+        "parameters",
+        "dt",
+        "sensors",
+        "propeller_torque",
+        "max_thrust",
+        "max_plane",
+        "process_noise_cov",
+        "measurement_noise_cov",
+        "sensor_effects",
+        "current",
+        "propeller_lag",
+        "plane_lag",
+    ),
+    VehicleParameters._fields,
+)
+
+
+def plant_data(plant: Plant) -> dict:
+    """What a filter's numbers depend on: the vehicle, its sample time, sensors, noise, current and lags.
+
+    Initial state, task and seed are not among it.
+    """
+    named = [name for name, parameters in PRESETS.items() if parameters == plant.parameters]
+    data = {
+        "preset": named[0] if named else None,
+        "parameters": plant.parameters._asdict(),
+        "dt": plant.dt,
+        "sensors": list(plant.channels),
+        "propeller_torque": plant.propeller_torque,
+        "max_thrust": plant.max_thrust,
+        "max_plane": plant.max_plane,
+        "process_noise_cov": plant.process_noise_cov.tolist(),
+        "measurement_noise_cov": plant.measurement_noise_cov.tolist(),
+        "sensor_effects": {channel: mappings(effects) for channel, effects in plant.sensors.items()},
+        "current": {direction: mappings(signals) for direction, signals in plant.current.items()},
+        "propeller_lag": plant.propeller_lag,
+        "plane_lag": plant.plane_lag,
+    }
+    return json.loads(json.dumps(data))  # lists for tuples, as a file has them
+
+
+def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list[str]:
+    """Raise ValueError, with the differences, if a tuned file is for another plant; return other differences.
+
+    Args:
+        tuned_for: the file's data of a plant, from `plant_data`.
+        plant: where it is to be used.
+        file: its path.
+    """
+    return check_same(ENTRIES, tuned_for, plant_data(plant), file)

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.compiled import inlined
-from thruster_env.core.sources import Index, Source
-from thruster_env.core.written import written_out
+from thruster_env.core.sources import Index, Source, written_out
 
 TURN = 2.0 * math.pi
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.compiled import inlined
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Index, Source, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding

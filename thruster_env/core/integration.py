@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from thruster_env.core.compiled import inlined
-from thruster_env.core.pickling import makes_functions
-from thruster_env.core.sources import is_array, matrix_of, tuple_of, written_out
-from thruster_env.core.tuples import scaled_sum
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.sources import is_array, matrix_of, scaled_sum, tuple_of, written_out
 
 
 @makes_functions

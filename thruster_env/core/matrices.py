@@ -2,30 +2,421 @@
 
 Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of
 large ones, which would grow with the cube of the size, has loops instead (`thruster_env.core.sources`).
+
+They are compiled once for all sizes. They are loops rather than calls of BLAS, because the threads of BLAS would
+compete with those that work on different trajectories, and because its sums depend on the machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
+from typing import NamedTuple, TypeVar
 
-from thruster_env.core import arrays
-from thruster_env.core.sources import Source, is_array
-from thruster_env.core.triangles import (
-    careful_factor,
-    cholesky_factor,
-    column_solver,
-    factored_inverse,
-    forward_solver,
-    innovation_likelihood,
-    pivoted_factor,
-    row_solver,
-    semidefinite_factor,
-    square,
-    triangle_divider,
-    triangular_root,
-    vector_solver,
-)
+import numpy as np
+
+from thruster_env.core.checks import positive, short_repr
+from thruster_env.core.compiled import inlined, not_inlined
+from thruster_env.core.sources import Local, Source, is_array
+
+# Parameters multiplied by factors, for a filter that assumes another plant than the true one.
+
+
+Parameters = TypeVar("Parameters", bound=NamedTuple)
+
+
+def scaled(parameters: Parameters, factors: Mapping[str, float], names: Iterable[str]) -> Parameters:
+    """Parameters with some fields multiplied by positive factors; ValueError unless these are among the names."""
+    if not isinstance(factors, Mapping):
+        raise ValueError(f"parameter_factors must map names to factors, but got {short_repr(factors)}")
+    unknown = [name for name in factors if name not in names]
+    if unknown:
+        raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
+    changed = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
+    return parameters._replace(**changed)
+
+
+# Linear systems in discrete time: discretisation and observability.
+
+
+def zero_order_hold(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Discrete A_d, B_d of dx/dt = A x + B u for an input held over dt [s], by the matrix exponential."""
+    from scipy.signal import cont2discrete
+
+    a_d, b_d, *_ = cont2discrete((a, b, np.eye(len(a)), np.zeros((len(a), b.shape[1]))), dt, method="zoh")
+    return a_d, b_d
+
+
+def observability(a: np.ndarray, c: np.ndarray) -> tuple[int, float]:
+    """Rank and condition number of the observability matrix [C; C A; ...] of a discrete pair (A, C)."""
+    matrix = np.vstack([c @ np.linalg.matrix_power(a, k) for k in range(len(a))])
+    return int(np.linalg.matrix_rank(matrix)), float(np.linalg.cond(matrix))
+
+
+# Products and quotients of large matrices, as loops over arrays of float64 that run along contiguous memory.
+
+
+def called(function):
+    """Mark a function that compiled functions call; see `thruster_env.core.compiled.inlined`."""
+    return inlined(function, into_callers=False)
+
+
+@not_inlined
+def _products_of_rows(a, b, lower):
+    """A b', or its part on and below the diagonal, in blocks of two rows of a and four of b that share reads.
+
+    Blocks at the ends repeat the last row, so that no further loops are needed for the remainder.
+    """
+    rows, columns, inner = a.shape[0], b.shape[0], a.shape[1]
+    out = np.empty((rows, columns))
+    for i in range(0, rows, 2):
+        i_1 = min(i + 1, rows - 1)
+        for j in range(0, i + 2 if lower else columns, 4):
+            j_0, j_1, j_2, j_3 = (
+                min(j, columns - 1),
+                min(j + 1, columns - 1),
+                min(j + 2, columns - 1),
+                min(j + 3, columns - 1),
+            )
+            p_0 = p_1 = p_2 = p_3 = q_0 = q_1 = q_2 = q_3 = 0.0
+            for k in range(inner):
+                x, y = a[i, k], a[i_1, k]
+                p_0 += x * b[j_0, k]
+                p_1 += x * b[j_1, k]
+                p_2 += x * b[j_2, k]
+                p_3 += x * b[j_3, k]
+                q_0 += y * b[j_0, k]
+                q_1 += y * b[j_1, k]
+                q_2 += y * b[j_2, k]
+                q_3 += y * b[j_3, k]
+            out[i, j_0], out[i, j_1], out[i, j_2], out[i, j_3] = p_0, p_1, p_2, p_3
+            out[i_1, j_0], out[i_1, j_1], out[i_1, j_2], out[i_1, j_3] = q_0, q_1, q_2, q_3
+    return out
+
+
+@not_inlined
+def product_of_rows(a, b):
+    """A b'."""
+    return _products_of_rows(a, b, False)
+
+
+@not_inlined
+def add_product(out, a, b):
+    """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
+    rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
+    whole = inner - inner % 4
+    for i in range(rows):
+        for k in range(0, whole, 4):
+            x_0, x_1, x_2, x_3 = a[i, k], a[i, k + 1], a[i, k + 2], a[i, k + 3]
+            for j in range(columns):
+                out[i, j] += x_0 * b[k, j] + x_1 * b[k + 1, j] + x_2 * b[k + 2, j] + x_3 * b[k + 3, j]
+        for k in range(whole, inner):
+            x_0 = a[i, k]
+            for j in range(columns):
+                out[i, j] += x_0 * b[k, j]
+
+
+@called
+def product(a, b):
+    """A b."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    add_product(out, a, b)
+    return out
+
+
+@not_inlined
+def sparse_product(a, b):
+    """A b; where four entries of a that lie side by side are zero, nothing is added."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for first in range(0, a.shape[1], 4):
+            last = min(first + 4, a.shape[1])
+            anything = False
+            for k in range(first, last):
+                anything = anything or a[i, k] != 0.0
+            if anything and last == first + 4:
+                x_0, x_1, x_2, x_3 = a[i, first], a[i, first + 1], a[i, first + 2], a[i, first + 3]
+                for j in range(b.shape[1]):
+                    out[i, j] += (
+                        x_0 * b[first, j] + x_1 * b[first + 1, j] + x_2 * b[first + 2, j] + x_3 * b[first + 3, j]
+                    )
+            elif anything:
+                for k in range(first, last):
+                    for j in range(b.shape[1]):
+                        out[i, j] += a[i, k] * b[k, j]
+    return out
+
+
+@not_inlined
+def deviations(table, first, rows, means, size):
+    """Deviations from means (rows,) of `rows` rows of a table, starting at row `first`, and `size` columns."""
+    out = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            out[i, j] = table[first + i, j] - means[i]
+    return out
+
+
+@called
+def weighted_square_of_rows(d, table, weights):
+    """The sum of w d d' over columns d with weights w from a row of a table, exactly symmetric."""
+    rows, size = d.shape
+    scaled = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            scaled[i, j] = table[weights, j] * d[i, j]
+    out = _products_of_rows(scaled, d, True)
+    for i in range(rows):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
+
+
+@not_inlined
+def square_of_rows(a):
+    """A a', exactly symmetric."""
+    out = _products_of_rows(a, a, True)
+    for i in range(a.shape[0]):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
+
+
+@not_inlined
+def solve_rows(b, factor):
+    """B (l l')^-1 for a lower triangular l: forward, then backward substitution for all rows of b at a time."""
+    rows, size = b.shape
+    turned = b.T.copy()
+    for i in range(size):
+        for k in range(i):
+            x = factor[i, k]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            x = factor[k, i]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    return turned.T.copy()
+
+
+# Triangular factors of matrices of every size, and solutions with them; see `thruster_env.core.matrices`.
+
+
+NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
+RESOLUTION = 1e-15  # of the difference of two float64, relative to them
+
+
+def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
+    """Return `factor(a)`: the lower triangular L of Cholesky's method, row by row, with a diagonal of one's own.
+
+        l_ij = (a_ij - sum_k l_ik l_jk) / l_jj for j < i, the sum over k < j
+        d_i = a_ii - sum_k l_ik^2, the sum over k < i, of which l_ii is the root where there is one
+
+    Args:
+        size: rows and columns of a.
+        diagonal: source of l_ii, in which `{d}` stands for d_i and `{a}` for a_ii.
+        names: other names that it uses, with their values.
+    """
+    source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
+    root, d = source.local("l", size, size), source.local("d", size)
+    for i in source.range(size):
+        for j in source.range(i):
+            rest = source.less(f"a[{i}][{j}]", (f"{root[i, k]} * {root[j, k]}" for k in source.range(j)))
+            source.line(f"{root[i, j]} = ({rest}) / {root[j, j]}")
+        source.line(
+            f"{d[i]} = " + source.less(f"a[{i}][{i}]", (f"{root[i, k]} * {root[i, k]}" for k in source.range(i)))
+        )
+        source.line(f"{root[i, i]} = " + diagonal.format(d=d[i], a=f"a[{i}][{i}]"))
+    return source.function(source.lower(root), **names)
+
+
+@cache
+def cholesky_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
+    return pivoted_factor(size, "({d} if {d} > 0.0 else nan) ** 0.5", nan=math.nan)
+
+
+@cache
+def careful_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L of a positive semidefinite a, for `row_solver`.
+
+    Where a pivot is zero the diagonal of L is infinite, so that solving gives zero there.
+    """
+    return pivoted_factor(size, f"{{d}} ** 0.5 if {{d}} > {NEGLIGIBLE} * {{a}} else infinity", infinity=math.inf)
+
+
+@cache
+def semidefinite_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L with L L' = a, for a that may be singular.
+
+    A column whose pivot is no more than rounding is zero.
+    """
+    source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
+    root = source.local("l", size, size)
+    for j in source.range(size):
+        source.line(
+            "d = " + source.less(f"a[{j}][{j}]", (f"{root[j, k]} * {root[j, k]}" for k in source.range(j)))
+        )
+        source.line(f"{root[j, j]} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
+        source.line(f"r = 1.0 / {root[j, j]} if {root[j, j]} != 0.0 else 0.0")
+        for i in source.range(j + 1, size):
+            rest = source.less(f"a[{i}][{j}]", (f"{root[i, k]} * {root[j, k]}" for k in source.range(j)))
+            source.line(f"{root[i, j]} = ({rest}) * r")
+    return source.function(source.lower(root))
+
+
+@cache
+def row_solver(rows: int, size: int) -> Callable:
+    """Return `solve(b, l)`: b (l l')^-1, for b of shape (rows, size) and l lower triangular."""
+    if is_array(rows, size) and is_array(size, size):
+        return solve_rows
+    shape = rows, size
+    source = Source("solve", "b, l", result=shape, b=shape, l=(size, size), work=rows * size * size)
+    y, x = source.local("y", rows, size), source.local("x", rows, size)
+    for r in source.range(rows):
+        for i in source.range(size):
+            rest = source.less(f"b[{r}][{i}]", (f"l[{i}][{k}] * {y[r, k]}" for k in source.range(i)))
+            source.line(f"{y[r, i]} = ({rest}) / l[{i}][{i}]")
+        for i in source.reversed(size):
+            rest = source.less(y[r, i], (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
+            source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
+
+
+@cache
+def vector_solver(size: int) -> Callable:
+    """Return `solve(v, l)`: (l l')^-1 v, for v of `size` components and l lower triangular."""
+    source = Source("solve", "v, l", result=(size,), v=(size,), l=(size, size), work=size * size)
+    y, x = _forward(source, size), source.local("x", size)
+    for i in source.reversed(size):
+        rest = source.less(y[i], (f"l[{k}][{i}] * {x[k]}" for k in source.range(i + 1, size)))
+        source.line(f"{x[i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
+
+
+@cache
+def triangle_divider(rows: int, size: int) -> Callable:
+    """Return `divide(b, l)`: b l^-1, for b of shape (rows, size) and l lower triangular."""
+    shape = rows, size
+    source = Source("divide", "b, l", result=shape, b=shape, l=(size, size), work=rows * size * size // 2)
+    x = source.local("x", rows, size)
+    for r in source.range(rows):
+        for i in source.reversed(size):
+            rest = source.less(f"b[{r}][{i}]", (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
+            source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
+
+
+def _forward(source: Source, size: int, each: Callable = lambda i, y: None, missing: str = "") -> Local:
+    """The numbers y = l^-1 v; `each(i, y)` is called behind every one, and `missing` follows its source."""
+    y = source.local("y", size)
+    for i in source.range(size):
+        rest = source.less(f"v[{i}]", (f"l[{i}][{k}] * {y[k]}" for k in source.range(i)))
+        source.line(f"{y[i]} = ({rest}) / l[{i}][{i}]" + missing.format(i=i))
+        each(i, y)
+    return y
+
+
+@cache
+def forward_solver(size: int) -> Callable:
+    """Return `solve(l, v)`: the tuple l^-1 v, for l lower triangular and v of `size` components."""
+    source = Source("solve", "l, v", result=(size,), l=(size, size), v=(size,), work=size * size // 2)
+    return source.function(source.whole(_forward(source, size)))
+
+
+@cache
+def column_solver(size: int, columns: int) -> Callable:
+    """Return `solve(l, b)`: l^-1 b, for l lower triangular and b of shape (size, columns)."""
+    shape = size, columns
+    source = Source("solve", "l, b", result=shape, l=(size, size), b=shape, work=size * size * columns // 2)
+    y = source.local("y", size, columns)
+    for c in source.range(columns):
+        for i in source.range(size):
+            rest = source.less(f"b[{i}][{c}]", (f"l[{i}][{k}] * {y[k, c]}" for k in source.range(i)))
+            source.line(f"{y[i, c]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(y))
+
+
+@cache
+def innovation_likelihood(size: int) -> Callable:
+    """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
+    shapes = {"v": (size,), "l": (size, size), "z": (size,)}
+    source = Source("log_likelihood", "v, l, z", **shapes, work=size * size // 2)
+    source.line("total = 0.0")
+
+    def add(i, y):
+        for _ in source.inside(f"if z[{i}] == z[{i}]:"):
+            half = f"0.5 * {y[i]} * {y[i]} + log(l[{i}][{i}])"
+            source.line(f"total -= {half} + {0.5 * math.log(2.0 * math.pi)!r}")
+
+    _forward(source, size, add)
+    return source.function("total", log=math.log)
+
+
+@cache
+def square(rows: int, columns: int) -> Callable:
+    """Return `square(a)`: a a', exactly symmetric, for a of shape (rows, columns)."""
+    if is_array(rows, rows) and is_array(rows, columns):
+        return square_of_rows
+    work = rows * rows * columns // 2
+    source = Source("square", "a", result=(rows, rows), a=(rows, columns), work=work)
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * a[{j}][{k}]" for k in source.range(columns))
+
+    return source.function(source.symmetric("p", rows, entry))
+
+
+@cache
+def factored_inverse(size: int) -> Callable:
+    """Return `invert(l)`: (l l')^-1 = W' W with W = l^-1, exactly symmetric, for l lower triangular."""
+    source = Source("invert", "l", result=(size, size), l=(size, size), work=size**3 // 3)
+    w = source.local("w", size, size)
+    for j in source.range(size):
+        source.line(f"{w[j, j]} = 1.0 / l[{j}][{j}]")
+        for i in source.range(j + 1, size):
+            rest = source.sum(f"l[{i}][{k}] * {w[k, j]}" for k in source.range(j, i))
+            source.line(f"{w[i, j]} = -({rest}) / l[{i}][{i}]")
+
+    def entry(i, j):
+        return source.sum(f"{w[k, i]} * {w[k, j]}" for k in source.range(i, size))
+
+    return source.function(source.symmetric("p", size, entry))
+
+
+@cache
+def triangular_root(rows: int, columns: int) -> Callable:
+    """Return `triangle(a)`: the lower triangular L (rows, rows) with L L' = a a', for a of shape (rows, columns).
+
+    Its rows are those of a in the basis that Gram and Schmidt's method makes of them: the modified method, whose
+    L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
+    Gram-Schmidt orthogonalization".
+    """
+    given = rows, columns
+    source = Source("triangle", "a", result=(rows, rows), a=given, work=rows * rows * columns // 2)
+    b, root = source.local("b", rows, columns), source.local("l", rows, rows)
+    for i in source.range(rows):
+        for j in source.range(columns):
+            source.line(f"{b[i, j]} = a[{i}][{j}]")
+    for i in source.range(rows):
+        total = source.sum(f"{b[i, j]} * {b[i, j]}" for j in source.range(columns))
+        source.line(f"{root[i, i]} = ({total}) ** 0.5")
+        source.line(f"r = 1.0 / {root[i, i]} if {root[i, i]} != 0.0 else 0.0")
+        for j in source.range(columns):
+            source.line(f"{b[i, j]} = {b[i, j]} * r")
+        for k in source.range(i + 1, rows):
+            total = source.sum(f"{b[i, j]} * {b[k, j]}" for j in source.range(columns))
+            source.line(f"{root[k, i]} = {total}")
+            for j in source.range(columns):
+                source.line(f"{b[k, j]} = {b[k, j]} - {root[k, i]} * {b[i, j]}")
+    return source.function(source.lower(root))
+
 
 __all__ = [
     "careful_factor",
@@ -57,7 +448,7 @@ def multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b for shapes (rows, inner) and (inner, columns)."""
     shapes = {"result": (rows, columns), "a": (rows, inner), "b": (inner, columns)}
     if all(is_array(*shape) for shape in shapes.values()):
-        return arrays.product
+        return product
     source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
 
     def entry(i, j):
@@ -71,7 +462,7 @@ def transposed_multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b' for shapes (rows, inner) and (columns, inner)."""
     shapes = {"result": (rows, columns), "a": (rows, inner), "b": (columns, inner)}
     if all(is_array(*shape) for shape in shapes.values()):
-        return arrays.product_of_rows
+        return product_of_rows
     source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
 
     def entry(i, j):

@@ -1,14 +1,24 @@
-"""Objects by "module:object": code, which only a user's own command line or call may have imported."""
+"""Objects by "module:object", optional dependencies, and leftovers of uninstalled copies.
+
+`python -m thruster_env.core.modules`, from the checkout's folder, removes them; `make` does it after each
+installation.
+"""
 
 from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import sys
+import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
 from types import FrameType, ModuleType
+
+# Objects by "module:object": code, which only a user's own command line or call may have imported.
+
 
 SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
 
@@ -145,3 +155,55 @@ def as_module(name: str) -> list[str]:
     home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
     return [sys.executable, "-P", "-c", run]
+
+
+# How to install what is not in a plain installation: the optional dependencies of pyproject.toml.
+
+
+OF_ONE_PACKAGE = {
+    "parquet": "pyarrow",
+    "units": "pint",
+    "frames": "pandas",
+    "samplers": "cmaes",
+    "nuts": "nutpie",
+    "torch": "torch",
+}
+
+
+def to_install(extra: str) -> str:
+    """The command that installs an extra, for the end of a message.
+
+    An extra of one package is installed by that package's name. The others are named in this project's folder, for
+    the project is on no package index.
+
+    Args:
+        extra: a key of `optional-dependencies` in pyproject.toml.
+    """
+    if extra in OF_ONE_PACKAGE:
+        return f"pip install {OF_ONE_PACKAGE[extra]}"
+    return f"pip install '.[{extra}]' in the project's folder"
+
+
+# What an uninstalled copy of our packages left behind: folders without sources, which would hide the checkout's.
+
+
+def remove_leftovers(site: Path, checkout: Path) -> list[Path]:
+    """Remove folders in `site` with the name of a package in `checkout` that hold caches alone; return them.
+
+    Args:
+        site: folder where pip installs packages.
+        checkout: folder of the sources.
+    """
+    found = []
+    for source in sorted(checkout.glob("*/__init__.py")):
+        folder = site / source.parent.name
+        files = [one for one in folder.rglob("*") if one.is_file()] if folder.is_dir() else []
+        if folder.is_dir() and all(one.parent.name == "__pycache__" for one in files):
+            shutil.rmtree(folder)
+            found.append(folder)
+    return found
+
+
+if __name__ == "__main__":
+    for folder in remove_leftovers(Path(sysconfig.get_path("purelib")), Path.cwd()):
+        print(f"removed {folder}, which an earlier installation left behind")

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.core.code_cache import made_by
-from thruster_env.core.compiled import CompiledOrPython
+from thruster_env.core.compiled import CompiledOrPython, made_by
 from thruster_env.core.files import write_whole
 
 _known: dict[str, tuple[float, ...]] = {}  # of this process
@@ -22,7 +21,7 @@ def cached_numbers(
 ) -> np.ndarray:
     """Return the vector compute(), or what it was the last time that it followed from the same.
 
-    Numbers lie as JSON where the code is compiled to (`thruster_env.core.code_cache`), for one kind of
+    Numbers lie as JSON where the code is compiled to (`thruster_env.core.compiled`), for one kind of
     processor, and go with it. A file that is damaged is as if it were not there, a folder that takes none is as it
     is.
 

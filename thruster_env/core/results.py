@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from thruster_env.core.compiled import inlined, overloaded, when_compiling
-from thruster_env.core.pickling import makes_functions
-from thruster_env.core.sources import is_array
-from thruster_env.core.written import made_here, written_out
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.sources import is_array, made_here, written_out
 
 
 @overloaded

@@ -1,20 +1,193 @@
 """Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
 
-The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads,
-because a draw depends on its index only and never on what was drawn before. Every expression works on
-scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random
-numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
+Source: Johnson, Kotz, Balakrishnan (1994), Continuous Univariate Distributions, volume 1, section 13.10.1.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from thruster_env.core.compiled import inlined, overloaded, when_compiling
-from thruster_env.core.trigonometry import cosine_and_sine_of_turns
+
+# The normal distribution, for compiled code.
+
+
+HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
+
+
+@inlined
+def below(z):
+    """The normal distribution at z."""
+    return 0.5 * math.erfc(-z / 2.0**0.5)
+
+
+@inlined
+def quantile(share):
+    """The z below which there is a share in (0, 1) of the normal distribution."""
+    low, high = -40.0, 40.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if below(middle) < share:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+# Moments of a normal distribution of which only a part is possible.
+
+
+FAR = 5.0  # standard deviations, from which a continued fraction is used
+VERY_FAR = 100.0  # from which the moments are series, whose next terms are 1e-10 of them
+NEVER = -37.0  # beyond which exp(a^2/2) would not be finite; what lies below it has no probability
+NARROW = 1e-4  # standard deviations, up to which the part is taken as uniform
+TERMS = 60  # of the fraction
+
+
+@inlined
+def mills_ratio(a):
+    """(1 - Phi(a))/phi(a) of the standard normal distribution: the probability beyond a over the density at a."""
+    if a < FAR:
+        a = max(a, NEVER)
+        return math.sqrt(0.5 * math.pi) * math.exp(0.5 * a * a) * math.erfc(a * math.sqrt(0.5))
+    rest = a
+    for k in range(TERMS, 0, -1):
+        rest = a + k / rest
+    return 1.0 / rest
+
+
+@inlined
+def truncated_normal(low, high):
+    """Mean and variance of a standard normal number between two bounds, of which one may be infinite.
+
+        d = m(a) - e m(b),  e = exp((a^2 - b^2)/2),  mean = (1 - e)/d,  variance = 1 + (a - b e)/d - mean^2
+
+    with Mills' ratio m, in the order in which b >= |a|; with e = 0 for one bound.
+    """
+    sign, a, b = 1.0, low, high
+    if low + high < 0.0:
+        sign, a, b = -1.0, -high, -low
+    if b - a < NARROW:
+        return sign * 0.5 * (a + b), (b - a) * (b - a) / 12.0
+    e = math.exp(-0.5 * (b - a) * (b + a)) if b < math.inf else 0.0
+    if a > VERY_FAR and e < 1e-16:
+        s = 1.0 / (a * a)
+        return sign * (a + (1.0 - s * (2.0 - 10.0 * s)) / a), s * (1.0 - s * (6.0 - 50.0 * s))
+    d, end = mills_ratio(a), a
+    if e > 0.0:
+        d, end = d - e * mills_ratio(b), a - b * e
+    mean = (1.0 - e) / d
+    return sign * mean, max(1.0 + end / d - mean * mean, 0.0)
+
+
+# e^x of logarithms of weights, without branches and calls, so that loops over it become vector code.
+
+
+LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
+LN_2, PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)
+ROUNDER = 1.5 * 2.0**52  # adding it leaves a whole number in the last bits
+ROUNDER_BITS = int(np.float64(ROUNDER).view(np.int64))
+
+
+@inlined
+def parts(x):
+    """The factor e^r and the power k of e^x = e^r 2^k, |r| <= log(2)/2, by its series, to 1e-16."""
+    k = np.floor(x * PER_LN_2 + 0.5)
+    r = x - k * LN_2
+    series = 1.0 / 6227020800.0
+    series = series * r + 1.0 / 479001600.0
+    series = series * r + 1.0 / 39916800.0
+    series = series * r + 1.0 / 3628800.0
+    series = series * r + 1.0 / 362880.0
+    series = series * r + 1.0 / 40320.0
+    series = series * r + 1.0 / 5040.0
+    series = series * r + 1.0 / 720.0
+    series = series * r + 1.0 / 120.0
+    series = series * r + 1.0 / 24.0
+    series = series * r + 1.0 / 6.0
+    series = series * r + 0.5
+    series = series * r + 1.0
+    series = series * r + 1.0
+    return series, k
+
+
+@inlined
+def exponential(x):
+    """e^x for x <= 700, as e^-46 below -46 and for NaN."""
+    series, k = parts(x if x > LOWEST else LOWEST)
+    bits = np.float64(k + ROUNDER).view(np.int64) - ROUNDER_BITS  # k itself, which becomes the exponent
+    return series * np.int64((bits + 1023) << 52).view(np.float64)
+
+
+# Sine and cosine in operators: vector code in loops, and the same source for floats, arrays and tensors.
+
+
+_PI, _PER_TURN = math.pi, 0.5 / math.pi
+
+
+@inlined
+def cosine_and_sine_of_turns(turns):
+    """cos(2 pi turns) and sin(2 pi turns) for |turns| <= 1/2: Taylor series at half the angle, doubled."""
+    a = _PI * turns
+    q = a * a
+    s = -1.0 / 121645100408832000.0
+    s = s * q + 1.0 / 355687428096000.0
+    s = s * q - 1.0 / 1307674368000.0
+    s = s * q + 1.0 / 6227020800.0
+    s = s * q - 1.0 / 39916800.0
+    s = s * q + 1.0 / 362880.0
+    s = s * q - 1.0 / 5040.0
+    s = s * q + 1.0 / 120.0
+    s = s * q - 1.0 / 6.0
+    s = (s * q + 1.0) * a
+    c = -1.0 / 6402373705728000.0
+    c = c * q + 1.0 / 20922789888000.0
+    c = c * q - 1.0 / 87178291200.0
+    c = c * q + 1.0 / 479001600.0
+    c = c * q - 1.0 / 3628800.0
+    c = c * q + 1.0 / 40320.0
+    c = c * q - 1.0 / 720.0
+    c = c * q + 1.0 / 24.0
+    c = c * q - 0.5
+    c = c * q + 1.0
+    return 1.0 - 2.0 * s * s, 2.0 * s * c
+
+
+@overloaded
+def nearest_whole(x):
+    """The whole number nearest to x, of a float, an array or a tensor; one instruction in compiled code.
+
+    Of a remainder torch knows the derivative, of a floor it does not.
+    """
+    above = x + 0.5
+    return above - above % 1.0
+
+
+@when_compiling
+def _teach_nearest_whole():
+    from numba.extending import overload
+
+    @overload(nearest_whole, inline="always")
+    def _of_float(x):
+        return lambda x: np.floor(x + 0.5)
+
+
+@inlined
+def cosine_and_sine(angle):
+    """The cosine and sine of any angle [rad], of a float, an array or a tensor.
+
+    Errors are some 2e-16 up to a right angle, and at most 1e-14 up to two turns.
+    """
+    turns = _PER_TURN * angle
+    return cosine_and_sine_of_turns(turns - nearest_whole(turns))
+
+
+# Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
+
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)

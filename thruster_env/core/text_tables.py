@@ -1,9 +1,14 @@
-"""Tables of text: for the terminal, and as plain text."""
+"""Tables of text: for the terminal, as plain text, and in Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+import codecs
+import re
+import sys
+import unicodedata
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -11,7 +16,93 @@ from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType,
 from rich.table import Table
 from rich.text import Text
 
-from thruster_env.core.characters import showable
+from thruster_env.core.files import write_whole
+
+# Tables in Markdown, and pages whose tables are computed.
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("".join(f"| {cell} " if cell else "| " for cell in line) + "|" for line in lines)
+
+
+def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
+    """The page with these computed tables written anew; others stay.
+
+    A table stands between `<!-- table NAME -->` and `<!-- end -->`.
+    """
+
+    def anew(match: re.Match) -> str:
+        if match[2] not in tables:
+            return match[0]
+        return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
+
+    return re.sub(r"(<!-- table ([^\n]+?) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
+
+
+def print_or_write(name: str, text: str, arguments: Sequence[str]) -> None:
+    """Print a table, or write it anew on the page whose path is the first argument of a command line."""
+    if not arguments:
+        print(text)
+        return
+    page = Path(arguments[0])
+    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {name: lambda: text}))
+
+
+# Characters that a terminal lacks, in others that it has: no table ends in its middle.
+
+
+HANDLER = "thruster: other characters"  # name among Python's error handlers of encodings
+OTHERS = {"±": "+-", "×": "x", "µ": "u", "ω": "w", "–": "-", "—": "-", "−": "-", "•": "*", "‘": "'", "’": "'"}
+OTHERS |= dict(zip("▁▂▃▄▅▆▇█", "_.:-=+*#", strict=True))  # heights
+OTHERS |= {"“": '"', "”": '"', "≤": "<=", "≥": ">=", "→": "->", "·": "*", "✓": "x"}
+TITLE = 90  # characters for which a figure has room
+STRAIGHT = {"HORIZONTAL": "-", "LEFT": "-", "RIGHT": "-", "VERTICAL": "|"}  # ends of names of box drawings
+
+
+def adapt_standard_streams() -> None:
+    """Have standard output and error write what their encoding lacks in other characters."""
+    codecs.register_error(HANDLER, _replace)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors=HANDLER)
+
+
+def showable(text: str, encoding: str) -> str:
+    """Text in characters of an encoding, for what is laid out in columns before it is written."""
+    if encoding.startswith("utf"):
+        return text
+    codecs.register_error(HANDLER, _replace)
+    return text.encode(encoding, HANDLER).decode(encoding)
+
+
+def verbatim(text: str, most: int | None = None) -> str:
+    """Text of a user's for a figure: dollars begin no formula, and the middle of a long one is left out."""
+    if most is not None and len(text) > most:
+        text = f"{text[: most // 2]}...{text[-(most // 2) :]}"
+    return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return "".join(map(_in_ascii, error.object[error.start : error.end])), error.end
+
+
+def _in_ascii(character: str) -> str:
+    if character in OTHERS:
+        return OTHERS[character]
+    name = unicodedata.name(character, "")
+    if name.startswith("BOX DRAWINGS"):
+        return "+" if " AND " in name else STRAIGHT.get(name.split()[-1], "+")
+    if name.startswith("BRAILLE"):  # of what turns beside a line that takes its time
+        return "."
+    return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode() or "?"
+
+
+# Tables of text: for the terminal, and as plain text.
+
 
 BEST = "bold green"  # style of rows that win
 

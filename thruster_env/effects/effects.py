@@ -8,6 +8,8 @@ where `memory[b, target, j]` is the value that it changes for copy j, `memory[b,
 `numbers[at + i]` its parameters, `number` distinguishes its random draws from those of other effects, and `begin`
 is true at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may
 register further effects before the first env is made.
+
+Effects are called, not inlined: each loops over all copies of a block, and a plant's two kernels share them.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from thruster_env.core.checks import short_repr
-from thruster_env.core.compiled import inlined
+from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.memory import KEY_0, KEY_1, STEP
+from thruster_env.core.sources import written_out
 from thruster_env.core.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
 
 # An effect in a row of numbers: its length, kind, row that it acts on, first row of its own, number, parameters.
@@ -183,3 +186,37 @@ def _numbers(values: tuple) -> list:
 def set_field(effect: object, name: str, value) -> None:
     """Set a checked value on a frozen effect, from its __post_init__."""
     object.__setattr__(effect, name, value)
+
+
+# Chains of effects in compiled code: packed parameters of effects that act one after the other.
+
+
+def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:
+    """Write out `run(kind, ...)`, which calls the function of one of some effects."""
+    arguments = "memory, b, target, rows, number, numbers, at, begin"
+    functions: dict[str, Any] = {f"act_{i}": not_inlined(effect.act) for i, effect in enumerate(effects)}
+    lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
+    return written_out("run_effect", f"kind, {arguments}", *lines, "None", **functions)
+
+
+def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
+    """Return `run(memory, b, numbers, at, begin)`: run the effects that `effects.encoded` put at numbers[at].
+
+    It returns the place where they end.
+
+    Args:
+        effects: the known types of effects, as `encoded` had them.
+        count: the place in numbers where their number stands.
+    """
+    dispatch = _dispatch(effects)
+
+    @not_inlined
+    def run_chain(memory, b, numbers, at, begin):
+        for _ in range(int(numbers[count])):
+            kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
+            rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
+            dispatch(kind, memory, b, target, rows, number, numbers, at + EFFECT_PARAMETERS, begin)
+            at += int(numbers[at])
+        return at
+
+    return run_chain

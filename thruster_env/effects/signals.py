@@ -13,7 +13,7 @@ from thruster_env.core.checks import finite, positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import STEP
 from thruster_env.effects.effects import Context, Effect, normals, set_field, uniforms
-from thruster_env.effects.recorded import RecordedSeries, recorded_value
+from thruster_env.effects.missing import RecordedSeries, recorded_value
 
 
 @inlined

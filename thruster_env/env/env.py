@@ -1,23 +1,195 @@
-"""The mechanics of a plant's Gymnasium env: seeds, steps, observations, infos, copies, pickles and its spec."""
+"""The mechanics of a plant's Gymnasium env: seeds, steps, observations, infos, rendering, copies and its spec."""
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
+from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.direct import direct
 from thruster_env.core.memory import REWARD, TERMINATED
+from thruster_env.core.sources import written_out
 from thruster_env.core.streams import draw_key
 from thruster_env.env.commands import one_number, some_numbers
 from thruster_env.env.copies import PlantCopies
-from thruster_env.env.rendered import RenderedEnv
-from thruster_env.env.report import FLOAT32_ENDS, ReportRows, info_maker, observation_of, views_of
 from thruster_env.model.quantities import Quantity
+
+# Rendering, common to all envs of plants.
+
+
+if TYPE_CHECKING:
+    from thruster_env.render.renderer import PlantRenderer
+
+
+SMALLEST, LARGEST = 64, 4096  # side of a picture [px]
+
+
+def checked_size(size: Sequence[int] | None) -> tuple[int, int] | None:
+    """A size of pictures, (width, height) [px], as a pair of integers, or None; ValueError for any other."""
+    if size is None:
+        return None
+    if not isinstance(size, (tuple, list)) or len(size) != 2:
+        raise ValueError(f"render_size must be None or (width, height) in pixels, but got {short_repr(size)}")
+    width, height = (
+        at_least(f"the {side} of render_size", value, SMALLEST, LARGEST)
+        for side, value in zip(("width", "height"), size, strict=True)
+    )
+    return width, height
+
+
+class RenderedEnv(gym.Env):
+    """An env with a `plant` that can draw itself, in the modes of its `metadata`.
+
+    A plant's env defines `make_renderer`, which returns its renderer, and `moment_of`, the renderer's input from a
+    step's report.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 100}
+    render_overlay: Callable[[], Any] | None = None  # a filter wrapper's hook: what it shows beside the truth
+
+    plant: Any
+    _renderer: PlantRenderer | None = None
+
+    def make_renderer(self) -> PlantRenderer:
+        """The renderer of this env for its `render_mode`."""
+        raise NotImplementedError
+
+    def moment_of(self, report: list[float]) -> tuple:
+        """The renderer's input from a report."""
+        raise NotImplementedError
+
+    def _prepare_rendering(self, render_mode: str | None, render_size: Sequence[int] | None = None) -> None:
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            rule = " or ".join(["None", *map(repr, modes)])
+            raise ValueError(f"render_mode must be {rule}, but got {render_mode!r}")
+        self.render_mode, self.render_size = render_mode, checked_size(render_size)
+        self._renderer = None
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.plant.dt))}  # true speed
+
+    def render(self) -> np.ndarray | None:
+        """Draw the plant: an array (height, width, 3) of uint8 in mode "rgb_array", a window in mode "human"."""
+        if self._renderer is None:
+            if self.render_mode is None:
+                gym.logger.warn("render() draws nothing without a render_mode, given to gym.make")
+            return None
+        if self.render_overlay is not None:
+            self._renderer.amend(self.render_overlay())
+        return self._renderer.draw()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _show(self, report: list[float], *, begin: bool = False) -> None:
+        """Note what a reset (`begin`) or a step reported, and draw it in a window."""
+        if self._renderer is None:
+            self._renderer = self.make_renderer()
+        if begin:
+            self._renderer.begin()
+        elif self.render_overlay is not None:
+            self._renderer.amend(self.render_overlay())  # of the moment before: the wrapper updates after the step
+        self._renderer.add(self.moment_of(report))
+        if self.render_mode == "human":
+            self._renderer.draw()
+
+
+# The parts of a step's report that an env shows: its rows for the observation and the info.
+
+
+FLOAT32_ENDS = 3e38  # casting beyond 3.4e38 would warn on its way to infinity
+
+
+class ReportRows(NamedTuple):
+    """Rows of a report, an array (reported,) or (reported, N), see `thruster_env.env.copies`."""
+
+    measurement: slice  # of the m channels
+    valid: slice  # whether each is valid
+    dropping: tuple[int, ...]  # channels whose measurements may be missing; their validity stands in observations
+    appended: tuple[int, ...]  # rows that stand last in the observation, such as a reference
+    info: Mapping[str, int | slice]  # what info has, in order: a row for a number, several for a vector
+
+    @property
+    def states(self) -> int:
+        """Number of states, for a plant whose info has them."""
+        place = self.info["state"]
+        return place.stop - place.start if isinstance(place, slice) else 1
+
+    @property
+    def flags(self) -> tuple[int, ...]:
+        """Rows of the validity flags that observations have."""
+        return tuple(self.valid.start + i for i in self.dropping)
+
+    @property
+    def observed(self) -> list[int]:
+        """Rows that make the observation: measurements, then validity flags, then what the plant appends."""
+        return [*range(self.measurement.start, self.measurement.stop), *self.flags, *self.appended]
+
+
+def observation_of(values: list[float]) -> np.ndarray:
+    """An observation (d,) in float32, infinite where a value is beyond its range or is not a number."""
+    values = [value if abs(value) < FLOAT32_ENDS else -math.inf if value < 0 else math.inf for value in values]
+    return np.array(values, dtype=np.float32)
+
+
+def observations_of(report: np.ndarray, observed: list[int]) -> np.ndarray:
+    """The same of N copies, (N, d), from rows of their report (reported, N)."""
+    observations = np.empty((report.shape[1], len(observed)), dtype=np.float32)
+    with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
+        for i, row in enumerate(observed):
+            observations[:, i] = report[row]
+    if np.isnan(observations.sum()):  # of a copy that terminates; a single env reports infinity, too
+        observations[np.isnan(observations)] = np.inf
+    return observations
+
+
+def views_of(report: np.ndarray, rows: ReportRows) -> tuple[np.ndarray, ...]:
+    """Views of the vectors in a report (reported,) that `info_maker` takes."""
+    vectors = [report[place] for place in rows.info.values() if isinstance(place, slice)]
+    return (*vectors, report[rows.valid])
+
+
+def info_maker(rows: ReportRows) -> Callable[[np.ndarray, tuple[np.ndarray, ...]], dict]:
+    """Return `info(report, views)`: the info of one copy, in separate arrays.
+
+    It is generated for the plant's entries, because a step has to be fast. Numbers are NumPy scalars, because
+    clients ask every value for its dtype.
+    """
+    places = tuple((name, None if isinstance(place, slice) else place) for name, place in rows.info.items())
+    return _info_maker(places, bool(rows.dropping))
+
+
+@cache
+def _info_maker(places: tuple[tuple[str, int | None], ...], drops: bool) -> Callable:
+    vectors = [name for name, place in places if place is None]
+    entries = [
+        f"{name!r}: views[{vectors.index(name)}].copy()" if place is None else f"{name!r}: report[{place}]"
+        for name, place in places
+    ]
+    if drops:
+        entries.append(f"'measurement_valid': views[{len(vectors)}] > 0.0")
+    return written_out("info", "report, views", f"{{{', '.join(entries)}}}")
+
+
+def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str, np.ndarray]:
+    """The same of N copies: arrays with one row per copy, and the mask (N,) as `_key` for each key."""
+    info = {name: report[place].T for name, place in rows.info.items()}
+    if rows.dropping:
+        info["measurement_valid"] = report[rows.valid].T > 0.0
+    return info | {f"_{key}": mask for key in info}
+
+
+# The mechanics of a plant's Gymnasium env: seeds, steps, observations, infos, copies, pickles and its spec.
+
 
 # What `_set_views` makes.
 VIEWS = ("_memory", "_command", "_arguments", "_advance", "_report", "_outcome", "_views", "_info")
@@ -27,7 +199,7 @@ class PlantEnv(RenderedEnv):
     """An env of one copy of a plant, whose compiled step does all the computation.
 
     A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. `RenderedEnv`
-    renders it, and `thruster_env.env.modelled` offers its model to filters. The vector env is then a
+    renders it, and `thruster_env.env.model_env` offers its model to filters. The vector env is then a
     class of two lines, see `thruster_env.env.vector_env`.
 
     Attributes:

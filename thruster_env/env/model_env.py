@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+import warnings
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +16,7 @@ from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.core.streams import GROUP, draw_key
 from thruster_env.env.commands import some_numbers
-from thruster_env.model.layout import padded
+from thruster_env.model.shape import padded
 from thruster_env.model.simulate import truth_steps_of
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -125,3 +128,64 @@ def _mover(
         measure(z, x, draws, step, key[0], key[1], numbers)
 
     return CompiledOrPython(move)
+
+
+# The interface of a plant's env or vector env for filters: its model, and checks of tuned files.
+
+
+class ModelledEnv:
+    """An env with a `plant`, which offers the plant's model to filters.
+
+    Attributes:
+        plant_name: the plant's name in messages.
+    """
+
+    plant_name: ClassVar[str] = "a plant"
+    plant: Any
+
+    def model_maker(self) -> Callable[..., StateSpaceModel]:
+        """The function that makes a model of the plant and of changes by name."""
+        raise NotImplementedError
+
+    def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
+        """Minor differences between a tuned file's plant and the env's; ValueError for essential ones.
+
+        None by default: states, inputs, sensors and dt are compared for every model.
+        """
+        return []
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """The model of the env's plant, exact unless changed; changes are arguments of its `model_maker`.
+
+        Raises ValueError if an argument is wrong; the message states the rule and the value.
+        """
+        make = self.model_maker()
+        known = list(inspect.signature(make).parameters)[1:]
+        unknown = sorted(set(changes) - set(known))
+        if unknown:
+            rule = f"arguments of {self.plant_name}'s model must be among {', '.join(known)}"
+            raise ValueError(f"{rule}, but got {', '.join(map(repr, unknown))}")
+        return make(self.plant, **changes)
+
+    def check_tuned_for(self, tuned_for: Mapping | None, file: str) -> None:
+        """Raise ValueError if a tuned file is for another plant than the env's; warn if it is for other noise.
+
+        A file without this entry (None) is not compared.
+        """
+        if tuned_for is not None:
+            others = self.tuned_differences(tuned_for, file)
+            if others:
+                warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=5)
+
+
+# A policy's memory between two steps of its env.
+
+
+def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
+    """The state (..., k) of the last call, or its initial value at the start of an episode."""
+    if state is None:
+        return at_start
+    if episode_start is None:
+        return np.asarray(state)
+    starts = np.reshape(episode_start, at_start.shape[:-1]).astype(bool)
+    return np.where(starts[..., None], at_start, state)

@@ -15,8 +15,7 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.keys import EpisodeKeys, reset_mask
 from thruster_env.core.memory import REWARD, TERMINATED, TIME
 from thruster_env.env.commands import of_copies
-from thruster_env.env.env import PlantEnv
-from thruster_env.env.report import ReportRows, infos_of, observations_of
+from thruster_env.env.env import PlantEnv, ReportRows, infos_of, observations_of
 
 MOST_ENVS = 1_000_000  # of some kilobytes each
 

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, Number
 from thruster_env.graphs.loops import Cut
-from thruster_env.graphs.precision import as_single
 from thruster_env.graphs.programs import CALLED_IN_ROUNDS, Place, Program
 
 OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}

@@ -5,16 +5,50 @@ here, so that no program multiplies by zero: of an A P A' with a sparse A little
 
 Numbers along which something is to be differentiated are left whole (`Graph.whole`): of a - b that moves
 -(a - b) stays what it is, for b - a would not show that it moves.
+
+Slopes ask for it: only a root that may be zero, or a quotient whose divisor may be infinite, needs a choice.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from thruster_env.graphs.magnitudes import GROWING
+import numpy as np
+
+# What is known of the size of a number when a graph gets it: whether it may be infinite, whether it can be zero.
+
+
+if TYPE_CHECKING:
+    from thruster_env.graphs.graphs import Number
+
+GROWING = frozenset("exp exp2 expm1 log log2 log10 log1p sinh cosh arctanh pow".split())
+"""Operations whose results may be infinite for numbers of usual size."""
+UNKNOWN, NEVER_NEGATIVE, POSITIVE = range(3)
+
+
+def overflow_of(operation: str, of: Sequence[Number]) -> bool:
+    """Whether the result of an operation may be infinite for numbers of usual size, or is made of such."""
+    divided = operation == "/" and of[1].sign != POSITIVE and not of[1].value
+    return divided or operation in GROWING or any([one.may_overflow for one in of])
+
+
+def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
+    """UNKNOWN, NEVER_NEGATIVE or POSITIVE, of the result of an operation on numbers; POSITIVE is never zero."""
+    if operation == "constant":
+        return POSITIVE if value > 0.0 else NEVER_NEGATIVE if value == 0.0 else UNKNOWN  # type: ignore[operator]
+    if operation == "+":
+        return max(of[0].sign, of[1].sign) if of[0].sign and of[1].sign else UNKNOWN
+    if operation == "*":
+        return max(NEVER_NEGATIVE, of[0].sign) if of[0] is of[1] else min(of[0].sign, of[1].sign)
+    if operation in ("sqrt", "abs", "hypot"):
+        return max(NEVER_NEGATIVE, *[one.sign for one in of])
+    if operation in ("exp", "exp2", "erfc"):
+        return NEVER_NEGATIVE
+    return {"cosh": POSITIVE, "cbrt": of[0].sign if of else UNKNOWN}.get(operation, UNKNOWN)
+
 
 if TYPE_CHECKING:
     from thruster_env.graphs.graphs import Number
@@ -141,7 +175,7 @@ def divided(a: Number, b: Number) -> Number:
 def modulus(a: Number, b: Number) -> Number:
     """The rest a % b, with the sign of b, as Python and NumPy have it."""
     rest = worked_out("fmod", a, b)
-    return _chosen(_turns(rest, b), total(rest, b), rest)
+    return _folded_choice(_turns(rest, b), total(rest, b), rest)
 
 
 def floor_quotient(a: Number, b: Number) -> Number:
@@ -150,10 +184,10 @@ def floor_quotient(a: Number, b: Number) -> Number:
         return divided(a, b)
     rest = worked_out("fmod", a, b)
     parts = divided(difference(a, rest), b)
-    parts = _chosen(_turns(rest, b), difference(parts, a.graph.constant(1.0)), parts)
+    parts = _folded_choice(_turns(rest, b), difference(parts, a.graph.constant(1.0)), parts)
     whole = worked_out("floor", parts)
-    found = _chosen(difference(parts, whole) > 0.5, total(whole, a.graph.constant(1.0)), whole)
-    return found if b.value is not None else _chosen(b == 0.0, divided(a, b), found)
+    found = _folded_choice(difference(parts, whole) > 0.5, total(whole, a.graph.constant(1.0)), whole)
+    return found if b.value is not None else _folded_choice(b == 0.0, divided(a, b), found)
 
 
 def _turns(rest: Number, b: Number) -> Number | bool:
@@ -163,7 +197,21 @@ def _turns(rest: Number, b: Number) -> Number | bool:
     return (rest < 0.0) & (b > 0.0) | (rest > 0.0) & (b < 0.0)
 
 
-def _chosen(condition: Number | bool, a: Number, b: Number) -> Number:
+def _folded_choice(condition: Number | bool, a: Number, b: Number) -> Number:
     if isinstance(condition, bool):
         return a if condition else b
     return a if a is b else a.graph.make("where", condition, a, b)
+
+
+# Constants of a graph in single precision.
+
+
+SMALLEST = float(np.finfo(np.float32).tiny)  # normal
+
+
+def as_single(value: float) -> float:
+    """The nearest float32; of a number that is too small for one the smallest, which keeps a divisor from zero."""
+    if 0.0 < abs(value) < SMALLEST:
+        return math.copysign(SMALLEST, value)
+    with np.errstate(over="ignore"):
+        return float(np.float32(value))

@@ -35,12 +35,13 @@ from thruster_env.graphs.folding import (
     floor_quotient,
     modulus,
     negative,
+    overflow_of,
     product,
     quotient,
+    sign_of,
     total,
     worked_out,
 )
-from thruster_env.graphs.magnitudes import overflow_of, sign_of
 
 UNARY = (
     *(

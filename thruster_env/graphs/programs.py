@@ -224,10 +224,10 @@ def _called(name: str, count: int, *given):
 
 def _teach(work: Callable, program: Program, width: int, arrays: Sequence[str], scratch: int) -> None:
     if arrays == OF_MEMBERS:
-        from thruster_env.graphs.loop_instructions import teach_loops
+        from thruster_env.graphs.instructions import teach_loops
 
         teach_loops(work, program, width, scratch)
     else:
-        from thruster_env.graphs.instructions import teach  # which imports numba
+        from thruster_env.graphs.instructions import teach
 
         teach(work, program, width, arrays)

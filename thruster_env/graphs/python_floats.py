@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.compiled import compiled_in_place_of, inlined, rounds
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.user_functions import (
     Copies,
     Module,

@@ -19,10 +19,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from thruster_env.core.code_text import is_plain
 from thruster_env.core.compiled import inlined
-from thruster_env.core.user_functions import MODULES, functions_in, needs_floats
-from thruster_env.core.written import matrix_of, tuple_of, written_out
+from thruster_env.core.sources import matrix_of, tuple_of, written_out
+from thruster_env.core.user_functions import MODULES, functions_in, is_plain, needs_floats
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import UNARY, Graph, Number
 from thruster_env.graphs.programs import Place, program_of, values_of

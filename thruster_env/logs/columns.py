@@ -2,14 +2,167 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
+import numpy as np
+
 from thruster_env.core.checks import FEW, listed, short_repr
-from thruster_env.logs.units import parted
+from thruster_env.core.modules import to_install
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
+
+# Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
+
+
+WORDS = (
+    *("V", "mV", "kV", "A", "mA", "W", "kW", "Hz", "kHz", "rpm", "rps", "rad", "mrad", "deg", "turn", "rev"),
+    *("N", "mN", "kN", "kgf", "lbf", "Nm", "kg", "g", "Pa", "kPa", "bar", "K", "degC", "degF"),
+    *("m", "mm", "cm", "km", "s", "ms", "us", "ns", "min", "h", "sec", "minutes", "hours", "days"),
+    *("uV", "nV", "uA", "nA", "mW", "MW", "MHz", "uN", "MN", "mNm", "kNm", "mPa", "hPa", "MPa", "mbar", "mK"),
+    *("um", "nm", "urad", "mg", "ug"),
+)
+PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K")
+GRAVITY = "g_0"  # standard gravity; also "g" of accelerometers, where the other unit is an acceleration
+GRAMS = {"g": "g_0", "mg": "mg_0", "ug": "ug_0", "G": "g_0"}
+# Units as multiples of others. What turns or swings so often a second has an angle of 2 pi each time.
+MULTIPLES = {
+    "rpm": ("rad/s", 2.0 * math.pi / 60.0),
+    "rps": ("rad/s", 2.0 * math.pi),
+    "Hz": ("rad/s", 2.0 * math.pi),
+    "min": ("s", 60.0),
+    "h": ("s", 3600.0),
+    "deg": ("rad", math.pi / 180.0),
+    **dict.fromkeys(("turn", "rev", "cycle"), ("rad", 2.0 * math.pi)),
+    **dict.fromkeys(("sec", "second", "seconds"), ("s", 1.0)),
+    **dict.fromkeys(("minute", "minutes"), ("s", 60.0)),
+    **dict.fromkeys(("hour", "hours"), ("s", 3600.0)),
+    **dict.fromkeys(("d", "day", "days"), ("s", 86400.0)),
+    **{f"{prefix}{GRAVITY}": ("m/s^2", size * 9.80665) for prefix, size in (("", 1.0), ("m", 1e-3), ("u", 1e-6))},
+    "degC": ("K", 1.0),  # a difference, as in K/min; a temperature itself is among OFFSET
+    "degF": ("K", 5.0 / 9.0),
+}
+OFFSET = {"K": (1.0, 0.0), "degC": (1.0, 273.15), "degF": (5.0 / 9.0, 459.67 * 5.0 / 9.0)}  # factor, and K of 0
+OFFSET |= {f"{prefix}K": (factor, 0.0) for prefix, factor in PREFIXES.items()}
+TURNING = ("1/s", "1/min", "1/h", "s^-1", "min^-1", "h^-1")  # of turns, or of radians: nobody knows
+WRITTEN = {"Nm": "N*m", "°C": "degC", "°F": "degF", "°": "deg"}  # as pint reads them
+WRITTEN |= {**dict.fromkeys(("m/s/s", "m/s2", "m/s²", "m/s**2"), "m/s^2"), **dict.fromkeys(("g0", "gn"), "g_0")}
+PURE = {"", "-", "1"}  # of a number without a unit
+LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
+_RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
+_BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+
+
+def parted(header: str) -> tuple[str, str | None]:
+    """The header of a column without its unit, and the unit, None where it gives none.
+
+    Units stand in brackets ("speed [rad/s]"), or at the end as `thruster simulate` writes them
+    ("omega_m_rad_per_s", also "omega_m_rad_s"); these are of WORDS.
+    """
+    if found := _BRACKETS.match(header):
+        return found["base"], found["unit"].strip() or None
+    found = _RATE.match(header)
+    if found and found["base"] and found["over"] in (WORDS if found["per"] else LENGTHS):
+        power = f"^{found['power']}" if found["power"] else ""
+        return found["base"], f"{found['over']}/{found['under']}{power}"
+    base, underscore, last = header.rpartition("_")
+    if underscore and base and last in WORDS:
+        return base, last
+    return header, None
+
+
+def suffix(unit: str) -> str:
+    """A unit at the end of a header: "rad_per_s" of "rad/s"; empty for a pure number."""
+    return unit.replace("/", "_per_").replace("^", "").replace("*", "").replace(" ", "")
+
+
+def simple(unit: str) -> tuple[str, float]:
+    """A unit without prefix and the factor to it: ("V", 0.001) for "mV"; an unknown unit is returned unchanged.
+
+    Known are SI prefixes, minutes, hours, days, degrees, turns, rpm, rps and Hz (a turn a second, 2 pi rad/s), and
+    differences of degC and degF, also as parts of a quotient.
+    """
+    unit = WRITTEN.get(unit, unit)
+    if unit in MULTIPLES:
+        return MULTIPLES[unit]
+    over, slash, under = unit.partition("/")
+    if slash:
+        (above, factor), (below, divisor) = simple(over), simple(under)
+        return f"{above}/{below}", factor / divisor
+    prefix, base = unit[:1], WRITTEN.get(unit[1:], unit[1:])
+    if prefix in PREFIXES and base in PREFIXED:
+        target, factor = MULTIPLES.get(base, (base, 1.0))
+        return target, PREFIXES[prefix] * factor
+    return unit, 1.0
+
+
+def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> np.ndarray:
+    """Convert values to another unit; unchanged where a column gives no unit, or the wanted one.
+
+    Args:
+        values: of a column.
+        unit: its unit, None where it gives none.
+        wanted: that of the model's quantity, empty for a pure number.
+        where: the column, for messages.
+
+    Raises:
+        ValueError: if pint, which converts the units that `simple` does not, does not know a unit or is not
+            installed, or if the unit is of another dimension.
+    """
+    if unit is None or unit == wanted or {unit, wanted} <= PURE:
+        return values
+    known = conversion(unit, wanted)
+    if known is not None:
+        factor, divisor, zero = known
+        return (values * factor + zero) / divisor if zero else values * (factor / divisor)
+    (given, _), (target, _) = simple(unit), simple(wanted)
+    for one, other, base in ((unit, wanted, target), (wanted, unit, given)):
+        if one.replace(" ", "") in TURNING and base == "rad/s" and "Hz" not in other:
+            rule = f"the unit of {where} must say whether it counts turns or radians (rpm, Hz, rad/min)"
+            raise ValueError(f"{rule}, but {unit!r} is to be {wanted!r}")
+    try:
+        import pint
+    except ImportError:
+        raise ValueError(
+            f"units must be converted by pint, which is not installed ({to_install('units')}), but "
+            f"{where} is in {unit!r} in place of {wanted!r}"
+        ) from None
+    registry = pint.application_registry.get()
+    try:
+        given, target = (WRITTEN.get(text, text) for text in (unit, wanted))
+        return np.asarray(registry.Quantity(values, given).to(target).magnitude, dtype=np.float64)
+    except pint.DimensionalityError:
+        rule = f"the unit of {where} must be one that converts to {wanted or 'a pure number'}"
+        raise ValueError(f"{rule}, but got {unit!r} (name another in brackets: {_example(wanted)})") from None
+    except Exception as error:  # pint raises many kinds for text that is no unit
+        why = " ".join(str(error).split())
+        rule = f"the unit of {where} must be one that pint knows, but got {unit!r}: {why}"
+        raise ValueError(f"{rule} (name another in brackets: {_example(wanted)})") from None
+
+
+def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
+    """Factor, divisor and zero of values in a unit: (value factor + zero)/divisor; None if `simple` knows none.
+
+    A "g" is a gram, and the standard gravity where the other unit is an acceleration.
+    """
+    ends = [WRITTEN.get(text, text) for text in (unit, wanted)]
+    if all(end in OFFSET for end in ends):
+        (factor, zero), (of_wanted, of_zero) = (OFFSET[end] for end in ends)
+        return factor, of_wanted, zero - of_zero
+    if sum(simple(end)[0] == "m/s^2" for end in ends) == 1:
+        ends = [GRAMS.get(end, end) for end in ends]
+    (given, factor), (target, of_wanted) = map(simple, ends)
+    return (factor, of_wanted, 0.0) if given == target else None
+
+
+def _example(wanted: str) -> str:
+    """How a unit is named."""
+    return f"--column NAME=HEADER[{wanted or 'UNIT'}]"
+
 
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
 TIME = "time"

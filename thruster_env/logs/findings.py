@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thruster_env.core.angles import difference
-from thruster_env.logs.stamps import date_text, time_text
+from thruster_env.logs.grid import date_text, time_text
 
 if TYPE_CHECKING:
     from thruster_env.logs.log import Log

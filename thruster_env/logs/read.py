@@ -10,27 +10,35 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import finite, listed, positive, short_repr
-from thruster_env.core.toml import read_toml
+from thruster_env.core.files import read_toml
 from thruster_env.logs.columns import (
     INPUT,
     MEASUREMENT,
     TIME,
     Column,
     Wanted,
+    converted,
     find_columns,
     find_wanted,
     quantities_of,
 )
 from thruster_env.logs.findings import CLOCK, Recording, Remark
-from thruster_env.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
-from thruster_env.logs.log import FEWEST_STEPS, Log
-from thruster_env.logs.own_stamps import at_own_stamps
+from thruster_env.logs.grid import (
+    MOST_HELD,
+    TOLERANCE,
+    Grid,
+    Series,
+    at_own_stamps,
+    follows,
+    grid_of,
+    held,
+    in_seconds,
+    sampled,
+)
+from thruster_env.logs.log import FEWEST_STEPS, Log, stale_inputs
 from thruster_env.logs.recorders.merged import Recorded
 from thruster_env.logs.recorders.registry import check_stamps, format_of
-from thruster_env.logs.stale_inputs import stale_inputs
-from thruster_env.logs.stamps import follows, in_seconds
 from thruster_env.logs.table import Table, read_table, table_of
-from thruster_env.logs.units import converted
 from thruster_env.model.state_space import StateSpaceModel
 
 SECOND = "s"
@@ -72,7 +80,7 @@ def read_log(
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
     Columns are found by their headers (`thruster_env.logs.columns.find_columns`), converted to the model's
-    units (`thruster_env.logs.units`) and put on a grid (`thruster_env.logs.grid`). Times are
+    units (`thruster_env.logs.columns`) and put on a grid (`thruster_env.logs.grid`). Times are
     numbers, or ISO 8601 dates, the first of which is time 0. A file beside it, run.toml for run.csv, may say
 
         dt = 0.01
@@ -95,7 +103,7 @@ def read_log(
         clock_offset: how far a channel's clock is ahead [s].
         dt: sample time [s], for files without a time column, or whose time stamps lie on no grid.
         grid: whether samples are put on a grid; else rows are the times of samples
-            (`thruster_env.logs.own_stamps`), and `dt` is the sample time to which covariances belong.
+            (`thruster_env.logs.grid`), and `dt` is the sample time to which covariances belong.
         stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
             topics have stamps of one clock (`thruster_env.logs.recorders.one_clock`).
         name: of a log that is not a file.

@@ -16,12 +16,12 @@ import numpy as np
 
 from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import by_complex_step
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.stamps import count_steps
 from thruster_env.logs.findings import Recording
 from thruster_env.logs.log import Log
-from thruster_env.model.diffusion import same_dt
+from thruster_env.model.continuous import same_dt
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Shape
 from thruster_env.model.state_space import StateSpaceModel

@@ -11,10 +11,15 @@ import numpy as np
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import covariance, vector
 from thruster_env.core.derivatives import step_of, stretch
-from thruster_env.core.pickling import makes_functions
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Source, as_value
-from thruster_env.model.layout import starts_of
-from thruster_env.model.shape import Functions, constants_are_array, observation_slopes, transition_slopes
+from thruster_env.model.shape import (
+    Functions,
+    constants_are_array,
+    observation_slopes,
+    starts_of,
+    transition_slopes,
+)
 from thruster_env.model.state_space import StateSpaceModel
 
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
-from thruster_env.core.tuples import vector_reader, vector_writer
-from thruster_env.model.layout import constants_reader, number_places, padded
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_places, padded
 from thruster_env.model.state_space import StateSpaceModel
 
 

@@ -13,17 +13,14 @@ import numpy as np
 from thruster_env.core.checks import at_least, covariance, covariance_root, one_of, vector
 from thruster_env.core.derivatives import by_complex_step, complex_step
 from thruster_env.core.equal_functions import first_equal
-from thruster_env.core.pickling import as_function, as_made
 from thruster_env.core.results import array_valued
 from thruster_env.core.sources import is_array
+from thruster_env.core.user_functions import as_function, as_made
 from thruster_env.graphs.python_floats import with_python_floats
-from thruster_env.model.model_check import check_functions, checked_constants
-from thruster_env.model.model_digest import digest_of
-from thruster_env.model.positions import Positions
-from thruster_env.model.quantities import Quantities, count_of, outputs, quantities
+from thruster_env.model.model_check import check_functions, checked_constants, digest_of
+from thruster_env.model.quantities import Positions, Quantities, count_of, outputs, quantities
 from thruster_env.model.shape import Functions, Shape, constants_are_array, constants_form
-from thruster_env.model.state_bounds import checked_bounds
-from thruster_env.model.state_scales import scales_of
+from thruster_env.model.state_bounds import checked_bounds, scales_of
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.render.axis import Axis, fitting_axis
 from thruster_env.render.canvas import (
     BAND,
     ESTIMATE,
@@ -23,7 +23,107 @@ from thruster_env.render.canvas import (
     number,
     with_band,
 )
-from thruster_env.render.history import STEPS, newest
+
+# Vertical axes with round ends.
+
+
+ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # ends of an axis, up to powers of ten
+LEAST = 0.02  # ends of an axis, of full scale, where nothing happens
+MOST = 3.0  # ends of an axis, of full scale, whatever happens
+
+
+class Axis(NamedTuple):
+    """A vertical axis from `low`, zero or below, at the bottom to `high`, zero or above, at the top."""
+
+    low: float
+    high: float
+    top: float  # [px]
+    height: float  # [px]
+    downward: bool = False  # with the larger values below
+
+    def y(self, value):
+        """Where a value is [px]; a value off the axis is somewhat off it, however large."""
+        part = np.clip((value - self.low) / (self.high - self.low), -1, 2)
+        return self.top + self.height * (part if self.downward else 1 - part)
+
+    def label(self, canvas: Canvas, x: float) -> None:
+        """Write zero and the ends, unless these are too near to it, left of x [px]."""
+        for value in dict.fromkeys((0.0, self.low, self.high)):  # an end may be zero
+            if not value or abs(self.y(value) - self.y(0.0)) > 9:
+                canvas.text(number(value, _digits(value)), (x, self.y(value)), 10, align=1.0)
+
+
+def fitting_axis(values: np.ndarray, scale: float, top: float, height: float) -> Axis:
+    """An axis with all values that are numbers on it, from LEAST to MOST of full scale."""
+    values = np.clip(values[np.isfinite(values)], -MOST * scale, MOST * scale)
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    least = LEAST * scale if max(-low, high) < LEAST * scale else 0.0
+    return Axis(-_round_up(max(-low, least)), _round_up(max(high, least)), top, height)
+
+
+def _round_up(value: float) -> float:
+    """The next round number; 0 for what is not positive."""
+    if not value > 0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next((step * power for step in ROUND if step * power >= value), 10 * power)
+
+
+def _digits(value: float) -> int:
+    """Digits after the point that a round number needs."""
+    return 0 if value == round(value) else max(1, 1 - math.floor(math.log10(abs(value))))
+
+
+# The last time steps of an episode, with the estimates of a filter.
+
+
+STEPS = 500  # that are remembered
+ABSURD = 1e12  # states and estimates can diverge; beyond this a number is not drawn
+
+
+class History:
+    """The last moments of an episode, in columns: truth by its own name, beliefs as estimated_NAME.
+
+    A moment is a tuple of numbers, or None where there is none; an overlay is a label and what a filter believes.
+    """
+
+    def __init__(self, moment: tuple[str, ...], overlay: tuple[str, ...]):
+        """Take the names of a moment's entries, and of an overlay's behind the label."""
+        self._names = (*moment, *(f"estimated_{name}" for name in overlay))
+        self._of_moment = len(moment)
+        self._rows = np.empty((STEPS, len(self._names)))
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all of it."""
+        self.count = 0  # moments added
+        self.label = ""  # name of the filter
+
+    def add(self, moment: tuple) -> None:
+        """Note a moment."""
+        row = self._rows[self.count % STEPS]
+        row[: self._of_moment] = moment  # None becomes NaN
+        row[self._of_moment :] = math.nan
+        self.count += 1
+
+    def amend(self, overlay: tuple) -> None:
+        """Note what a filter believes of the moment added last."""
+        self.label = overlay[0]
+        self._rows[(self.count - 1) % STEPS, self._of_moment :] = overlay[1:]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """An array (n,) for each name, oldest first, NaN where there is no value that can be drawn."""
+        full = self.count > STEPS
+        rows = np.roll(self._rows, -self.count, axis=0) if full else self._rows[: self.count]
+        return dict(zip(self._names, np.where(np.abs(rows) < ABSURD, rows, math.nan).T, strict=True))
+
+
+def newest(columns: dict[str, np.ndarray], name: str) -> float:
+    """The newest value of a column; that of the step before if a filter has not got to the last step yet."""
+    last = columns[name][-2:]
+    known = last[np.isfinite(last)]
+    return float(known[-1]) if len(known) else math.nan
+
 
 LEFT, RIGHT = 44, 486  # of the strip charts [px]
 DASH = 6  # steps in a dash of the reference

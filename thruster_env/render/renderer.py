@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
 import os
-from typing import Any, ClassVar
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import pygame
 from gymnasium.error import DependencyNotInstalled
 
 from thruster_env.core.checks import one_of, positive
-from thruster_env.core.extras import to_install
-from thruster_env.render.history import History
+from thruster_env.core.files import check_target, write_whole
+from thruster_env.core.modules import to_install
+from thruster_env.render.canvas import SIZE
+from thruster_env.render.charts import History
 
 MODES = ("human", "rgb_array")
 
@@ -54,7 +63,6 @@ class PlantRenderer:
                 f"rendering needs pygame, which is not installed: {to_install('render')}"
             ) from error
         from thruster_env.render.canvas import SIZE, Canvas
-        from thruster_env.render.window import Window
 
         size = made_with.get("size") or SIZE
         self._canvas = Canvas(size)
@@ -122,3 +130,101 @@ class PlantRenderer:
         """The newest moment as a pygame surface, which the next frame overwrites."""
         self._draw(self._history.columns(), self._history.count, self._history.label)
         return self._canvas.finish()
+
+
+# A window that shows pictures in real time.
+
+
+LEAST_RATE = 20.0  # frames a second that are shown even if the steps come late [1/s]
+
+
+class Window:
+    """A window that keeps real time: it waits when it is early and leaves frames out when it is late."""
+
+    def __init__(self, frame_time: float, caption: str, size: tuple[int, int] = SIZE):
+        """Keep calls of `show` frame_time [s] apart; the window of a size [px] opens with the first."""
+        self._size = size
+        self._caption = caption
+        self._frame_time = frame_time
+        self._screen: pygame.Surface | None = None
+        self._closed_by_hand = False
+
+    def show(self, picture: Callable[[], pygame.Surface]) -> None:
+        """Show a picture, unless it is late or the window was closed by hand, and wait until its time is over."""
+        if self._closed_by_hand:
+            return
+        screen = self._screen
+        if screen is None or not pygame.display.get_init():  # perhaps another env called pygame.quit()
+            pygame.display.init()
+            screen = self._screen = pygame.display.set_mode(self._size)
+            pygame.display.set_caption(self._caption)
+            self._due, self._shown = time.perf_counter(), -math.inf
+        if pygame.event.get((pygame.QUIT, pygame.WINDOWCLOSE)):  # all other events are left to the caller
+            self.close()
+            self._closed_by_hand = True
+            return
+        start = time.perf_counter()
+        if start <= self._due + self._frame_time or start - self._shown > 1 / LEAST_RATE:
+            screen.blit(picture(), (0, 0))
+            pygame.display.flip()
+            self._shown = start
+        now = time.perf_counter()
+        # Time lost is made up for a little, not after a pause of whole seconds.
+        self._due = max(self._due + self._frame_time, now - 2 / LEAST_RATE)
+        time.sleep(max(0.0, self._due - now))
+
+    def close(self) -> None:
+        """Close the window."""
+        self._closed_by_hand = False
+        if self._screen is not None:
+            pygame.display.quit()
+            self._screen = None
+
+
+# Films of an episode, .mp4 or .gif; needs moviepy, of the extra `render`.
+
+
+FRAME_RATES = {".mp4": 50, ".gif": 25}  # frames a second, at most: browsers show no faster gif
+OnStep = Callable[[int, int], None]  # steps so far, of how many
+
+
+class Played(NamedTuple):
+    """An episode that was shown."""
+
+    steps: int
+    total_reward: float
+    seconds: float  # of the plant's time
+
+
+def check_drawing(video: Path | None) -> None:
+    """Raise ValueError unless a film can be drawn and written there; None for a window.
+
+    Raises:
+        ValueError: if a package of the extra `render` is missing, or the file cannot be written.
+    """
+    for package in ("pygame",) if video is None else ("pygame", "moviepy"):
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(f"drawing needs {package}, which is not installed: {to_install('render')}")
+    if video is not None:
+        if video.suffix not in FRAME_RATES:
+            raise ValueError(f"--out must end in {' or '.join(FRAME_RATES)}, but got {str(video)!r}")
+        check_target(video)
+
+
+def steps_a_frame(video: Path | None, dt: float) -> int:
+    """Every how many steps of dt [s] a film has a frame; 0 for a window, which draws itself."""
+    return 0 if video is None else max(1, round(1 / (dt * FRAME_RATES[video.suffix])))
+
+
+def write_video(video: Path, frames: Sequence[np.ndarray], rate: float) -> None:
+    """Write frames, (height, width, 3) of uint8, at so many a second; the file is written whole or not at all."""
+    from moviepy import ImageSequenceClip
+
+    clip = ImageSequenceClip(list(frames), fps=rate)
+    with tempfile.TemporaryDirectory() as aside:
+        path = Path(aside) / video.name
+        if video.suffix == ".gif":
+            clip.write_gif(str(path), logger=None)
+        else:
+            clip.write_videofile(str(path), audio=False, logger=None)
+        write_whole(video, path.read_bytes())

@@ -6,7 +6,7 @@ of the equations of motion; the derivatives of T by the state are dy[0].
 
 from __future__ import annotations
 
-from thruster_env.env.channels import Channel
+from thruster_env.env.copies import Channel
 from thruster_env.model.quantities import Quantity
 
 

@@ -1,23 +1,26 @@
-"""`BowThruster-v0`: voltage in, noisy thrust out, the state hidden."""
+"""`BowThruster-v0` and its tasks, as single and vector envs: voltage in, noisy thrust out, the state hidden."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.core.arguments import arguments_of, takes_arguments_of
-from thruster_env.core.checks import finite
+from thruster_env.core.checks import arguments_of, finite, takes_arguments_of
 from thruster_env.core.memory import KEY_0, KEY_1, TIME
-from thruster_env.env.env import PlantEnv
-from thruster_env.env.report import ReportRows
+from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
+from thruster_env.env.model_env import ModelledEnv
+from thruster_env.env.vector_env import PlantVectorEnv
+from thruster_env.render.renderer import MODES
 from thruster_env.thruster.effects.reference import Constant
 from thruster_env.thruster.effects.uncertainty import drawn_parameters
 from thruster_env.thruster.engine.copies import Copies
 from thruster_env.thruster.engine.memory import (
     AMBIENT,
+    COMMAND,
     FLOW,
     NEXT_REFERENCE,
     OMEGA,
@@ -26,12 +29,97 @@ from thruster_env.thruster.engine.memory import (
     THRUST,
     VALID,
 )
-from thruster_env.thruster.modelled import ModelledThruster
-from thruster_env.thruster.parameters import ThrusterParameters
+from thruster_env.thruster.linear.analysis import state_range
+from thruster_env.thruster.linear.published import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.quantities import INPUTS
-from thruster_env.thruster.rendering.env import RenderedThruster
+from thruster_env.thruster.rendering.renderer import Moment, Renderer
 from thruster_env.thruster.task import half_thrust, make_task, thrust_scale
+
+# What every bow thruster env and vector env offers to filters.
+
+
+if TYPE_CHECKING:
+    from thruster_env.model.state_space import StateSpaceModel
+    from thruster_env.thruster.rendering import Overlay
+
+
+class ModelledThruster(ModelledEnv):
+    """An env with a `plant` that offers its model to filters; changes are those of `model.model_of_plant`."""
+
+    plant_name = "a bow thruster"
+    plant: Plant
+
+    def model_maker(self) -> Callable[..., StateSpaceModel]:
+        """`model.model_of_plant`."""
+        from thruster_env.thruster.model import model_of_plant
+
+        return model_of_plant
+
+    def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
+        """See `plant_data.check_same_plant`."""
+        from thruster_env.thruster.plant import check_same_plant
+
+        return check_same_plant(tuned_for, self.plant, file)
+
+    def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+        """The belief that a rendered thruster shows beside the truth."""
+        from thruster_env.thruster.model import overlay_of
+
+        return overlay_of(label, model, mean, cov)
+
+
+# How a bow thruster env draws itself.
+
+
+def renderer_of(
+    plant: Plant, mode: str, frames_per_second: float, size: tuple[int, int] | None = None
+) -> Renderer:
+    """What draws a plant, its scales those of the full voltage; arguments are those of `Renderer`."""
+    p, top = plant.parameters, plant.max_voltage
+    speed, flow = state_range(p, top) / 2
+    return Renderer(
+        mode,
+        gear_ratio=p.gear_ratio,
+        diameter=p.diameter,
+        max_voltage=top,
+        thrust_scale=thrust_scale(plant),
+        speed_scale=speed,
+        flow_scale=flow,
+        dt=plant.dt,
+        frames_per_second=frames_per_second,
+        size=size,
+    )
+
+
+class RenderedThruster(RenderedEnv):
+    """An env with a thruster as `plant`, and a `_memory` of one copy."""
+
+    _memory: np.ndarray
+    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
+
+    def make_renderer(self) -> Renderer:
+        """What draws the thruster in its water."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
+        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"], self.render_size)
+
+    def moment_of(self, report: list[float]) -> Moment:
+        """What the renderer adds of a report: truth, measured thrust, reference and voltage."""
+        channels = self.plant.channels
+        measured = report[READINGS + channels.index("thrust")] if "thrust" in channels else math.nan
+        return Moment(
+            time=report[TIME],
+            omega_m=report[OMEGA],
+            U_a=report[FLOW],
+            thrust=report[THRUST],
+            measured_thrust=measured,
+            reference=report[REFERENCE],
+            voltage=float(self._memory[0, COMMAND, 0]),
+            ambient_velocity=report[AMBIENT],
+        )
+
+
+# `BowThruster-v0`: voltage in, noisy thrust out, the state hidden.
 
 
 class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
@@ -126,3 +214,101 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         drawn = drawn_parameters(self.plant.parameters, self.plant.uncertainty, keys)
         values: dict[str, Any] = {name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty}
         return drawn._replace(**values)
+
+
+# The other envs: tracking, reversal, and the published linear systems.
+
+
+class BowThrusterTrackingEnv(BowThrusterEnv):
+    """A ship's bow thruster: follow a reference thrust that changes, ahead.
+
+    As `BowThrusterEnv`, except for these:
+
+    ## Observation space
+    | num | observation | min | max | unit |
+    |---|---|---|---|---|
+    | 0 | measured thrust T + v at time k | -inf | inf | N |
+    | 1 | reference r at time k + 1 | -inf | inf | N |
+
+    With other `sensors`, their channels and validity flags come first, the reference last.
+
+    ## Reward
+    That of step k compares T with r of time k + 1, the one that the action saw.
+
+    ## Arguments `reference` is a list of signals of `effects.reference.REFERENCE_SIGNALS`, which are added, each a
+    mapping with its `name` ("constant", "steps", "ramps", "prbs", "multi-sine", "band-limited-noise", "recorded");
+    levels are fractions of the steady thrust at max_voltage. By default steps between 0.1 and 0.8, held for 1 s.
+    """
+
+    observes_reference = True
+    default_reference = ({"name": "steps", "low": 0.1, "high": 0.8, "hold_time": 1.0},)
+
+    def _reference_signals(self, reference):
+        return self.default_reference if reference is None else reference
+
+
+class BowThrusterReversalEnv(BowThrusterTrackingEnv):
+    """A ship's bow thruster: follow a reference thrust that crosses zero, ahead and astern.
+
+    As `BowThrusterTrackingEnv`; by default the reference runs in straight lines of 1 s between levels drawn from
+    -0.6 to 0.6 of the steady thrust at max_voltage. Near zero the thrust contains hardly any information on the
+    state.
+    """
+
+    default_reference = ({"name": "ramps", "low": -0.6, "high": 0.6, "hold_time": 1.0},)
+
+
+class BowThrusterLinearEnv(BowThrusterEnv):
+    """A linear system that Kiki (2020) and Nurhadi et al. (2022) print in place of the bow thruster.
+
+        x_{k+1} = A_d x_k + B_d (V_s, U_0)_k + w_k,    z_k = C x_k + v_k
+
+    Here the Kalman filter is optimal. Observation, action, reward, info and episode are those of `BowThrusterEnv`;
+    T_max and the range of the state are those of the equilibrium at max_voltage. (The open-bladed system is
+    unstable.)
+
+    ## Arguments
+    The list is that of `thruster_env.thruster.linear.published.make_linear_plant` (`system` is "tunnel" or
+    "open_bladed"; `process_noise_cov` and `measurement_noise_cov` are the published 0.5 of each state and
+    measurement by default) and of `thruster_env.thruster.task.make_task`; `render_mode` and `render_size` come on
+    top.
+    """
+
+    @takes_arguments_of(
+        make_linear_plant, make_task, defaults={"process_noise_cov": (PUBLISHED_NOISE, PUBLISHED_NOISE)}
+    )
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
+        """Build the plant; see the class for the arguments."""
+        plant = make_linear_plant(**arguments_of(make_linear_plant, arguments))
+        self._build(plant, (render_mode, render_size), arguments)
+
+
+# The vector envs: all copies advanced by one compiled call, noise included.
+
+
+class BowThrusterVectorEnv(ModelledThruster, PlantVectorEnv):
+    """Vector env of `BowThruster-v0`; see `PlantVectorEnv`. Uncertain parameters are drawn per copy and episode.
+
+    `num_envs`, `max_episode_steps` and `autoreset_mode` are those of `PlantVectorEnv`, the others those of the
+    single env.
+    """
+
+    single_env: ClassVar[type[BowThrusterEnv]] = BowThrusterEnv
+
+
+class BowThrusterTrackingVectorEnv(BowThrusterVectorEnv):
+    """Vector env of `BowThrusterTracking-v0`."""
+
+    single_env = BowThrusterTrackingEnv
+
+
+class BowThrusterReversalVectorEnv(BowThrusterVectorEnv):
+    """Vector env of `BowThrusterReversal-v0`."""
+
+    single_env = BowThrusterReversalEnv
+
+
+class BowThrusterLinearVectorEnv(BowThrusterVectorEnv):
+    """Vector env of `BowThrusterLinear-v0`."""
+
+    single_env = BowThrusterLinearEnv

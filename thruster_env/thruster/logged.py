@@ -20,19 +20,19 @@ import numpy as np
 
 from thruster_env.core.checks import covariance, finite, positive, short_repr
 from thruster_env.core.compiled import inlined
-from thruster_env.core.pickling import makes_functions
-from thruster_env.core.tuples import matrix_of, tuple_of, written_out
-from thruster_env.model.diffusion import noise_for_dt, same_dt
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.sources import matrix_of, tuple_of, written_out
+from thruster_env.model.continuous import ContinuousModel, noise_for_dt, same_dt
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import MAX_CHANNELS
-from thruster_env.thruster.dynamics import Constants, substep, substep_jacobian
+from thruster_env.thruster.dynamics import Constants, rates, substep, substep_jacobian
 from thruster_env.thruster.effects.amplifier import outside
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.model import channel_functions, model_of_plant, thrust_of
+from thruster_env.thruster.parameters import THRUST
 from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.preset_file import BY_CHANNEL, checked_band, is_file, read_preset
-from thruster_env.thruster.quantities import THRUST
 
 _FURTHER = (
     "dead_band_low",  # [V], not positive
@@ -100,7 +100,7 @@ def logged_model(
     Each sensor with a lag adds a state after the two of the thruster: its memory (above). From a preset file the
     recorder is taken, too: bias, lag, ambient flow, Q and R, unless arguments say otherwise. Covariances are per
     step and do not scale with dt; but Q of a preset file, which has the sample time that it belongs to, is that of
-    another one by `thruster_env.model.diffusion.noise_for_dt`.
+    another one by `thruster_env.model.continuous.noise_for_dt`.
 
     Args:
         dead_band: ends (low, high) of the dead band [V], or half the width of a symmetric one.
@@ -281,3 +281,41 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
             **names,
         ),
     )
+
+
+# The thruster in continuous time: its rates and spectral densities, from which follows a model for any dt.
+
+
+@inlined
+def voltage_rates(x, u, c):
+    """Time derivatives [rad/s^2, m/s^2] under voltage u = (V_s,), in the ambient flow of the constants."""
+    return rates(x, (u[0], c.ambient_velocity), c)
+
+
+@inlined
+def driven_rates(x, u, c):
+    """The same behind a dead band."""
+    return rates(x, (outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity), c)
+
+
+def continuous_thruster(**arguments) -> ContinuousModel:
+    """The thruster in continuous time, from plain arguments that JSON can hold.
+
+        d(omega_m, U_a)/dt = rates + w(t),   z = h(x) + v
+
+    The spectral densities of w are those whose Q of a step `dt` is `process_noise_cov`: `at(dt)` is
+    `thruster_env.thruster.logged.logged_model(**arguments)`, and `at` of another sample time is its model, with Q
+    by `thruster_env.model.continuous.noise_for_dt`.
+
+    Args:
+        **arguments: those of `logged_model` and so of `thruster_model`, but for `lag`: the memory of a lagging
+            sensor is one of a sample time.
+
+    Raises:
+        ValueError: if an argument is wrong, and for a Q that no white noise has.
+    """
+    model = logged_model(**arguments)
+    if model.n > 2:
+        raise ValueError("a thruster in continuous time must have no lag, but got sensors with one")
+    has_band = hasattr(model.constants, "dead_band_low")
+    return ContinuousModel.of(model, driven_rates if has_band else voltage_rates)

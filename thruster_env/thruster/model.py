@@ -11,10 +11,9 @@ import numpy as np
 
 from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.core.compiled import inlined
-from thruster_env.core.factors import scaled
-from thruster_env.core.linear_systems import zero_order_hold
-from thruster_env.core.pickling import makes_functions
-from thruster_env.env.channels import functions_of
+from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.matrices import scaled, zero_order_hold
+from thruster_env.env.copies import functions_of
 from thruster_env.model.affine import affine_model
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import CHANNELS
@@ -25,11 +24,9 @@ from thruster_env.thruster.dynamics import (
     thrust_and_torque,
     thrust_and_torque_tangent,
 )
-from thruster_env.thruster.linear.analysis import LinearModel
-from thruster_env.thruster.linear.steady_state import steady_state
-from thruster_env.thruster.parameters import ThrusterParameters, checked
+from thruster_env.thruster.linear.analysis import LinearModel, steady_state
+from thruster_env.thruster.parameters import INPUTS, STATES, THRUST, ThrusterParameters, checked
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.quantities import INPUTS, STATES, THRUST
 from thruster_env.thruster.rendering import Overlay
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import between, meant, one_of, positive, short_repr, within
+from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.dynamics import Constants
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
@@ -262,3 +263,11 @@ def _scaled(factor, polynomial) -> tuple:
 def _product(quadratic, linear) -> tuple:
     (a, b, c), (d, e) = quadratic, linear
     return a * d, a * e + b * d, b * e + c * d, c * e
+
+
+# Names, symbols and units of the thruster's states, inputs and outputs.
+
+
+STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
+INPUTS = (Quantity("voltage", "V_s", "V"),)
+THRUST = Quantity("thrust", "T", "N")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,15 +22,16 @@ from thruster_env.core.checks import (
 )
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.env import plant_data as data_of_plants
+from thruster_env.env.plant_data import Entries, mappings
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import Constants
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, dead_band_of
-from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS, dead_band_of
 from thruster_env.thruster.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
-from thruster_env.thruster.linear.analysis import LinearModel
-from thruster_env.thruster.linear.steady_state import required_substeps_of_all, steady_state
+from thruster_env.thruster.linear.analysis import LinearModel, required_substeps_of_all, steady_state
 from thruster_env.thruster.parameters import (
     LARGEST_VOLTAGE,
+    PRESETS,
     ThrusterParameters,
     derive_constants,
     preset_and_dead_band,
@@ -211,3 +214,64 @@ def state(name: str, value) -> np.ndarray:
     if np.abs(given).max() > LARGEST_STATE:
         raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
     return given
+
+
+# A thruster as data for JSON, for files that record their plant.
+
+
+# What makes it another plant, on which Q and R mean nothing. The rest disturbs or bounds the same plant.
+ESSENTIAL = ("preset", "system", "dt", "sensors")
+PLANT_ENTRIES = (
+    *ESSENTIAL,
+    "parameters",
+    "max_voltage",
+    "ambient_velocity",
+    "process_noise_cov",
+    "measurement_noise_cov",
+    "sensor_effects",
+    "flow",
+    "amplifier",
+    "uncertainty",
+)
+ENTRIES = Entries(ESSENTIAL, PLANT_ENTRIES, ThrusterParameters._fields)
+
+
+def plant_data(plant: Plant) -> dict:
+    """What a filter's numbers depend on: the thruster, its sample time, sensors, noise and disturbances.
+
+    Initial state, task and seed are not among it.
+    """
+    linear = plant.linear
+    named = [name for name, parameters in PRESETS.items() if parameters == plant.parameters]
+    data = {
+        "preset": named[0] if named else None,
+        "parameters": plant.parameters._asdict(),
+        "system": None if linear is None else [matrix.tolist() for matrix in (linear.a, linear.b, linear.c)],
+        "dt": plant.dt,
+        "max_voltage": plant.max_voltage,
+        "ambient_velocity": plant.ambient_velocity,
+        "sensors": list(plant.channels),
+        "process_noise_cov": plant.process_noise_cov.tolist(),
+        "measurement_noise_cov": plant.measurement_noise_cov.tolist(),
+        "sensor_effects": {channel: mappings(effects) for channel, effects in plant.sensors.items()},
+        "flow": mappings(plant.flow),
+        "amplifier": mappings(plant.amplifier),
+        "uncertainty": {name: distribution.as_mapping() for name, distribution in plant.uncertainty.items()},
+    }
+    return json.loads(json.dumps(data))  # lists for tuples, as a file has them
+
+
+def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list[str]:
+    """Raise ValueError, with the differences, if a tuned file is for another plant; return other differences.
+
+    Args:
+        tuned_for: the file's data of a plant, from `plant_data`.
+        plant: where it is to be used.
+        file: its path.
+    """
+    return data_of_plants.check_same(ENTRIES, tuned_for, plant_data(plant), file)
+
+
+def differences(then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
+    """What two plants' data differ in: what makes them other plants, and what does not; ValueError for others."""
+    return data_of_plants.differences(ENTRIES, then, now)

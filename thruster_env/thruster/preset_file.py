@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thruster_env.core.checks import finite, one_of, positive, short_repr
-from thruster_env.core.files import write_whole
-from thruster_env.core.toml import as_toml, read_toml
+from thruster_env.core.files import as_toml, read_toml, write_whole
 from thruster_env.logs.write import check_not_among
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.parameters import ThrusterParameters, checked

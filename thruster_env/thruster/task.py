@@ -10,8 +10,7 @@ from thruster_env.core.checks import positive, within
 from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.linear.analysis import equilibrium
-from thruster_env.thruster.linear.steady_state import state_range, steady_state
+from thruster_env.thruster.linear.analysis import equilibrium, state_range, steady_state
 from thruster_env.thruster.plant import Plant
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from filters.consistency.intervals import Interval, slightly
-from filters.plot_styles import colour_of
-from thruster_env.core.characters import TITLE, verbatim
+from filters.logs.figure import colour_of
 from thruster_env.core.plots import panels
-from thruster_env.core.text_tables import plain_text
+from thruster_env.core.text_tables import TITLE, plain_text, verbatim
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners

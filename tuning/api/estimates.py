@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from filters.filter import Filter
-from filters.logs.alarms import LogAlarms, alarms_of
-from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate
-from filters.logs.findings import LogFindings
-from filters.logs.verdict import verdict
+from filters.logs.findings import LogAlarms, LogFindings, alarms_of, columns_of, verdict
 from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_columns

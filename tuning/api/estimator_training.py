@@ -12,10 +12,9 @@ from rich.table import Table
 
 from filters.consistency.intervals import Interval
 from filters.filter import Filter
-from filters.plot_styles import colour_of
-from thruster_env.core.characters import verbatim
+from filters.logs.figure import colour_of
 from thruster_env.core.plots import panels
-from thruster_env.core.text_tables import plain_text, table
+from thruster_env.core.text_tables import plain_text, table, verbatim
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import ORACLE
 from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, Standing

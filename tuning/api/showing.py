@@ -10,7 +10,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from filters.consistency.intervals import Interval, span
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 
 if TYPE_CHECKING:
     import pandas

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thruster_env.auv.manoeuvres import MANOEUVRES
+from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import Plant
 from thruster_env.core.checks import one_of
 from thruster_env.effects.effects import set_field

@@ -11,12 +11,18 @@ import numpy as np
 
 from filters.bounds import path_bound
 from filters.wrapped import wrapped_variances
-from thruster_env.auv.channels import MAX_CHANNELS
+from thruster_env.auv.channels import MAX_CHANNELS, STATES
+from thruster_env.auv.engine.simulation import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
-from thruster_env.auv.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
-from thruster_env.auv.plant_data import check_same_plant, plant_data
-from thruster_env.auv.quantities import STATES
-from thruster_env.auv.simulation import simulate
+from thruster_env.auv.plant import (
+    DEFAULT_DT,
+    DEFAULT_PROCESS_NOISE,
+    DEFAULT_PROPELLER_TORQUE,
+    Plant,
+    check_same_plant,
+    make_plant,
+    plant_data,
+)
 from thruster_env.core.checks import one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.model.state_space import StateSpaceModel

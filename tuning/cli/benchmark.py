@@ -8,7 +8,8 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from tuning.cli.output import announce_compilation, console, progress_console, table
+from thruster_env.core.text_tables import console, table
+from tuning.cli.output import announce_compilation, progress_console
 from tuning.experiments.benchmark import WHY, Benchmark, Row, find_benchmark
 
 

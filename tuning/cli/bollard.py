@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
+from thruster_env.core.text_tables import table
 from thruster_env.thruster.logged import Recorder
 from thruster_env.thruster.parameters import ThrusterParameters, preset_parameters
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.preset_file import PresetFile, is_file, write_preset
-from tuning.cli.output import announce_compilation, check_targets, emit, table
+from tuning.cli.output import announce_compilation, check_targets, emit
 from tuning.experiments.bollard_fit import FITTED, Identified, identify, relative_errors
 from tuning.experiments.bollard_table import read_table
 from tuning.identification.identify import identify as identify_logs

@@ -14,9 +14,12 @@ import typer
 from rich.table import Table
 
 from filters.filter import Filter
-from tuning.cli.output import JsonOption, SeedOption, emit, table, working
+from thruster_env.core.text_tables import table
+from tuning.api.run import Tuning
+from tuning.cli.options import JsonOption, SeedOption
+from tuning.cli.output import emit, working
 from tuning.cli.tune import tune
-from tuning.cli.tuning_report import Tuning, as_json
+from tuning.cli.tuning_report import as_json
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label

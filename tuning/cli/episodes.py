@@ -17,10 +17,10 @@ from filters.logs.estimate import estimate as estimate_log
 from thruster_env.core.checks import at_least, one_of, within
 from thruster_env.core.streams import episode_keys
 from thruster_env.logs.log import Log
-from thruster_env.render.video import OnStep, Played, steps_a_frame, write_video
+from thruster_env.render.renderer import OnStep, Played, steps_a_frame, write_video
 from thruster_env.thruster.control.controllers import PIController
-from thruster_env.thruster.rendering.env import renderer_of
-from thruster_env.thruster.rendering.history import Moment, Overlay
+from thruster_env.thruster.env import renderer_of
+from thruster_env.thruster.rendering.renderer import Moment, Overlay
 from tuning.cli.output import warn_beyond
 from tuning.problems.excitation import EXCITATIONS, excitation_of
 from tuning.thruster.excitation import voltages_of

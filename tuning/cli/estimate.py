@@ -10,11 +10,20 @@ from typing import Annotated, Any
 import typer
 from rich.console import RenderableType
 
-from filters.logs.alarms import LogAlarms, alarms_of, episode_sentence, episodes
-from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
-from filters.logs.findings import LogFindings, Residual, findings
-from filters.logs.verdict import ALPHA, verdict
+from filters.logs.findings import (
+    ALPHA,
+    LogAlarms,
+    LogFindings,
+    Residual,
+    alarms_of,
+    columns_of,
+    episode_sentence,
+    episodes,
+    findings,
+    verdict,
+)
+from thruster_env.core.text_tables import table
 from thruster_env.logs.write import check_suffix, write_columns
 from tuning.cli.log_options import GridOptions, with_groups
 from tuning.cli.options import (
@@ -30,7 +39,7 @@ from tuning.cli.options import (
     filter_option,
     one_file,
 )
-from tuning.cli.output import announce_compilation, check_picture, check_targets, emit, table
+from tuning.cli.output import announce_compilation, check_picture, check_targets, emit
 from tuning.logs.read import as_tuned, read_named
 
 MOST_EPISODES = 8  # that are shown

@@ -7,9 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from filters.c.programs import programs_of
+from filters.c.programs import programs_of, single_error
 from filters.c.project import write_project
-from filters.c.single import single_error
 from thruster_env.core.checks import one_of
 from tuning.cli.options import (
     OUTPUT,

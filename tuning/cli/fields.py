@@ -11,11 +11,12 @@ from rich.console import RenderableType
 
 from thruster_env.core.checks import listed
 from thruster_env.core.text_tables import plain_text, table
-from thruster_env.env.replay import ANY_DT
+from thruster_env.env.record import ANY_DT
 from thruster_env.logs.columns import find_columns, quantities_of
+from thruster_env.logs.grid import time_text
+from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.one_clock import HEADER, RECEIPT
-from thruster_env.logs.recorders.registry import ENDINGS, METADATA, Contents, Field, contents, format_of
-from thruster_env.logs.stamps import time_text
+from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
 from tuning.problems.plant_packages import logs_package
 

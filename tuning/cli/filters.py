@@ -16,9 +16,10 @@ from rich.text import Text
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type
+from thruster_env.core.text_tables import console, table
 from tuning.cli.fitting import fit_table, fits_of
 from tuning.cli.options import INPUT, JsonOption, spelt
-from tuning.cli.output import console, emit, table
+from tuning.cli.output import emit
 from tuning.cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
 from tuning.search.filter_parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES

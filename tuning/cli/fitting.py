@@ -8,7 +8,7 @@ from rich.console import RenderableType
 
 from filters.engine.compile import new_memory
 from filters.registry import FILTERS
-from tuning.cli.output import table
+from thruster_env.core.text_tables import table
 from tuning.problems.problem import Problem
 from tuning.search.space import untuned_choice
 

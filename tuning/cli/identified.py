@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import RenderableType
 
 from thruster_env.core.plots import save_figure
+from thruster_env.core.text_tables import table
 from thruster_env.logs.log import Log
-from tuning.cli.output import table
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation, fall_sentence

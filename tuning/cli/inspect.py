@@ -9,29 +9,32 @@ import numpy as np
 import typer
 
 from thruster_env.core.checks import within
+from thruster_env.core.text_tables import table
 from thruster_env.thruster.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
     Analysis,
     LinearModel,
+    SteadyState,
     analyse,
     frequency_response,
     linear_model,
+    response_figure,
     response_grids,
+    state_range,
+    steady_state,
     step_response,
 )
-from thruster_env.thruster.linear.figures import response_figure
 from thruster_env.thruster.linear.published import (
     NO_LINEARISATION,
     SAMPLE_TIME,
     PublishedLinearModel,
     published_for,
 )
-from thruster_env.thruster.linear.steady_state import SteadyState, state_range, steady_state
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from thruster_env.thruster.preset_file import is_file
 from tuning.cli.options import INPUT, OUTPUT, JsonOption, PresetOption
-from tuning.cli.output import check_picture, check_targets, emit, table, warn_beyond
+from tuning.cli.output import check_picture, check_targets, emit, warn_beyond
 
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
 

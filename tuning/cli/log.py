@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
+from thruster_env.core.text_tables import console, table
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import check_suffix, write_log
@@ -20,7 +21,7 @@ from tuning.cli.options import (
     OUTPUT,
     JsonOption,
 )
-from tuning.cli.output import check_picture, check_targets, console, emit, table
+from tuning.cli.output import check_picture, check_targets, emit
 from tuning.cli.printing import printed_whole
 from tuning.logs.read import read_named
 
@@ -89,7 +90,7 @@ def command(
     if out is not None:
         write_log(out, recorded)
     if plot is not None:
-        from thruster_env.logs.figure import findings_figure
+        from thruster_env.logs.write import findings_figure
 
         findings_figure(plot, recorded)
     files = [str(one) for one in (plot, out) if one is not None]

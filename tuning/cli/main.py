@@ -55,7 +55,7 @@ def main() -> None:
         Timer(0.05, pthread_kill, (main_thread().ident, SIGINT)).start()  # which also wakes it up
 
     try:
-        from thruster_env.core.characters import adapt_standard_streams
+        from thruster_env.core.text_tables import adapt_standard_streams
 
         adapt_standard_streams()
         from tuning.cli.app import app

@@ -12,8 +12,7 @@ from typing import Annotated
 
 import typer
 
-from filters.monitoring.monitor import Monitor, monitor_of
-from filters.monitoring.stored import tuned_monitor
+from filters.monitoring.monitor import Monitor, monitor_of, tuned_monitor
 from filters.registry import FILTERS
 from thruster_env.core.checks import any_case
 from thruster_env.thruster.channels import CHANNELS

@@ -10,8 +10,8 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from thruster_env.core.checks import at_least, one_of, short_repr
-from thruster_env.env.rendered import LARGEST, SMALLEST
-from thruster_env.render.video import Played, check_drawing
+from thruster_env.env.env import LARGEST, SMALLEST
+from thruster_env.render.renderer import Played, check_drawing
 from tuning.cli.options import (
     FILTER,
     FILTER_HELP,

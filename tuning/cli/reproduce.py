@@ -9,16 +9,18 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
+from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import check_target
+from thruster_env.core.text_tables import table
 from tuning.cli import options
 from tuning.cli.benchmark import fitted, list_of, reproduce_benchmark
 from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import announce_compilation, check_picture, emit, progress_console, table
+from tuning.cli.output import announce_compilation, check_picture, emit, progress_console
 from tuning.cli.vehicle import reproduce_vehicle
 from tuning.experiments import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from tuning.experiments.benchmark import RUNS as BENCHMARK_RUNS
-from tuning.experiments.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
+from tuning.experiments.comparison import MEMBERS, MOST_RUNS, RUNS, compare_all
 from tuning.experiments.findings import findings, general_statements, study_statements
 from tuning.experiments.series import all_series, series_figure
 from tuning.experiments.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS

@@ -13,8 +13,9 @@ from rich.text import Text
 
 from filters.consistency.intervals import mean_interval
 from thruster_env.core.checks import one_of
+from thruster_env.core.text_tables import table
 from tuning.cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
-from tuning.cli.output import announce_compilation, emit, progress_console, table
+from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.cli.train import LEARNABLE
 from tuning.policies.extras import check_installed
 from tuning.policies.observations import find_observation_set

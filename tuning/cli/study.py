@@ -15,10 +15,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from thruster_env.core.text_tables import table
 from tuning.cli import recordings, users, ways_study
 from tuning.cli.app import Command, Group
 from tuning.cli.options import OUTPUT, RUNS, JsonOption
-from tuning.cli.output import announce_compilation, emit, progress_console, table
+from tuning.cli.output import announce_compilation, emit, progress_console
 
 RESULTS = Path("out") / "comparison"
 

@@ -16,9 +16,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least
+from thruster_env.core.text_tables import table
 from tuning.api.run import file_name
 from tuning.cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, OfPresetOption, spelt
-from tuning.cli.output import announce_compilation, emit, progress_console, table
+from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.extras import check_installed
 from tuning.policies.observations import OBSERVATION_SETS

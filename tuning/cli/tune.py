@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.api.run import aim_of, name_of, run_tuning, with_budget
+from tuning.api.run import Tuning, aim_of, name_of, run_tuning, with_budget
 from tuning.cli.log_options import BlockOptions, GridOptions, with_groups
 from tuning.cli.log_problems import problems_of
 from tuning.cli.options import (
@@ -25,7 +25,7 @@ from tuning.cli.options import (
 )
 from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
 from tuning.cli.problems import PROBLEMS
-from tuning.cli.tuning_report import Tuning, as_json, report
+from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.tuned import check_keepable
 from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.objectives import OBJECTIVES

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from thruster_env.core.text_tables import table
 from tuning.cli.options import INPUT, OUTPUT, RUNS, JsonOption
-from tuning.cli.output import announce_compilation, emit, progress_console, table
+from tuning.cli.output import announce_compilation, emit, progress_console
 
 RESULTS = Path("out") / "users"
 

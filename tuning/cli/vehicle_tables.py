@@ -8,8 +8,8 @@ import numpy as np
 from rich.table import Table
 
 from filters.consistency.intervals import Interval, mean_interval
+from thruster_env.core.text_tables import table
 from tuning.cli.benchmark import fitted
-from tuning.cli.output import table
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS
 from tuning.experiments.vehicle.experiment import PathResult

@@ -6,8 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
+from thruster_env.core.text_tables import table
 from tuning.cli.options import JsonOption, spelt
-from tuning.cli.output import emit, table
+from tuning.cli.output import emit
 from tuning.ways.registry import WAYS, find_way
 from tuning.ways.way import GRADIENT, TRUTH
 

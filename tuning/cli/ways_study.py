@@ -64,7 +64,7 @@ def command(
     Example: thruster study ways --quick
     """
     from thruster_env.core.files import write_whole
-    from thruster_env.core.markdown import with_tables
+    from thruster_env.core.text_tables import with_tables
     from tuning.experiments.ways.figure import figure
     from tuning.experiments.ways.predictions import PREDICTIONS
     from tuning.experiments.ways.protocol import FAST, Protocol

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from filters.consistency.blow_up import blow_up_sentence
+from filters.consistency.nees import blow_up_sentence
 from filters.engine.batch import Estimates
 from filters.filter import Filter
 from tuning.problems.data import Data

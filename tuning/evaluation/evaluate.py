@@ -22,9 +22,9 @@ from filters.consistency.intervals import (
 )
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.consistency.time_constants import TimeConstants
-from filters.ensembles.recording import record_members
+from filters.ensembles.rank_histogram import record_members
 from filters.filter import Filter
-from filters.restarts import Restarts, restarts_of
+from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios

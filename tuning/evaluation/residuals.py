@@ -10,9 +10,8 @@ import numpy as np
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from thruster_env.core.tuples import vector_reader, vector_writer
-from thruster_env.model.layout import constants_reader, number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.core.sources import vector_reader, vector_writer
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import data_of
 from tuning.problems.data import Data

@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.consistency.time_constants import TimeConstants
-from filters.restarts import Restarts
+from filters.starts import Restarts
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.problems.problem import Problem

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.estimators.find import is_foreign, label_of
-from filters.monitoring.stored import monitor_data, monitor_for
+from filters.monitoring.monitor import monitor_data, monitor_for
 from filters.tuned_file import (
     AUGMENTED,
     FACTORS,
@@ -22,12 +22,13 @@ from filters.tuned_file import (
     FILE_VERSION,
     NOISE,
     PRIOR,
+    check_same_quantities,
     compared,
     made_with,
+    model_data,
     read_tuned_file,
     sealed,
 )
-from filters.tuned_model import check_same_quantities, model_data
 from thruster_env.core.checks import at_least, covariance, positive, short_repr
 from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import ThrusterParameters, derive_constants
 from tuning.experiments.bollard_table import CENTRE, SPAN, BollardTable
 

@@ -24,7 +24,7 @@ from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of, positive
-from thruster_env.core.linear_systems import zero_order_hold
+from thruster_env.core.matrices import zero_order_hold
 from thruster_env.core.streams import COMPARISON_STUDY, derived_generator
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.simulate import Truth, simulate

@@ -16,10 +16,10 @@ import numpy as np
 from filters.engine.batch import run
 from filters.filter import Filter
 from filters.monitoring.monitor import TESTS, Monitor
-from filters.monitoring.thresholds import cusum_run_length, cusum_threshold
+from filters.monitoring.recursion import cusum_run_length, cusum_threshold
 from filters.registry import make_filter
-from thruster_env.core.markdown import print_or_write, table
 from thruster_env.core.streams import filter_keys
+from thruster_env.core.text_tables import markdown_table, print_or_write
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
@@ -169,7 +169,7 @@ def markdown(runs: int = RUNS) -> str:
     heads = [
         f"{plant.name}: {what}" for plant in PLANTS for what in ("readings", "found", "first test", "best CUSUM")
     ]
-    return table(["fault", *heads], rows)
+    return markdown_table(["fault", *heads], rows)
 
 
 def main() -> None:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import at_least
-from thruster_env.core.markdown import table
 from thruster_env.core.streams import episode_keys
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.logged import Recorder, logged_model
@@ -111,7 +111,9 @@ def report(rows: Sequence[Coverage], repetitions: int) -> str:
     cells = [[one.name, *(f"{value:.4g}" for value in one[1:5]), str(one.within)] for one in rows]
     total = sum(one.within for one in rows)
     part = total / (repetitions * len(rows))
-    return table(columns, cells) + f"\n\n{total} of {repetitions * len(rows)} ({part:.1%}) hold the truth.\n"
+    return (
+        markdown_table(columns, cells) + f"\n\n{total} of {repetitions * len(rows)} ({part:.1%}) hold the truth.\n"
+    )
 
 
 def study(repetitions: int, tell: Callable[[int], None] = lambda done: None, **options) -> list[Identification]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from thruster_env.core.compiled import inlined
-from thruster_env.model.positions import Positions
+from thruster_env.model.quantities import Positions
 from tuning.experiments.benchmark import Benchmark, Published, against_published, noise_free_problem
 
 STATES, FORCING, SUBSTEP = 40, 8.0, 0.05

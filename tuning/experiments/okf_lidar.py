@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from thruster_env.core.markdown import print_or_write, table
+from thruster_env.core.text_tables import markdown_table, print_or_write
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
 from tuning.experiments.lidar import Run, drawn, lidar_problem
@@ -149,7 +149,7 @@ def markdown(rows: list[Row]) -> str:
         said = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]" if row is not first else "1"
         numbers = f"{row.seconds:.1f}", f"{row.mse:.1f}", said, f"{row.nis:.2f}", f"{row.nees:.2f}"
         cells.append([row.name, *numbers, f"{row.log_likelihood:.3f}"])
-    return table(heads, cells)
+    return markdown_table(heads, cells)
 
 
 def main() -> None:

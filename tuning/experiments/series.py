@@ -10,11 +10,11 @@ import numpy as np
 from filters import EnsembleKalmanFilter, KalmanFilter
 from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
-from filters.plot_styles import TRUTH, plot_style
+from filters.logs.figure import TRUTH, plot_style
 from thruster_env.core.checks import at_least
 from thruster_env.core.plots import new_figure, save_figure, tidy
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.linear.figures import STATES
+from thruster_env.thruster.linear.analysis import STATES
 from thruster_env.thruster.linear.published import SAMPLE_TIME
 from tuning.experiments.comparison import MEMBERS, discrete_model, keys_of
 from tuning.experiments.published import NOISE_LEVELS, STEPS, SYSTEMS

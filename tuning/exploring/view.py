@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.nees import band_of_means
-from filters.consistency.whiteness import LAGS, whiteness
+from filters.consistency.nees import LAGS, band_of_means, whiteness
 from filters.engine.batch import Estimates
 from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, compute_metrics

@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from filters.pages.traced import traced_model
-from thruster_env.core.captured import captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.core.derivatives import by_complex_step
-from thruster_env.core.equal_functions import bound_call
+from thruster_env.core.equal_functions import bound_call, captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.logs.steps import AnyStepModel, in_any_steps

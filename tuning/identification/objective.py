@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.differentiated.runs import same_functions
+from filters.differentiated.runs import ModelSlopes, same_functions
 from filters.registry import make_filter
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.sensitivity import sensitivity
 from filters.starts import Starts
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.log import Log

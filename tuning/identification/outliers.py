@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from filters.adaptive.robust import RobustExtendedKalmanFilter
+from filters.adaptive import RobustExtendedKalmanFilter
 from filters.starts import Starts
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.objective import Objective
@@ -20,7 +20,7 @@ ROUNDS = 30  # of leaving out and identifying again, at most; a narrow gate take
 def outliers_of(model: StateSpaceModel, runs: Data, gate: float, starts: Starts | None = None) -> np.ndarray:
     """Which samples are outliers, (B, K + 1, m): innovations of more than `gate` standard deviations.
 
-    The filter is an extended Kalman filter with Student-t noise (`filters.adaptive.robust`): the normal one
+    The filter is an extended Kalman filter with Student-t noise (`filters.adaptive`): the normal one
     follows outliers, so that their neighbours would look like outliers, too.
 
     Args:

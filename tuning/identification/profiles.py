@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.characters import verbatim
 from thruster_env.core.checks import one_of
 from thruster_env.core.plots import BLUE, DARK, RUST, panels
+from thruster_env.core.text_tables import verbatim
 from tuning.identification.ascent import climb
 from tuning.identification.result import Identification
 from tuning.likelihood.identifiability import SIGNIFICANT

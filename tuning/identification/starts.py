@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import chi2
 
+from filters.differentiated.runs import ModelSlopes
 from filters.engine.batch import Estimates, run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.sensitivity import sensitivity
 from filters.starts import Starts, as_the_prior_says, wide_cov
 from thruster_env.core.angles import difference
 from thruster_env.model.state_space import StateSpaceModel

@@ -12,10 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from thruster_env.core.checks import finite, positive, short_repr
-from thruster_env.core.files import write_whole
-from thruster_env.core.toml import as_toml, read_toml
+from thruster_env.core.files import as_toml, read_toml, write_whole
 from thruster_env.logs.write import check_not_among
-from thruster_env.model.diffusion import noise_for_dt, same_dt
+from thruster_env.model.continuous import noise_for_dt, same_dt
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification

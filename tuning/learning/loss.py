@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from filters.learned.estimator import LearnedEstimator, Track
-from filters.tensors.algebra import density, factor
+from filters.tensors.stages import density, factor
 
 
 class Loss:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import LearnedEstimator
-from thruster_env.core.torch_threads import one_thread
+from thruster_env.core.threads import one_thread
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.loss import Loss
 from tuning.learning.settings import Settings

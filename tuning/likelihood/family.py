@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from filters.differentiated.differentiable import KINDS, has_derivatives
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
-from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
+from filters.differentiated.runs import KINDS, ModelSlopes, Truth, derivatives, has_derivatives, same_functions
 from filters.estimators.find import is_foreign
 from filters.pages.page_filter import PageFilter
 from filters.registry import filter_type, make_filter

@@ -10,7 +10,7 @@ from typing import Any
 
 from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
-from thruster_env.env.replay import read_for
+from thruster_env.env.record import read_for
 from thruster_env.logs.log import Log
 from tuning.logs.read import check_model, read_named, texts
 from tuning.problems.augmented import name_and_unknown

@@ -9,7 +9,7 @@ from typing import Any
 from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.modules import object_named
-from thruster_env.env.replay import ANY_DT, read_for
+from thruster_env.env.record import ANY_DT, read_for
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import in_discrete_time
 from tuning.problems.plant_packages import logs_package

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
 from filters.registry import filter_type
-from thruster_env.env.observe import ObserveState, ObserveStateVector
+from thruster_env.env.commands import ObserveState, ObserveStateVector
 from tuning.policies.controllers import CorrectController
 from tuning.policies.observations import find_observation_set
 from tuning.policies.plants.find import plant_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.render.video import OnStep, Played, check_drawing, steps_a_frame, write_video
+from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
 from tuning.policies.environments import episode_steps, make_environments
 from tuning.policies.saved import load, read_configuration
 

@@ -9,8 +9,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.distributions import Distribution
 
-from thruster_env.core.torch_threads import one_thread
-from thruster_env.core.wait_policy import PASSIVE, waiting
+from thruster_env.core.threads import PASSIVE, one_thread, waiting
 from tuning.policies.rollouts import epoch_minibatches
 from tuning.policies.tanh import numpys_tanh
 

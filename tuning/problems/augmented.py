@@ -12,11 +12,12 @@ import gymnasium as gym
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
+from filters.consistency.time_constants import Run
 from filters.tuned_file import AUGMENTED, PRIOR
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import rows_argument
-from tuning.problems.data import Data, Run
+from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Problem
 

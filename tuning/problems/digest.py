@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.core.pickling import Made, as_made
+from thruster_env.core.user_functions import Made, as_made
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import code_digest, network_digest
 from tuning.problems.problem import Problem

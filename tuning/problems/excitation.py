@@ -17,7 +17,7 @@ import numpy as np
 from thruster_env.core.checks import at_least, finite, positive, vector
 from thruster_env.core.streams import EXCITATION, uniform_block
 from thruster_env.effects.effects import LONGEST, Effect, Registry, set_field
-from thruster_env.effects.sensors import probability
+from thruster_env.effects.missing import probability
 
 EXCITATIONS = Registry("excitation")
 MOST_STEPS = int(LONGEST)  # for which a level is held

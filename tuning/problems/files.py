@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from thruster_env.core.checks import any_case, meant, one_of, short_repr
-from thruster_env.core.toml import read_toml
+from thruster_env.core.files import read_toml
 from tuning.problems.plant_packages import PLANT_PACKAGES, plant_package
 from tuning.problems.scenario import BaseScenario
 

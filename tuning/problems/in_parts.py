@@ -11,7 +11,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.progress import told
 from thruster_env.core.threads import cores
-from thruster_env.model.layout import LANES
+from thruster_env.model.shape import LANES
 from tuning.problems.data import Data, padded
 
 MOST_BYTES = 2**28  # of a part's estimates: a run of 1000 steps with forty states and channels takes 26 MB

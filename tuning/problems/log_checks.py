@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from thruster_env.core.checks import short_repr
-from thruster_env.logs.log import Log
-from thruster_env.logs.overlap import shared_by
-from thruster_env.model.diffusion import same_dt
+from thruster_env.logs.log import Log, shared_by
+from thruster_env.model.continuous import same_dt
 
 
 def checked_logs(given: Any) -> tuple[Log, ...]:

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from filters.consistency.time_constants import Run
 from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.replay import ReplayEnv
+from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.findings import remarks_on
 from thruster_env.logs.log import Log
 from thruster_env.logs.steps import as_rows, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
-from tuning.problems.data import Data, Run, mask_of, only, padded
+from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.digest import digest_of
 from tuning.problems.log_checks import check_apart, checked_logs
 from tuning.problems.log_parts import Parts, parts_of

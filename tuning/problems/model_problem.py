@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.baselines.baselines import OpenLoop
+from filters.baselines import OpenLoop
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.core.angles import difference

@@ -11,10 +11,11 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
+from filters.consistency.time_constants import Run
 from thruster_env.model.quantities import Quantities
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import seeds
-from tuning.problems.data import Data, Run, runs_of
+from tuning.problems.data import Data, runs_of
 from tuning.problems.parameter import Parameter
 
 BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import LEVELS, Interval
 from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
-from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
-from filters.plot_styles import colour_of
-from thruster_env.core.characters import TITLE, verbatim
+from filters.logs.figure import colour_of
 from thruster_env.core.plots import BLUE, DARK, RUST, panels, save_figure
+from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.reporting.panels import COLUMNS, plotted_states
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.plot_styles import colour_of
-from thruster_env.core.characters import TITLE, verbatim
+from filters.logs.figure import colour_of
 from thruster_env.core.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
+from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, plotted_states

@@ -13,7 +13,7 @@ from thruster_env.core.text_tables import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import belief_sentences, noise_sentence
-from tuning.evaluation.tuned import summary
+from tuning.evaluation.summary import summary
 from tuning.evaluation.worth import slowest_sentence, without_truth
 from tuning.reporting.error_tables import (
     ABOVE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from textwrap import wrap
 
-from thruster_env.core.characters import verbatim
+from thruster_env.core.text_tables import verbatim
 from thruster_env.model.quantities import Quantity
 
 MOST_PANELS = 6  # of states in one figure

@@ -10,8 +10,8 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from thruster_env.core.characters import verbatim
 from thruster_env.core.plots import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
+from thruster_env.core.text_tables import verbatim
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import early_trials, limit_values
 from tuning.reporting.panels import COLUMNS, plotted_states

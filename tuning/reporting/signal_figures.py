@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from filters.filter import Filter
-from filters.plot_styles import MEASURED, colour_of
+from filters.logs.figure import MEASURED, colour_of
 from thruster_env.core.angles import wrapped, wrapped_where
-from thruster_env.core.characters import TITLE, verbatim
 from thruster_env.core.plots import GREY, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value
+from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data

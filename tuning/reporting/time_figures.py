@@ -11,10 +11,10 @@ import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from filters.plot_styles import TRUTH, colour_of
+from filters.logs.figure import TRUTH, colour_of
 from thruster_env.core.angles import with_breaks, wrapped_where
-from thruster_env.core.characters import TITLE, verbatim
 from thruster_env.core.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
+from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data

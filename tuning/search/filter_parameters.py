@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 from filters.filter import Filter
-from filters.particles.rao_blackwell import RaoBlackwellisedParticleFilter
+from filters.particles.particle import RaoBlackwellisedParticleFilter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import FilterType, filter_type
 from tuning.problems.parameter import Parameter

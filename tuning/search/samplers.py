@@ -13,7 +13,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.core.checks import one_of
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 from tuning.search.box import GpInBox, RandomInBox, TpeInBox
 from tuning.search.cma_es import CmaEsSampler
 from tuning.search.space import FILTER_TYPE

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thruster_env.effects.effects import Effect, set_field
-from thruster_env.thruster.control.controllers import PIController
-from thruster_env.thruster.control.gains import lambda_gains
+from thruster_env.thruster.control.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
 from thruster_env.thruster.engine.copies import Copies
 from thruster_env.thruster.engine.memory import NEXT_REFERENCE, READINGS

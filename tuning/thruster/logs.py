@@ -10,9 +10,9 @@ import numpy as np
 
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.env import ModelledThruster
 from thruster_env.thruster.logged import NO_BAND, logged_plant, with_recorder
 from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.modelled import ModelledThruster
 from thruster_env.thruster.parameters import PRESETS
 from thruster_env.thruster.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from filters.baselines.baselines import OpenLoop
+from filters.baselines import OpenLoop
 from filters.engine.batch import run
 from thruster_env.core.checks import at_least
-from thruster_env.thruster.linear.steady_state import jacobians, steady_state
+from thruster_env.thruster.linear.analysis import jacobians, steady_state
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.plant import Plant
 from tuning.thruster.scenario import Scenario

@@ -15,14 +15,20 @@ from thruster_env.core.checks import positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.linear.analysis import equilibrium
-from thruster_env.thruster.linear.linear_plant import make_linear_plant
-from thruster_env.thruster.linear.steady_state import state_range
+from thruster_env.thruster.engine.copies import simulate
+from thruster_env.thruster.linear.analysis import equilibrium, state_range
+from thruster_env.thruster.linear.published import make_linear_plant
 from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
-from thruster_env.thruster.plant_data import check_same_plant, plant_data
+from thruster_env.thruster.plant import (
+    DEFAULT_DT,
+    DEFAULT_MAX_VOLTAGE,
+    DEFAULT_PROCESS_NOISE,
+    Plant,
+    check_same_plant,
+    make_plant,
+    plant_data,
+)
 from thruster_env.thruster.preset_file import is_file, preset_mapping
-from thruster_env.thruster.simulation import simulate
 from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.plain import plain

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from filters.registry import filter_type
-from thruster_env.core.extras import to_install
+from thruster_env.core.modules import to_install
 from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space

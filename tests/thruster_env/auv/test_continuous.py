@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from thruster_env.auv.continuous import continuous_auv
-from thruster_env.auv.model import auv_model
+from thruster_env.auv.model import auv_model, continuous_auv
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ from scipy.integrate import solve_ivp
 from tests.thruster_env.auv import textbook
 from tests.thruster_env.auv.textbook import random_states
 from thruster_env.auv import dynamics
-from thruster_env.auv.kinematics import attitude_of, in_earth_axes
+from thruster_env.auv.dynamics import attitude_of, in_earth_axes
 from thruster_env.auv.parameters import derive_constants
 from thruster_env.auv.presets import PRESETS, SEGOROGENI
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.tuples import vector_reader, vector_writer
+from thruster_env.core.sources import vector_reader, vector_writer
 
 SIZES = {"velocity": 6, "motion": 8, "navigation": 12}
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)

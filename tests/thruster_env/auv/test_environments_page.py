@@ -9,7 +9,7 @@ import pytest
 import thruster_env.auv  # noqa: F401 - registers the envs
 from pages import auv_figures, auv_filters, auv_papers
 from thruster_env.auv.channels import SUITES
-from thruster_env.auv.effects.current import CURRENT_SIGNALS
+from thruster_env.auv.effects import CURRENT_SIGNALS
 from tuning.auv.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "auv.md").read_text()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thruster_env.auv.kinematics import (
+from thruster_env.auv.dynamics import (
     angle_rates,
     attitude_of,
     down,
@@ -11,7 +11,7 @@ from thruster_env.auv.kinematics import (
     planar_kinematics,
 )
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.trigonometry import cosine_and_sine
+from thruster_env.core.streams import cosine_and_sine
 
 
 def random_angles(count=100):

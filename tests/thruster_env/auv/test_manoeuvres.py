@@ -7,13 +7,15 @@ import pytest
 from scipy.optimize import fsolve
 
 from thruster_env.auv.dynamics import (
+    cruise_thrust,
     motion_rates,
     motion_rates_tangent,
     navigation_substep,
+    planar_kinematics,
+    required_substeps,
+    top_speed,
     velocity_rates_tangent,
 )
-from thruster_env.auv.kinematics import planar_kinematics
-from thruster_env.auv.operating import cruise_thrust, required_substeps, top_speed
 from thruster_env.auv.parameters import derive_constants
 from thruster_env.auv.presets import LAUV, PRESETS, REMUS100, REMUS100_PRESTERO, SEGOROGENI, SEGOROGENI_PAPERS
 

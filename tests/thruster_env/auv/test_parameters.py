@@ -5,7 +5,7 @@ import pytest
 
 from tests.thruster_env.auv.textbook import random_states, without_drag_and_lift
 from thruster_env.auv.forces import forces
-from thruster_env.auv.parameters import VehicleParameters, checked, derive_constants, mass_matrix
+from thruster_env.auv.parameters import PRINTED_INVERSE, VehicleParameters, checked, derive_constants, mass_matrix
 from thruster_env.auv.presets import (
     LAUV,
     PRESETS,
@@ -13,10 +13,10 @@ from thruster_env.auv.presets import (
     REMUS100_PRESTERO,
     REMUS_SIZES,
     SEGOROGENI,
+    lamb_factors,
     preset_parameters,
+    recipe,
 )
-from thruster_env.auv.published import PRINTED_INVERSE
-from thruster_env.auv.recipe import lamb_factors, recipe
 
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)
 

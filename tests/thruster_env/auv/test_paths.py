@@ -6,10 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from thruster_env.auv.control.depth_and_course import DepthAndCourse
-from thruster_env.auv.manoeuvres import MANOEUVRES, run
-from thruster_env.auv.paths import make_path
-from thruster_env.env.observe import ObserveState, ObserveStateVector
+from thruster_env.auv.control import DepthAndCourse
+from thruster_env.auv.paths import MANOEUVRES, make_path, run
+from thruster_env.env.commands import ObserveState, ObserveStateVector
 
 PATH, DEPTH = "SegorogeniAUVPath-v0", "SegorogeniAUVDepth-v0"
 SQUARE = [[0, 0, 1], [10, 0, 1], [10, 10, 3], [0, 10, 3]]

@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from thruster_env.auv.channels import CHANNELS, INSTRUMENTS, SUITES, channels_of, suite
+from thruster_env.auv.channels import CHANNELS, INSTRUMENTS, STATES, SUITES, SYMBOLS, channels_of, suite
 from thruster_env.auv.plant import make_plant
 from thruster_env.auv.presets import LAUV, SEGOROGENI
-from thruster_env.auv.quantities import STATES, SYMBOLS
 
 
 def test_the_default_plant_is_the_documented_one():

@@ -4,8 +4,7 @@ import gymnasium as gym
 import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
-from thruster_env.auv.plant import make_plant
-from thruster_env.auv.plant_data import ENTRIES, plant_data
+from thruster_env.auv.plant import ENTRIES, make_plant, plant_data
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from filters import EstimateState
-from thruster_env.auv.control.depth_and_course import DepthAndCourse
+from thruster_env.auv.control import DepthAndCourse
 from thruster_env.auv.paths import STRAIGHT_AHEAD, make_path
 from thruster_env.auv.rendering import Moment, Overlay, Renderer
 
 pytest.importorskip("pygame")
 
-from thruster_env.auv.rendering.view import HULL, PROJECTION, attitude  # noqa: E402
+from thruster_env.auv.rendering.view import HULL, PROJECTION, attitude
 from thruster_env.render.canvas import BAND, ESTIMATE, INK, REFERENCE  # noqa: E402
 
 ARGUMENTS = {

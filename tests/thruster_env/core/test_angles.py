@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
-from filters.baselines.inverse import component_solver
+from filters.baselines import component_solver
 from filters.consistency.report import consistency_report
-from filters.ensembles.recording import record_members
-from filters.gaussian.mixture import Parts, part_aligner
+from filters.ensembles.rank_histogram import record_members
+from filters.gaussian.mixtures import Parts, part_aligner
 from filters.likelihood import likelihood
 from tests.models import simulated, small
 from thruster_env.core.angles import difference, row_aligner, wrapped, wrapped_where

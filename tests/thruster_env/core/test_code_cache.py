@@ -10,9 +10,8 @@ import numba
 import pytest
 from numba.core import caching
 
-from thruster_env.core import code_cache
-from thruster_env.core.code_cache import keep_code, private_folder
-from thruster_env.core.compiled import compiled
+from thruster_env.core import compiled as code_cache
+from thruster_env.core.compiled import compiled, keep_code, private_folder
 
 SOURCE = "def double(x):\n    return x + x\n"
 

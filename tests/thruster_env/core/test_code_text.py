@@ -7,8 +7,8 @@ import types
 import numpy as np
 import pytest
 
-from thruster_env.core.code_text import code_text
 from thruster_env.core.compiled import function_fingerprint
+from thruster_env.core.user_functions import code_text
 from tuning.problems.digest import digest_of
 
 USERS = """

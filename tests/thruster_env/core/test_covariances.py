@@ -7,7 +7,7 @@ from filters import make_filter
 from filters.estimators.checked import Checks
 from tests.models import plane_model, random_affine
 from thruster_env.core.checks import correlation_flaws, covariance
-from thruster_env.model.diffusion import densities_of, noise_of_densities
+from thruster_env.model.continuous import densities_of, noise_of_densities
 
 BLOCK = np.array([[1.0, 2.0], [2.0, 1.0]])  # indefinite
 SCALES = (1e-9, 1e-3, 1.0, 3e4, 1e9)

@@ -6,7 +6,7 @@ import pytest
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint
 from thruster_env.core.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.results import array_valued
-from thruster_env.core.trigonometry import nearest_whole
+from thruster_env.core.streams import nearest_whole
 
 
 class Step:

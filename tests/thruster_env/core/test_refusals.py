@@ -7,8 +7,7 @@ import pytest
 
 from thruster_env.core import compiled
 from thruster_env.core.compiled import CompiledOrPython
-from thruster_env.core.sources import Source
-from thruster_env.core.written import written_out
+from thruster_env.core.sources import Source, written_out
 
 FAULT = "a fault of the package and not of the model: please report it"
 

@@ -14,10 +14,20 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 
-from thruster_env.core.atomics import LINE, SPIN_ROUNDS, TAKEN, take
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.threads import BEHIND, CALLER, WorkerThreads, in_parts, spread, worker_threads
-from thruster_env.core.wait_policy import waiting
+from thruster_env.core.threads import (
+    BEHIND,
+    CALLER,
+    LINE,
+    SPIN_ROUNDS,
+    TAKEN,
+    WorkerThreads,
+    in_parts,
+    spread,
+    take,
+    waiting,
+    worker_threads,
+)
 
 COUNT = 1000
 

@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from thruster_env.core.toml import as_toml, read_toml
+from thruster_env.core.files import as_toml, read_toml
 
 
 def test_what_is_written_is_read_again(tmp_path):

@@ -9,9 +9,9 @@ import pytest
 
 from tests.fuzz.arithmetic import in_c
 from thruster_env.core.compiled import compiled
+from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
-from thruster_env.graphs.slopes import along
 from thruster_env.graphs.tracing import traced
 
 TABLE, VALUES = [-1.0, 0.0, 0.5, 2.0], [1.0, -2.0, 0.3, 4.0]
@@ -67,8 +67,8 @@ def test_values_and_slopes_are_those_of_python():
 
 def test_tensors_have_the_same_values_and_slopes():
     torch = pytest.importorskip("torch")
-    from filters.tensors.graphs import order_of
-    from filters.tensors.graphs import values_of as tensors_of
+    from filters.tensors.equations import order_of
+    from filters.tensors.equations import values_of as tensors_of
 
     values, slopes = graph_of()
     given = {Place("numbers", k): torch.tensor(row, requires_grad=True) for k, row in enumerate(POINTS)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
-from thruster_env.core.tuples import (
+from thruster_env.core.sources import (
     column_reader,
     column_writer,
     matrix_of,

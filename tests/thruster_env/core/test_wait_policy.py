@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from thruster_env.core import atomics, wait_policy
-from thruster_env.core.atomics import new_flags, spin_for_call
-from thruster_env.core.wait_policy import VARIABLE, waiting
+from thruster_env.core import threads as atomics
+from thruster_env.core import threads as wait_policy
+from thruster_env.core.threads import VARIABLE, new_flags, spin_for_call, waiting
 
 
 @pytest.fixture(params=[None, "active", "passive"])

@@ -4,7 +4,7 @@ import linecache
 
 from numba.core.serialize import dumps
 
-from thruster_env.core.written import written_out
+from thruster_env.core.sources import written_out
 
 
 def shifted(size, by):

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.graphs.branches import MOST_OUTCOMES, on_every_side
+from thruster_env.graphs.branches import MOST_OUTCOMES, along, on_every_side
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, values_of
-from thruster_env.graphs.slopes import along
 from thruster_env.graphs.tracing import traced
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from filters.algebra.matrices import given
+from filters.algebra.matrices import entries_product, given
 from filters.algebra.members import covariance, mean, variances
-from filters.algebra.scalars import entries_product
-from filters.pages.stages import Stage, as_programs
+from filters.pages.kernels import Stage, as_programs
 from thruster_env.core.compiled import compiled, interpreted
 from thruster_env.graphs.loops import cut
 from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thruster_env.core.compiled import compiled
+from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
-from thruster_env.graphs.slopes import along
 from thruster_env.graphs.tracing import traced
 
 AT_ZERO = {

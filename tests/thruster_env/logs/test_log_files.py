@@ -6,8 +6,8 @@ import pytest
 from tests.thruster_env.logs.test_logs import MODEL, log_of
 from thruster_env.logs import columns as columns_module
 from thruster_env.logs import table as table_module
+from thruster_env.logs.columns import parted
 from thruster_env.logs.read import read_log
-from thruster_env.logs.units import parted
 from thruster_env.logs.write import write_columns, write_log
 from thruster_env.thruster.model import thruster_model
 

@@ -7,9 +7,9 @@ import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL
 from tests.tuning.test_log_problem import logs_of
-from thruster_env.logs.figure import draw_findings
 from thruster_env.logs.findings import has_outliers, outliers, remarks_on, sentences
 from thruster_env.logs.read import read_log
+from thruster_env.logs.write import draw_findings
 from tuning.problems.find import find_problem
 
 

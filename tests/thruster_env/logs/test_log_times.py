@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from filters.logs.alarms import episode_sentence
-from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate
+from filters.logs.findings import columns_of, episode_sentence
 from filters.monitoring.monitor import Alarm
 from tests.fuzz.logs import MODEL
 from thruster_env.logs.findings import sentences

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL, log_of
+from thruster_env.logs.columns import converted, parted
 from thruster_env.logs.read import read_log
-from thruster_env.logs.units import converted, parted
 
 
 @pytest.mark.parametrize(

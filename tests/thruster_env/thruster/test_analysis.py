@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.core.linear_systems import zero_order_hold
+from thruster_env.core.matrices import zero_order_hold
 from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
 from thruster_env.thruster.linear.analysis import (
     INPUTS,
@@ -14,14 +14,16 @@ from thruster_env.thruster.linear.analysis import (
     controllability,
     dc_gain,
     frequency_response,
+    jacobians,
     linear_model,
+    response_figure,
     response_grids,
+    state_range,
+    steady_state,
     step_response,
     transfer_function,
 )
-from thruster_env.thruster.linear.figures import response_figure
 from thruster_env.thruster.linear.published import PUBLISHED, SAMPLE_TIME, published_for
-from thruster_env.thruster.linear.steady_state import jacobians, state_range, steady_state
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thruster_env.model.diffusion import noise_for_dt
-from thruster_env.thruster.continuous import continuous_thruster
+from thruster_env.model.continuous import noise_for_dt
 from thruster_env.thruster.dynamics import rates
-from thruster_env.thruster.logged import logged_model
+from thruster_env.thruster.logged import continuous_thruster, logged_model
 
 
 @pytest.mark.parametrize(

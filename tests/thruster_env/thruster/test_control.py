@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from thruster_env import PRESETS
-from thruster_env.env.observe import ObserveState, ObserveStateVector
-from thruster_env.thruster.control.controllers import LQRController, PIController
-from thruster_env.thruster.control.gains import lambda_gains, quadratic_gain
-from thruster_env.thruster.control.predictive import PredictiveController
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.thruster.control.controllers import LQRController, PIController, lambda_gains, quadratic_gain
+from thruster_env.thruster.control.planning import PredictiveController
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.task import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}

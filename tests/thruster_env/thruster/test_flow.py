@@ -10,11 +10,11 @@ from scipy import stats
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
-from thruster_env.effects.recorded import RecordedSeries
-from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.effects.missing import RecordedSeries
+from thruster_env.thruster.effects.amplifier import FLOW_SIGNALS
 from thruster_env.thruster.engine.copies import Copies
 from thruster_env.thruster.engine.memory import AMBIENT
-from thruster_env.thruster.linear.steady_state import run_substeps, state_range
+from thruster_env.thruster.linear.analysis import run_substeps, state_range
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.task import Task

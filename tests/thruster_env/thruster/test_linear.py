@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thruster_env.core.linear_systems import observability, zero_order_hold
+from thruster_env.core.matrices import observability, zero_order_hold
 from thruster_env.thruster.dynamics import rates, thrust_and_torque
-from thruster_env.thruster.linear.steady_state import (
+from thruster_env.thruster.linear.analysis import (
     jacobians,
     required_substeps,
     run_substeps,

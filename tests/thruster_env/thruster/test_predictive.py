@@ -10,8 +10,13 @@ from scipy.optimize import minimize
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.control import planning
-from thruster_env.thruster.control.planning import Problem, best_voltages, improve_plans
-from thruster_env.thruster.control.predictive import HORIZONS, PredictiveController
+from thruster_env.thruster.control.planning import (
+    HORIZONS,
+    PredictiveController,
+    Problem,
+    best_voltages,
+    improve_plans,
+)
 from thruster_env.thruster.parameters import preset_parameters
 from thruster_env.thruster.plant import make_plant
 

@@ -12,11 +12,11 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
 from thruster_env.thruster.engine.copies import Copies
 from thruster_env.thruster.engine.memory import NEXT_REFERENCE, REFERENCE
-from thruster_env.thruster.linear.steady_state import steady_state
+from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
+from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.task import Task, make_task
-from thruster_env.thruster.tasks import BowThrusterReversalEnv, BowThrusterTrackingEnv
 
 T_MAX = steady_state(TUNNEL, 24.0).thrust
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds

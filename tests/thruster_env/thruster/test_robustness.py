@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 import thruster_env
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.effects.uncertainty import UNCERTAIN
+from thruster_env.thruster.env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 from thruster_env.thruster.parameters import PRESETS
-from thruster_env.thruster.vector_env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]
 SENSORS = [

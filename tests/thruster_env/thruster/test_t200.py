@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.linear.steady_state import jacobians, required_substeps, steady_state
+from thruster_env.thruster.linear.analysis import jacobians, required_substeps, steady_state
 from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
 from tuning.experiments.bollard_fit import Identified, PulseWidthMap, identify, predict, relative_errors
 from tuning.experiments.bollard_table import read_table

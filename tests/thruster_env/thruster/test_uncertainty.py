@@ -20,9 +20,10 @@ from thruster_env.thruster.effects.uncertainty import (
     extreme_parameters,
     make_uncertainty,
 )
-from thruster_env.thruster.engine.copies import Copies
+from thruster_env.thruster.engine.copies import Copies, simulate
 from thruster_env.thruster.engine.memory import CONSTANT_ROWS
-from thruster_env.thruster.linear.steady_state import (
+from thruster_env.thruster.env import BowThrusterVectorEnv
+from thruster_env.thruster.linear.analysis import (
     required_substeps,
     required_substeps_of_all,
     run_substeps,
@@ -31,9 +32,7 @@ from thruster_env.thruster.linear.steady_state import (
 )
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import simulate
 from thruster_env.thruster.task import Task
-from thruster_env.thruster.vector_env import BowThrusterVectorEnv
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 UNIFORM, LOG_NORMAL = {"name": "uniform", "low": 0.8, "high": 1.3}, {"name": "log-normal", "std": 0.1}

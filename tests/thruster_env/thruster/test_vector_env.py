@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.thruster.vector_env import BowThrusterVectorEnv
+from thruster_env.thruster.env import BowThrusterVectorEnv
 
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED

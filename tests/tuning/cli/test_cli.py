@@ -14,9 +14,9 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from tests.slow import slow_but
+from thruster_env.core.text_tables import console
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, derive_constants
 from tuning.cli.main import main
-from tuning.cli.output import console
 
 
 class Done(NamedTuple):

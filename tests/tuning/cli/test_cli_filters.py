@@ -6,9 +6,9 @@ import sys
 import pytest
 
 from filters.registry import FILTERS, filter_type
+from thruster_env.core.text_tables import console
 from tuning.cli.filters import entry, first_sentence, fitted
 from tuning.cli.main import main
-from tuning.cli.output import console
 
 
 @pytest.fixture

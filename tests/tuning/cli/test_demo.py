@@ -9,9 +9,9 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
+from thruster_env.core.text_tables import console
 from tuning.cli import demo
 from tuning.cli.main import main
-from tuning.cli.output import console
 from tuning.reporting.report import Report
 from tuning.search.space import AUTO_FILTER_TYPES
 

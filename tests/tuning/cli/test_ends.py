@@ -15,7 +15,7 @@ import pytest
 
 import tuning.cli.app
 from tests.slow import slow_but
-from thruster_env.core.characters import showable
+from thruster_env.core.text_tables import showable
 from tuning.cli.main import main
 
 INTERRUPTED = "thruster: interrupted\n"

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_env.render import video
+from thruster_env.render import renderer as video
 from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.rendering.history import Moment, Overlay
+from thruster_env.thruster.rendering.renderer import Moment, Overlay
 from tuning.cli import episodes
 
 

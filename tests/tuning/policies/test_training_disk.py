@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tests.learners import learn, setup_of, short_episodes  # noqa: E402, F401 - one is a fixture
-from tuning.policies.learn import EVALUATIONS  # noqa: E402
+from tuning.policies.saved import EVALUATIONS
 
 
 def test_evaluations_that_find_no_room_do_not_spoil_those_before(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormal
 
 import thruster_env  # noqa: F401 - registers the envs
 from tests.slow import slow_but
-from thruster_env.thruster.vector_env import BowThrusterTrackingVectorEnv
+from thruster_env.thruster.env import BowThrusterTrackingVectorEnv
 from tuning.policies.environments import make_environments, make_single
 from tuning.policies.observations import OBSERVATION_SETS, STACKED
 from tuning.policies.setup import in_scenario, make_configuration

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.auv.engine.memory import (
+from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes
+from thruster_env.auv.engine.encoding import (
     COMMAND,
     ERRORS,
     FIRST_PIECE,
@@ -45,13 +46,11 @@ from thruster_env.auv.engine.memory import (
     Y,
     Z,
 )
-from thruster_env.auv.kinematics import angle_rates, attitude_of, in_earth_axes
 from thruster_env.auv.paths import PIECE as LENGTH
 from thruster_env.auv.task import step_cost
 from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import KEY_0, KEY_1, REWARD, STEP
-from thruster_env.core.streams import REFERENCE_SIGNAL, uniform_block
-from thruster_env.core.trigonometry import cosine_and_sine
+from thruster_env.core.streams import REFERENCE_SIGNAL, cosine_and_sine, uniform_block
 
 LARGEST_ERROR = 1e6  # [m], [m/s]: a reward stays finite when a state does not
 

@@ -7,7 +7,6 @@ attitude only. The common parts of all plants' pictures, and how a filter shows 
 `thruster_env.render`.
 """
 
-from thruster_env.auv.rendering.history import Moment, Overlay
-from thruster_env.auv.rendering.renderer import Renderer
+from thruster_env.auv.rendering.renderer import Moment, Overlay, Renderer
 
 __all__ = ["Moment", "Overlay", "Renderer"]

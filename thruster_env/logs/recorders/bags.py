@@ -13,25 +13,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.logs.recorders.bag_counts import check_counts, check_topics, counts_of, is_ros1
-from thruster_env.logs.recorders.bag_files import Bag, files_of, unpacker
+from thruster_env.logs.recorders.bag_counts import (
+    Bag,
+    check_counts,
+    check_topics,
+    counts_of,
+    files_of,
+    is_ros1,
+    unpacker,
+)
 from thruster_env.logs.recorders.one_clock import HEADER, RECEIPT
 from thruster_env.logs.recorders.topics import (
+    HEADER_TYPE,
     MOST_COLUMNS,
     MOST_FIELDS,
+    STAMPED,
+    Pairs,
     Topic,
     Wanted,
+    array_of_transforms,
     bounded,
     check_bytes,
     package,
     reading,
     wants,
-)
-from thruster_env.logs.recorders.transforms import (
-    HEADER_TYPE,
-    STAMPED,
-    Pairs,
-    array_of_transforms,
     wants_pairs,
 )
 

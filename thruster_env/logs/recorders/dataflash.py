@@ -11,16 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.logs.recorders.topics import (
-    Refused,
-    Topic,
-    Wanted,
-    columns_of,
-    joined,
-    package,
-    reading,
-    silent,
-)
+from thruster_env.logs.recorders.topics import Refused, Topic, Wanted, columns_of, joined, package, reading, silent
 
 KIND = "DataFlash log"
 MAGIC = b"\xa3\x95"

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from thruster_env.core.checks import listed
-from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns
+from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns, parted
 from thruster_env.logs.findings import CLOCK, OUTSIDE, Remark
+from thruster_env.logs.grid import SECOND, follows, time_text
 from thruster_env.logs.recorders.one_clock import HEADER, RECEIPT, Choice, chosen_clock
 from thruster_env.logs.recorders.registry import Format, Samples, check_stamps, read
-from thruster_env.logs.stamps import SECOND, follows, time_text
 from thruster_env.logs.table import Table
-from thruster_env.logs.units import parted
 
 STAMP = "times"  # header of the rows' times
 

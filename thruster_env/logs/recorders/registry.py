@@ -9,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import one_of
-from thruster_env.logs.columns import TIME, find_columns
+from thruster_env.logs.columns import TIME, find_columns, parted
+from thruster_env.logs.grid import in_seconds
 from thruster_env.logs.recorders import bag_counts, bags, dataflash, hdf5, matlab, ulog
-from thruster_env.logs.recorders.bag_files import METADATA
+from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.one_clock import RECEIPT, STAMPS, Clocked, chosen_clock
 from thruster_env.logs.recorders.topics import Reader, Topic, Wanted, unreadable
-from thruster_env.logs.stamps import in_seconds
 from thruster_env.logs.table import SUFFIXES, Table, read_table
-from thruster_env.logs.units import parted
 
 BINS = 8  # of the course of a field
 

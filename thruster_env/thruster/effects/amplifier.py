@@ -7,8 +7,32 @@ from dataclasses import dataclass
 from thruster_env.core.checks import positive
 from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Context, Effect, Registry, set_field
-from thruster_env.thruster.effects.context import ThrusterContext
+from thruster_env.effects.signals import GaussMarkov, Gusts, RecordedSignal, Sinusoid
 from thruster_env.thruster.engine.memory import OMEGA
+
+# Ambient flow U_0 along the thruster's axis [m/s]: signals that add to the constant `ambient_velocity`.
+
+
+FLOW_SIGNALS = Registry("flow")
+for _name, _signal in {
+    "sinusoid": Sinusoid,
+    "gauss-markov": GaussMarkov,
+    "gusts": Gusts,
+    "recorded": RecordedSignal,
+}.items():
+    FLOW_SIGNALS.register(_name)(_signal)
+
+
+# The context of effects on a thruster.
+
+
+@dataclass(frozen=True)
+class ThrusterContext(Context):
+    """The data with which an effect on a thruster computes its parameters."""
+
+    thrust_scale: float  # steady thrust at max_voltage [N]
+    back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]
+
 
 AMPLIFIER_EFFECTS = Registry("amplifier")
 

@@ -16,9 +16,9 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import KEY_0, KEY_1, STEP
 from thruster_env.core.streams import REFERENCE_SIGNAL, normal_block, uniform_block
 from thruster_env.effects.effects import LONGEST, Effect, Registry, set_field
-from thruster_env.effects.recorded import RecordedSeries, recorded_value
+from thruster_env.effects.missing import RecordedSeries, recorded_value
 from thruster_env.effects.signals import constant
-from thruster_env.thruster.effects.context import ThrusterContext
+from thruster_env.thruster.effects.amplifier import ThrusterContext
 from thruster_env.thruster.engine.memory import SAMPLE_TIME
 
 REFERENCE_SIGNALS = Registry("reference")

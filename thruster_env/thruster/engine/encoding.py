@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from thruster_env.core.checks import covariance_root
-from thruster_env.core.linear_systems import zero_order_hold
+from thruster_env.core.matrices import zero_order_hold
 from thruster_env.effects.effects import Effect, encoded
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.thruster.effects.context import ThrusterContext
-from thruster_env.thruster.effects.flow import FLOW_SIGNALS
+from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS, ThrusterContext
 from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS, Constant
 from thruster_env.thruster.engine import memory as at
 from thruster_env.thruster.linear.analysis import LinearModel

@@ -8,14 +8,162 @@ thrust T [N] from their values at the operating point. No input acts on the thru
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core.checks import one_of
-from thruster_env.core.linear_systems import observability, zero_order_hold
-from thruster_env.thruster.linear.steady_state import jacobians
-from thruster_env.thruster.parameters import ThrusterParameters
+from thruster_env.core.matrices import observability, zero_order_hold
+from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.thruster.dynamics import (
+    rates,
+    rates_tangent,
+    substep,
+    thrust_and_torque,
+    thrust_and_torque_tangent,
+)
+from thruster_env.thruster.parameters import ThrusterParameters, derive_constants
+
+# Operating points of the thruster: steady states, ranges, Jacobians, and the integration they need.
+
+
+ONE_STEP_ACCURACY = 1e-4  # of each state's range, over the whole voltage range
+
+
+class SteadyState(NamedTuple):
+    """A thruster at rest under a constant voltage."""
+
+    omega_m: float  # [rad/s]
+    U_a: float  # [m/s]
+    thrust: float  # [N]
+
+
+@lru_cache(maxsize=256)
+def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float = 0.0) -> SteadyState:
+    """Solve rates(x, (V_s, U_0)) = 0 for the state that a constant voltage [V] settles to.
+
+    Thrust, torque and momentum drag are homogeneous of degree two, so at U_0 = 0 the ratio r = U_a/omega_m
+    solves T(1, r) = K4 r |r| at any voltage (in reverse T(-1, -r) = -K4 r |r|), and omega_m is the root of a
+    quadratic. That point is the start of a simulation where U_0 is not zero; a Newton-type solution then polishes
+    where that settles. (Against the flow there are saddles too, on which Newton's method may end.)
+
+    Raises ValueError if no steady state is found.
+    """
+    from scipy.optimize import brentq
+
+    c = derive_constants(p, ambient_velocity)
+    if voltage == 0 and ambient_velocity == 0:
+        return SteadyState(0.0, 0.0, 0.0)
+
+    sign = -1.0 if voltage < 0 else 1.0
+
+    def forces(r):
+        return [sign * force for force in thrust_and_torque((sign, sign * r), c)]
+
+    def imbalance(r):
+        return forces(r)[0] * c.inverse_mass - c.flow_drag * r * abs(r)
+
+    # U_a = -U_p turns the attack angle past zero lift for every preset, so the root lies between.
+    if not imbalance(0.0) * imbalance(20.0 * c.blade_speed) < 0:
+        raise ValueError(f"blade_angle must allow a steady state, but got {p.blade_angle}")
+    ratio = brentq(imbalance, 0.0, 20.0 * c.blade_speed, xtol=1e-16)
+    load = c.load_gain * forces(ratio)[1]
+    drive = c.voltage_gain * abs(voltage)
+    # load omega^2 + K1 omega - K2 |V| = 0, in the form that survives load -> 0
+    omega = 2.0 * drive / (c.motor_damping + (c.motor_damping**2 + 4.0 * load * drive) ** 0.5)
+    x = np.array([omega, ratio * omega]) * (sign if voltage else 0.0)
+    if ambient_velocity != 0:
+        from scipy.integrate import solve_ivp  # a tenth of a second, which others need not wait
+        from scipy.optimize import root
+
+        u = (voltage, ambient_velocity)
+        settled = solve_ivp(lambda t, y: rates(tuple(y), u, c), (0.0, 1e5), x, method="LSODA", rtol=1e-8)
+        solution = root(lambda y: rates(tuple(y), u, c), settled.y[:, -1], jac=lambda y: _plant_matrix(y, u, c))
+        if not solution.success:
+            raise ValueError(f"voltage {voltage} V at {ambient_velocity} m/s has no steady state that was found")
+        x = solution.x
+    return SteadyState(float(x[0]), float(x[1]), float(thrust_and_torque((float(x[0]), float(x[1])), c)[0]))
+
+
+def state_range(p: ThrusterParameters, max_voltage: float) -> np.ndarray:
+    """Range (2,) of (omega_m [rad/s], U_a [m/s]) over the voltages +-max_voltage [V]: largest minus smallest."""
+    ahead, astern = steady_state(p, float(max_voltage)), steady_state(p, -float(max_voltage))
+    return np.abs(np.array(ahead[:2]) - np.array(astern[:2]))
+
+
+def _plant_matrix(x, u, c) -> np.ndarray:
+    x = (float(x[0]), float(x[1]))
+    return np.column_stack([rates_tangent(x, (1.0, 0.0), u, c), rates_tangent(x, (0.0, 1.0), u, c)])
+
+
+def jacobians(
+    p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocity: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Continuous-time A (2, 2), B (2, 1) for the voltage, and C (1, 2) of the thrust at state x, analytic.
+
+    dx/dt = A x + B V_s and T = C x for small deviations; units follow from (rad/s, m/s), V and N.
+    """
+    c = derive_constants(p, ambient_velocity)
+    x = (float(x[0]), float(x[1]))
+    a = _plant_matrix(x, (voltage, ambient_velocity), c)
+    thrust_slopes = [thrust_and_torque_tangent(x, dx, c)[0] for dx in ((1.0, 0.0), (0.0, 1.0))]
+    return a, np.array([[c.voltage_gain], [0.0]]), np.array([thrust_slopes])
+
+
+def run_substeps(x: tuple, u: tuple, p: ThrusterParameters, dt: float, substeps: int) -> tuple:
+    """State after dt [s] of constant input u = (V_s, U_0), in `substeps` Runge-Kutta steps; arrays allowed."""
+    c = derive_constants(p, substep=dt / substeps)
+    for _ in range(substeps):
+        x = substep(x, u, c)
+    return x
+
+
+def required_substeps(p: ThrusterParameters, dt: float, max_voltage: float, ambient_velocity: float = 0.0) -> int:
+    """Fewest Runge-Kutta steps a sample time that hold the one-step accuracy over the whole voltage range.
+
+    The one-step map is compared with one of 512 substeps from every state on a grid that spans the steady
+    states of +-max_voltage, under voltages up to full reversal.
+
+    Raises ValueError if 256 substeps do not suffice: dt is then far too long for the plant.
+    """
+    return required_substeps_of_all(((p, ambient_velocity),), dt, max_voltage)
+
+
+@lru_cache(maxsize=64)
+def required_substeps_of_all(
+    cases: tuple[tuple[ThrusterParameters, float], ...], dt: float, max_voltage: float
+) -> int:
+    """`required_substeps` that suffice for several thrusters, each with a flow U_0 [m/s], computed at once."""
+    limits = np.stack([ONE_STEP_ACCURACY * state_range(p, max_voltage) for p, _ in cases], axis=1)
+    ends = [(steady_state(p, max_voltage), steady_state(p, -max_voltage)) for p, _ in cases]
+    fastest = np.array([max(ahead.omega_m, -astern.omega_m) for ahead, astern in ends])
+    fastest_flow = np.array([max(ahead.U_a, -astern.U_a) for ahead, astern in ends])
+    grid = np.linspace(-1.0, 1.0, 5)
+    omega, flow, voltage = (g.ravel() for g in np.meshgrid(grid, grid, grid, indexing="ij"))
+    ambient = np.array([u_0 for _, u_0 in cases])[:, None]
+    p = _stacked([p for p, _ in cases])
+    x = omega * fastest[:, None], flow * (fastest_flow[:, None] + np.abs(ambient))
+    u, needed = (voltage * max_voltage, ambient), np.zeros(len(cases), dtype=int)
+    with np.errstate(all="ignore"):
+        exact = np.array(run_substeps(x, u, p, dt, 512))
+        for count in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256):
+            error = np.abs(np.array(run_substeps(x, u, p, dt, count)) - exact).max(axis=2)
+            needed[(needed == 0) & (error <= limits).all(axis=0)] = count
+            if needed.all():
+                return int(needed.max())
+    raise ValueError(f"dt must be short enough for 256 Runge-Kutta steps to follow the plant, but got {dt!r}")
+
+
+def _stacked(several: list[ThrusterParameters]) -> ThrusterParameters:
+    """Parameters (C, 1) of several thrusters of one convention of angles; a number where all have the same."""
+    columns = {name: [getattr(p, name) for p in several] for name in ThrusterParameters._fields}
+    differing: dict[str, Any] = {
+        name: np.array(values)[:, None] for name, values in columns.items() if len(set(values)) > 1
+    }
+    return several[0]._replace(**differing)
+
 
 INPUTS = ("V_s", "U_0")
 GAIN_UNITS = {"V_s": "N/V", "U_0": "N s/m"}  # of thrust over each input
@@ -156,3 +304,70 @@ def analyse(model: LinearModel, dt: float, scale) -> Analysis:
         numerators={name: transfer_function(model, name)[0] for name in INPUTS},
         dc_gain=dc_gain(model),
     )
+
+
+# Pictures of a thruster's responses, each saved as one PNG file.
+
+
+STATES = (("motor speed $\\omega_m$", "rad/s"), ("flow velocity $U_a$", "m/s"))
+
+
+def response_figure(path: str | Path, model: LinearModel, dt: float, title: str) -> Path:
+    """Bode plot of the thrust over the voltage, and the response to a step of 1 V.
+
+    Marked are the frequencies of the eigenvalues and the Nyquist frequency pi/dt, and the values that the
+    step settles to.
+
+    Args:
+        path: PNG file to write.
+        model: the thruster near an operating point.
+        dt: sample time [s].
+        title: said above the picture.
+
+    Raises:
+        ValueError: if the voltage does not move the thrust to first order, as at rest, or nothing can be written.
+    """
+    frequencies, times = response_grids(model)
+    gain = frequency_response(model, frequencies)
+    if not gain.all():
+        rule = "the thrust must move with the voltage for its Bode plot to be drawn (at rest it does not)"
+        raise ValueError(f"{rule}, but got C = {model.c[0].tolist()}")
+    figure = new_figure((9.6, 6.0))
+    left, right = figure.subfigures(1, 2)
+    _draw_bode(left.subplots(2, 1, sharex=True), frequencies, gain, np.linalg.eigvals(model.a), dt)
+    _draw_step(right.subplots(3, 1, sharex=True), times, step_response(model, times), model)
+    for part in (left, right):
+        part.align_ylabels()
+    figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path)
+
+
+def _draw_bode(axes, frequencies, gain, eigenvalues, dt) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    tidy(axes)
+    magnitude, phase = axes
+    magnitude.loglog(frequencies, np.abs(gain), color=BLUE)
+    phase.semilogx(frequencies, np.rad2deg(np.unwrap(np.angle(gain))), color=BLUE)
+    for axis in axes:
+        for place, value in enumerate(np.abs(eigenvalues)):
+            axis.axvline(value, color=DARK, linestyle=":", linewidth=1, label="" if place else "eigenvalues")
+        axis.axvline(np.pi / dt, color=RUST, linestyle="--", linewidth=1, label=f"Nyquist, dt = {dt:g} s")
+    magnitude.set_title("thrust over voltage", fontsize=10)
+    magnitude.set_ylabel("magnitude [N/V]")
+    magnitude.legend(loc="lower left", fontsize=9, framealpha=1, edgecolor="none")
+    phase.yaxis.set_major_locator(MaxNLocator(6, steps=[1.5, 3, 4.5, 9, 10]))
+    phase.set_ylabel("phase [deg]")
+    phase.set_xlabel("frequency [rad/s]")
+
+
+def _draw_step(axes, times, response, model) -> None:
+    tidy(axes)
+    labels = (*STATES, ("thrust $T$", "N"))
+    for axis, (label, unit), values, settled in zip(axes, labels, response.T, dc_gain(model)[:, 0], strict=True):
+        axis.axhline(settled, color=DARK, linestyle=":", linewidth=1, label="settled")
+        axis.plot(times, values, color=BLUE)
+        axis.set_ylabel(f"{label}\n[{unit}]")
+    axes[0].set_title("deviation after a step of 1 V", fontsize=10)
+    axes[0].legend(frameon=False, fontsize=9)
+    axes[-1].set_xlabel("time [s]")

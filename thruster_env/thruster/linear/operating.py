@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.linear_systems import zero_order_hold
+from thruster_env.core.matrices import zero_order_hold
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.linear.analysis import equilibrium
-from thruster_env.thruster.linear.steady_state import SteadyState, jacobians, steady_state
+from thruster_env.thruster.linear.analysis import SteadyState, equilibrium, jacobians, steady_state
 from thruster_env.thruster.plant import Plant
 
 # T(V_s) is about a parabola, so a straight line between two points errs by T_max/(POINTS - 1)^2, 2.5e-4 of T_max.

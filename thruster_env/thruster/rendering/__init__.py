@@ -10,7 +10,6 @@ The common parts of all plants' pictures, and how a filter shows its estimate, a
 Needs pygame (the extra `render`), which is imported when a `Renderer` is made.
 """
 
-from thruster_env.thruster.rendering.history import Moment, Overlay
-from thruster_env.thruster.rendering.renderer import Renderer
+from thruster_env.thruster.rendering.renderer import Moment, Overlay, Renderer
 
 __all__ = ["Moment", "Overlay", "Renderer"]

@@ -3,13 +3,42 @@
 from __future__ import annotations
 
 from math import isnan
+from typing import NamedTuple
 
 import numpy as np
 
 from thruster_env.core.checks import positive
-from thruster_env.render.history import ABSURD, newest
+from thruster_env.render.canvas import Canvas
+from thruster_env.render.charts import ABSURD, Charts, Strip, newest
 from thruster_env.render.renderer import MODES, PlantRenderer
-from thruster_env.thruster.rendering.history import Moment, Overlay
+
+# Contents of a picture: the truth at each step, and the estimate of a filter.
+
+
+class Moment(NamedTuple):
+    """The truth at the end of a step, one entry of the strip charts."""
+
+    time: float  # since the start of the episode [s]
+    omega_m: float  # motor speed [rad/s]
+    U_a: float  # section-average flow velocity [m/s]
+    thrust: float  # [N]
+    measured_thrust: float  # [N]
+    reference: float | None  # thrust to hold [N]
+    voltage: float  # [V]
+    ambient_velocity: float = 0.0  # U_0 [m/s]
+
+
+class Overlay(NamedTuple):
+    """The estimate of a filter at a step; None where it has none."""
+
+    label: str  # name of the filter in the legend
+    thrust: float | None = None  # [N]
+    thrust_std: float | None = None  # standard deviation [N]
+    omega_m: float | None = None  # [rad/s]
+    omega_m_std: float | None = None  # [rad/s]
+    U_a: float | None = None  # [m/s]
+    U_a_std: float | None = None  # [m/s]
+
 
 __all__ = ["MODES", "Renderer"]
 
@@ -71,9 +100,7 @@ class Renderer(PlantRenderer):
         self._set_up(arguments, Moment._fields, Overlay._fields[1:])
 
     def _make_pictures(self) -> None:
-        from thruster_env.thruster.rendering.charts import thruster_charts
-        from thruster_env.thruster.rendering.gauges import Gauges
-        from thruster_env.thruster.rendering.scene import Scene
+        from thruster_env.thruster.rendering.scene import Gauges, Scene
 
         canvas, given = self._canvas, self._made_with
         scales = {name: given[name] for name in ("thrust_scale", "flow_scale")}
@@ -117,3 +144,21 @@ class Renderer(PlantRenderer):
         moment = moment._replace(**{name: b for name, b in believed.items() if isnan(getattr(moment, name))})
         self._scene.draw(moment, self._angle_of_last_frame, self._angle_of_frame)
         self._gauges.draw(columns, self._charts.draw(columns, count - 1, label)[0])
+
+
+# The thruster's strip charts: thrust, motor speed and flow.
+
+
+TOP = 186  # of the lower half of the picture [px]
+
+
+def thruster_charts(
+    canvas: Canvas, *, dt: float, thrust_scale: float, speed_scale: float, flow_scale: float
+) -> Charts:
+    """Three strip charts; dt is in s, scales are in N, rad/s and m/s. Thrust has a gauge besides."""
+    strips = (
+        Strip("thrust", "thrust [N]", 1, 207, 66, thrust_scale, "measured_thrust", "reference", False),
+        Strip("omega_m", "motor speed [rad/s]", 1, 292, 38, speed_scale),
+        Strip("U_a", "flow [m/s]", 2, 349, 34, flow_scale),
+    )
+    return Charts(canvas, strips, top=TOP, dt=dt)

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.algebra.blocks import forward_quotient
-from filters.algebra.densities import log_density
 from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from filters.algebra.points import root
+from filters.algebra.samples import log_density
 from filters.algebra.scalars import at_most, diagonal, exponential
-from filters.gaussian.extended import advance, settle  # the prediction: x = f(x, u), P = F P F' + Q
-from filters.pages.page_filter import Page, PageFilter
+from filters.gaussian.extended import add_process_noise, propagate
+from filters.pages.page import Page
+from filters.pages.page_filter import PageFilter
 
 
 def update(model, x, P, z):
@@ -62,7 +63,7 @@ class Template(PageFilter):
     """
 
     name: ClassVar[str] = "mckf"
-    page: ClassVar[Page] = Page(advance, settle, update)
+    page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)  # whole numbers that say how often a loop runs
     ranges: ClassVar[dict[str, tuple[float, float]]] = {"bandwidth": (1.0, 20.0)}  # that studies search
     bandwidth: float = 3.0

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from filters.consistency.intervals import slightly
-from thruster_env.core.markdown import table
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import ORACLE
 from tuning.experiments.users.runs import Case, Paired
 from tuning.experiments.users.significance import LEVEL, holm
@@ -81,7 +81,7 @@ def rows_of(cases: Sequence[Case]) -> list[list[str]]:
 def markdown(cases: Sequence[Case]) -> str:
     """The table of a page."""
     rows = [[f"`{row[0]}`" if row[0] else "", f"`{row[1]}`", *row[2:]] for row in rows_of(cases)]
-    return table(header(cases), rows)
+    return markdown_table(header(cases), rows)
 
 
 def sentences(cases: Sequence[Case]) -> list[str]:

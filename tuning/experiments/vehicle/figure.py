@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.plot_styles import TRUTH as TRUTH_LOOK
-from filters.plot_styles import plot_style
+from filters.logs.figure import TRUTH as TRUTH_LOOK
+from filters.logs.figure import plot_style
 from thruster_env.core.checks import at_least
 from thruster_env.core.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from tuning.experiments import ngatini2017, ngatini2019

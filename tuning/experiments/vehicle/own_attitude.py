@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places
+from filters.engine.belief import Kernels, memory_places
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import page_kernels
 from thruster_env.core.compiled import inlined
-from thruster_env.model.layout import constants_reader, number_places
-from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from tuning.experiments.vehicle.pose import next_attitude
 
 KEPT = 5  # roll, pitch and the last p, q, r

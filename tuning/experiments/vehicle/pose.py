@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from thruster_env.auv.kinematics import angle_rates, attitude_of, in_earth_axes, planar_kinematics
+from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes, planar_kinematics
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 

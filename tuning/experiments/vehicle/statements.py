@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from filters import FuzzyKalmanFilter
-from thruster_env.auv.parameters import mass_matrix
+from thruster_env.auv.parameters import PRINTED_INVERSE, mass_matrix
 from thruster_env.auv.presets import SEGOROGENI
-from thruster_env.auv.published import PRINTED_INVERSE
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
 from tuning.experiments.vehicle.experiment import MEASURED_PLACES, PathResult

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.markdown import table
+from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.ways.entries import Result
 from tuning.experiments.ways.problems import GROUPS, Case
 from tuning.experiments.ways.protocol import (
@@ -98,7 +98,7 @@ def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
         proper = _cheapest(some, everywhere, lambda one: _finite(one.log_score), ENOUGH_NATS)
         cells = [[f"`{way}`", _both(some, way), _nees(some, way)] for way in (error, proper)]
         rows.append([situation.text, *cells[0], *cells[1]])
-    return table(heads, rows)
+    return markdown_table(heads, rows)
 
 
 def _cheapest(
@@ -155,7 +155,7 @@ def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> st
     ways = dict.fromkeys(way for column in columns for way in column)
     order = sorted(ways, key=lambda way: _rank(columns, way))
     heads = ["way", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
-    return table(heads, [_row(way, columns) for way in order])
+    return markdown_table(heads, [_row(way, columns) for way in order])
 
 
 def _rank(columns: Sequence[Mapping[str, Regret]], way: str) -> float:
@@ -196,7 +196,7 @@ def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
         if logs and all(logs):
             means = [float(np.mean(some)) for some in logs]
             rows.append((means[-1], [way, str(len(logs[-1])), *(percent(math.exp(one)) for one in means)]))
-    return table(["way", "cases", *found], [row for _, row in sorted(rows, key=lambda one: one[0])])
+    return markdown_table(["way", "cases", *found], [row for _, row in sorted(rows, key=lambda one: one[0])])
 
 
 def ways_table() -> str:
@@ -213,7 +213,7 @@ def ways_table() -> str:
     ]
     sources = [way.source for way in WAYS.values()]
     heads = ["way", "what it does", "truth", "gradient", "use it", "source"]
-    return table(heads, [[*row, source] for row, source in zip(rows, sources, strict=True)])
+    return markdown_table(heads, [[*row, source] for row, source in zip(rows, sources, strict=True)])
 
 
 def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[[], str]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.plot_styles import colour_of
+from filters.logs.figure import colour_of
 from thruster_env.core.plots import DARK, new_figure, save_figure, tidy
 from tuning.policies.comparison.plan import BEST
 from tuning.policies.comparison.runs import Result

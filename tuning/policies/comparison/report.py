@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from thruster_env.core.files import check_target, write_whole
-from thruster_env.core.markdown import table, with_tables
+from thruster_env.core.text_tables import markdown_table, with_tables
 from tuning.policies.comparison.answers import answers
 from tuning.policies.comparison.figures import cost_against_error, learning_curves
 from tuning.policies.comparison.plan import Comparison
@@ -42,7 +42,7 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path, 
     tables: dict[str, Callable[[], str]] = {
         f"policies_{noise}": partial(_noise_table, results, noise, rough) for noise in comparison.noises
     }
-    tables["summary"] = lambda: table(["", *comparison.noises], summary_rows(results))
+    tables["summary"] = lambda: markdown_table(["", *comparison.noises], summary_rows(results))
     tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
     text = page.read_text(encoding="utf-8") if page.is_file() else _new_page(comparison, list(tables))
     curves = learning_curves(results, page.with_name(CURVES))
@@ -52,7 +52,7 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path, 
 
 
 def _noise_table(results: Sequence[Result], noise: str, rough: bool) -> str:
-    return table(HEADER, rows_of(results, noise)) + (f"\n\n{ROUGH}" if rough else "")
+    return markdown_table(HEADER, rows_of(results, noise)) + (f"\n\n{ROUGH}" if rough else "")
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:

@@ -17,8 +17,7 @@ import numpy as np
 
 from thruster_env.core.files import write_whole
 from thruster_env.core.modules import safe_paths
-from thruster_env.core.threads import cores
-from thruster_env.core.torch_threads import one_thread
+from thruster_env.core.threads import cores, one_thread
 from tuning.policies.classical import classical_policy
 from tuning.policies.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from tuning.policies.environments import make_environments

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thruster_env.auv.control.depth_and_course import DepthAndCourse
+from thruster_env.auv.channels import STATES
+from thruster_env.auv.control import DepthAndCourse
+from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from thruster_env.auv.model import MODEL_ARGUMENTS, auv_model
 from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
-from thruster_env.auv.quantities import STATES
-from thruster_env.auv.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
-from thruster_env.env.observe import ObserveState
+from thruster_env.env.commands import ObserveState
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario

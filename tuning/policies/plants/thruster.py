@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.thruster.control.predictive import HORIZONS
+from thruster_env.thruster.control.planning import HORIZONS
 from thruster_env.thruster.env import BowThrusterEnv
 from thruster_env.thruster.model import MODEL_ARGUMENTS, thruster_model
 from thruster_env.thruster.plant import Plant, make_plant

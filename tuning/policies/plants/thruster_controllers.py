@@ -15,7 +15,7 @@ import numpy as np
 
 from thruster_env.core.checks import one_of
 from thruster_env.thruster.control.controllers import LQRController, PIController
-from thruster_env.thruster.control.predictive import HORIZONS, PredictiveController
+from thruster_env.thruster.control.planning import HORIZONS, PredictiveController
 from thruster_env.thruster.dynamics import Constants
 from tuning.policies.controllers import ClassicalPolicy
 from tuning.policies.plants.plant import TrainingReturns

@@ -7,7 +7,7 @@ from filters.logs.estimate import estimate
 from tests.thruster_env.logs.recorders.files import stamped
 from tests.thruster_env.logs.recorders.test_bad_recordings import refused
 from tests.thruster_env.logs.recorders.test_formats import EPOCH
-from thruster_env.logs.recorders import transforms
+from thruster_env.logs.recorders import topics as transforms
 from thruster_env.logs.recorders.registry import contents, fields, read
 from thruster_env.thruster.model import thruster_model
 

@@ -1,1 +1,0 @@
-"""Filters that learn the noise as they go, or distrust measurements that do not fit."""

@@ -1,1 +1,0 @@
-"""Baselines for filters: open loop, low-pass and inversion."""

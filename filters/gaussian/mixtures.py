@@ -1,0 +1,568 @@
+"""Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from math import prod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from filters.algebra.operations import present
+from filters.algebra.points import outer
+from filters.algebra.samples import dot, log_density
+from filters.algebra.scalars import choose, exceeds
+from filters.baselines import place_of
+from filters.engine.belief import Belief, Kernels, memory_places, own_place
+from filters.filter import Filter
+from filters.gaussian import extended
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.sigma_points import checked_corners, memberships, rules_at_corners
+from filters.pages.equations import Equations, PagedModel
+from filters.pages.kernels import (
+    Stage,
+    anything_measured,
+    nothing_to_summarise,
+    page_kernels,
+    prior_start,
+    programs_of,
+    stored,
+    together,
+    works_of,
+)
+from filters.pages.page import RowMemory
+from thruster_env.core.angles import places_of, whole_turns, wrapped
+from thruster_env.core.checks import at_least, one_of, short_repr
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source, lower_pairs
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.shape import Functions, Shape
+
+# A mixture of Gaussians with weights w, each of whose parts is a row of numbers: sums over the parts.
+
+
+class Parts(NamedTuple):
+    """Where the parts of a mixture lie in a row."""
+
+    first: int
+    stride: int  # from one to the next
+    number: int
+
+
+@cache
+def blender(
+    parts: Parts, size: int, x: int, p: int, angles: tuple[bool, ...], *, between: bool = True, wraps: bool = True
+) -> Callable:
+    """Return `blend(row, weights, target)`: mean and covariance of a mixture, which lie from a place on.
+
+    In each part x and P begin at such places; the weights begin at one in the row. Angles of parts are put on one
+    branch (`thruster_env.core.angles`); if it `wraps`, those of the mean lie in (-pi, pi]. Without what lies
+    `between` the parts the covariance is the sum of w_k P_k.
+    """
+    source = Source("blend", "row, weights, target", result=(size, size))
+    mean, cov, d = source.local("m", size), source.local("c", size, size), source.local("d", size)
+    each = f"for k in range({parts.number}):", f"part = {parts.first} + {parts.stride} * k"
+    if not source.loops:
+        source.line(
+            " = ".join([*(mean[i] for i in range(size)), *(cov[i, j] for i, j in lower_pairs(size)), "0.0"])
+        )
+    has_weight = "if row[weights + k] != 0.0:"  # 0 times the square of a part far away may be NaN
+    for _ in source.inside(each[0]):
+        source.line(each[1])
+        for _ in source.inside(has_weight):
+            for i in source.range(size):
+                source.line(f"{mean[i]} += row[weights + k] * row[part + {x + i}]")
+    for _ in source.inside(each[0]):
+        source.line(each[1])
+        source.line("w = row[weights + k]")
+        for _ in source.inside(has_weight):
+            for i in source.range(size if between else 0):
+                source.line(f"{d[i]} = row[part + {x + i}] - {mean[i]}")
+            for i in source.range(size):
+                for j in source.range(i + 1):
+                    apart = f" + {d[i]} * {d[j]}" * between
+                    source.line(f"{cov[i, j]} += w * (row[part + {p + i * size + j}]{apart})")
+    for i in source.range(size):
+        source.line(f"row[target + {i}] = {mean[i]}")
+        for j in source.range(i + 1):
+            source.line(f"row[target + {i * size + j + size}] = row[target + {j * size + i + size}] = {cov[i, j]}")
+    blend = source.function()
+    if not any(angles):
+        return blend
+    align, angle_places = part_aligner(parts, x, angles), places_of(angles)
+
+    @inlined
+    def blend_aligned(row, weights, target):
+        align(row, weights)
+        blend(row, weights, target)
+        if wraps:
+            for i in angle_places:
+                row[target + i] = wrapped(row[target + i])
+
+    return blend_aligned
+
+
+@cache
+def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `align(row, weights)`: put angles of a vector x of all parts on one branch, that of their mean."""
+    (_, stride, count), places = parts, places_of(angles, parts.first + x_place)
+
+    @inlined
+    def align(row, weights):
+        for i in places:
+            s = c = 0.0
+            for k in range(count):
+                s += row[weights + k] * np.sin(row[i + k * stride])
+                c += row[weights + k] * np.cos(row[i + k * stride])
+            middle = np.arctan2(s, c)
+            for k in range(count):
+                row[i + k * stride] -= whole_turns(row[i + k * stride] - middle)
+
+    return align
+
+
+@cache
+def weigher(parts: Parts, level: int) -> Callable:
+    """Return `weigh(row, weights)`: weights after a measurement, by log-likelihoods; the log of their sum.
+
+    It is for weights that each update begins with, none of which is zero.
+    """
+    (_, stride, count), first = parts, parts.first + level
+
+    @inlined
+    def weigh(row, weights):
+        top = -math.inf
+        for k in range(count):
+            top = max(top, row[first + k * stride])
+        total = 0.0
+        for k in range(count):
+            row[weights + k] *= math.exp(row[first + k * stride] - top)
+            total += row[weights + k]
+        for k in range(count):
+            row[weights + k] /= total
+        return top + math.log(total) if total > 0.0 else -math.inf
+
+    return weigh
+
+
+@cache
+def log_weigher(parts: Parts, level: int) -> Callable:
+    """Return `weigh(row, logs, weights)`: the same of weights that are carried on, by their logarithms.
+
+    These lie from `logs` on; a weight of zero, -inf there, stays zero. A weight that is too small for a float64
+    keeps its logarithm, so that its part comes back as soon as measurements speak for it.
+    """
+    (_, stride, count), first = parts, parts.first + level
+
+    @inlined
+    def weigh(row, logs, weights):
+        top = -math.inf
+        for k in range(count):
+            row[logs + k] += row[first + k * stride]
+            top = max(top, row[logs + k])
+        total = 0.0
+        for k in range(count):
+            row[weights + k] = math.exp(row[logs + k] - top)
+            total += row[weights + k]
+        log_total = top + math.log(total) if total > 0.0 else -math.inf
+        for k in range(count):
+            row[weights + k] /= total
+            row[logs + k] -= log_total
+        return log_total
+
+    return weigh
+
+
+@inlined
+def logarithm(weight):
+    """The logarithm of a weight, -inf of zero."""
+    return math.log(weight) if weight > 0.0 else -math.inf
+
+
+def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means (number, n), covariances (number, n, n) and weights, or their logarithms, of a belief's parts."""
+    parts, weights = np.split(extras, [-number])
+    means, covs, _ = np.split(parts.reshape(number, -1), [n, n + n * n], axis=1)
+    return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()
+
+
+@inlined
+def nothing(memory, given, numbers):
+    """What comes before the first of several functions."""
+
+
+# Filters that run a page on each part of a mixture, as kernels of the engine.
+
+
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
+
+
+class MixturePage(NamedTuple):
+    """What a filter does with the parts of a mixture; `own` is what a part has by itself.
+
+    With `predict` each part is predicted, and its weight is what the belief before says. Without it the belief is
+    predicted, by the extended filter, and an update splits it and multiplies the weights by likelihoods.
+    """
+
+    represent: (
+        Callable  # represent(model, x, P), of the belief: the weights of all parts, and what else they share
+    )
+    update: Callable  # update(model, own, *shared, x, P, z), of a part
+    predict: Callable | None = None  # predict(model, own, *shared, x, P, u), of a part
+    afresh: bool = True  # whether parts then begin with the belief, and not with what they were
+    between: bool = True  # whether what lies between the parts counts in the covariance
+    fixed: tuple[tuple[str, Any], ...] = ()  # what stands in `model.own` besides parameters
+
+
+@lru_cache(maxsize=64)
+def mixture_kernels(
+    page: MixturePage, functions: Functions, shape: Shape, parameters: Shapes, count: int, own: tuple[int, ...]
+) -> Kernels:
+    """Kernels for `count` parts, each with numbers of its own in the shape `own`, behind the parameters of all.
+
+    Extras: mean, covariance, innovation, its covariance and log-likelihood of each part; then the weights.
+    """
+    n, m, places, prior = shape.n, shape.m, memory_places(shape.n, shape.m), prior_start(shape)
+    belief, length, wide = n + n * n, prod(own), max(shape.inputs, m)
+    level = belief + m + m * m
+    parts = Parts(places.extras, level + 1, count)
+    first, stride, _ = parts
+    weights = first + count * stride
+    given = weights + count  # u or z, what a part has of its own, what all share
+    plain = ExtendedKalmanFilter.page._replace(own=parameters, fixed=page.fixed)
+    memory = RowMemory(shape, plain)
+    memory.end = given + wide + length
+    begun = together(page.represent(PagedModel(memory), memory.x, memory.P))
+    shared = [memory.another(one) for one in begun[1:]]
+    told = (places.innovation, m), (places.innovation_cov, m, m)
+    v, S = (memory.read("rows", *one) for one in told)
+    begin, density = works_of(
+        stored(begun, (weights, *shared)),
+        stored((log_density(v, S, present(memory.z)),), (places.log_likelihood,)),
+    )
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        x, P = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
+        u, z, of_part = memory.u, memory.z, [memory.read("given", wide, *own)]
+        of_part += [memory.read("given", one.operation.at - given, *one.shape) for one in shared]
+        moved = page.predict(model, *of_part, x, P, u) if page.predict else ()
+        found, told = page.update(model, *of_part, x, P, z), (x, P, belief, belief + m, level)
+        return [stored(moved, (x, P)[: len(moved)]), stored(found, told[: len(found)])]
+
+    predict_part, update_part = programs_of(plain, functions, shape, stages).works
+    of_states = blender(parts, n, 0, n, shape.state_angles, between=page.between)
+    of_innovations = blender(
+        *(parts, m, belief, belief + m, shape.measurement_angles), between=page.between, wraps=False
+    )
+    weigh, of_belief = weigher(parts, level), page_kernels(ExtendedKalmanFilter.page, functions, shape)
+    step_place, innovation_place, likelihood_place = places.step, places.innovation, places.log_likelihood
+    own_first, end, afresh = own_place(shape) + plain.own_size, memory.end, page.afresh
+
+    @inlined
+    def begin_afresh(row):
+        for k in range(count):
+            for i in range(belief):
+                row[first + k * stride + i] = row[i]
+
+    def each(work: Callable) -> Callable:
+        @inlined
+        def run(row, values, numbers):
+            for i in range(values.shape[0]):
+                row[given + i] = values[i]
+            for k in range(count):
+                for i in range(length):
+                    row[given + wide + i] = numbers[own_first + k * length + i]
+                work(row[first + k * stride : first + (k + 1) * stride], row[given:end], numbers)
+
+        return run
+
+    predict_each, update_each = each(predict_part), each(update_part)
+
+    @inlined
+    def start(memory, numbers, size):
+        row, _, _ = memory
+        prior(memory, numbers, size)
+        for i in range(first, end):
+            row[i] = 0.0
+
+    @inlined
+    def start_parts(memory, numbers, size):
+        start(memory, numbers, size)
+        begin_afresh(memory[0])
+        begin(memory[0], memory[0], numbers)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        begin(row, u, numbers)
+        if afresh:
+            begin_afresh(row)
+        predict_each(row, u, numbers)
+        of_states(row, weights, 0)
+        row[step_place] += 1.0
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        update_each(row, z, numbers)
+        of_innovations(row, weights, innovation_place)
+        density(row, z, numbers)
+        of_states(row, weights, 0)
+
+    @inlined
+    def split_and_update(memory, z, numbers, size):
+        row, _, _ = memory
+        begin(row, z, numbers)
+        begin_afresh(row)
+        update_each(row, z, numbers)
+        of_innovations(row, weights, innovation_place)
+        row[likelihood_place] = 0.0
+        if anything_measured(z):
+            row[likelihood_place] = weigh(row, weights)
+            of_states(row, weights, 0)
+
+    works = (start_parts, predict, update) if page.predict else (start, of_belief.predict, split_and_update)
+    return Kernels(*(n, m, n, 0, *works, nothing_to_summarise), extras=given - first, scratch=end - given)
+
+
+# A filter that runs a page on each part of a mixture: a class with its parameters.
+
+
+__all__ = ["MixtureFilter", "MixturePage"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MixtureFilter(Filter):
+    """Base of filters that have a page for the parts of a mixture.
+
+    Attributes:
+        page: its functions.
+    """
+
+    page: ClassVar[MixturePage]
+
+    @cached_property
+    def parameters(self) -> Mapping[str, Any]:
+        """Numbers and arrays that the page finds in `model.own`."""
+        raise NotImplementedError
+
+    @cached_property
+    def of_parts(self) -> np.ndarray:
+        """What each part has of its own, (parts,) or (parts, length)."""
+        raise NotImplementedError
+
+    @property
+    def written_page(self) -> MixturePage:
+        """The page, with what the fields say of it."""
+        return self.page
+
+    @cached_property
+    def own_parameters(self) -> tuple[float, ...]:
+        """The parameters, then what each part has of its own."""
+        arrays = *self.parameters.values(), self.of_parts
+        return tuple(float(number) for one in arrays for number in np.ravel(one))
+
+    def kernels(self) -> Kernels:
+        """Kernels of the page for the model's functions; see `Filter.kernels`."""
+        model, shapes = self.kernel_model, tuple((name, np.shape(one)) for name, one in self.parameters.items())
+        count, *own = np.shape(self.of_parts)
+        return mixture_kernels(self.written_page, model.functions, model.shape, shapes, count, tuple(own))
+
+    def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means (parts, n), covariances (parts, n, n) and weights (parts,) of the parts of a belief."""
+        return parts_of(belief.extras, len(self.of_parts), self.model.n)
+
+
+# A Gaussian sum filter: each update splits the belief, so that it may have several modes, and merges it again.
+
+
+FEWEST_PARTS, MOST_PARTS = 7, 1000
+REACH = 4.5  # of the outermost parts, in standard deviations of the split component
+OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
+
+
+def split(model, x, P):
+    """Weights of the parts before a measurement, and the direction g = P e/sqrt(e' P e) of the split."""
+    e = model.own.unit
+    variance = dot(e, P @ e)
+    return model.own.weights, P @ e * choose(exceeds(variance, 0.0), variance**-0.5, variance * 0.0)
+
+
+def update_gaussian_sum(model, t, g, x, P, z):
+    """The part at the node t, after the measurement z."""
+    return extended.update(model, x + g * t, P - outer(g, g) * model.own.narrower, z)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GaussianSumFilter(MixtureFilter):
+    """Gaussian sum filter: an extended filter whose belief is a sum of Gaussians within each update.
+
+        predict: the extended filter's
+        split:   along g = P e_i/sqrt(P_ii), the way in which the state goes with its component i, into parts
+                 N(mean + t_k g, P - (1 - s^2) g g') of weight a_k; nodes t_k, weights a_k and s < 1 are those of a
+                 sum of N(t_k, s^2) with mean 0 and variance 1, so that mean and covariance stay the belief's
+        update:  each part by the extended filter, with h and H at its own mean;
+                 its weight becomes a_k N(z; h(x_k), S_k)/L,  L = sum of a_k N(z; h(x_k), S_k)
+        merge:   mean and P of the weighted parts: P within the parts and between them
+
+    A measurement may thus have several solutions in component i; one linearisation at the mean finds only one. The
+    log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine model
+    this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than a
+    Gaussian.
+
+    `Belief.extras` holds what the last update made of each part: mean, covariance, innovation, its covariance and
+    its log-likelihood; then the weights. `part_estimates` takes it apart.
+
+    Attributes:
+        parts: number of Gaussians, at least 7.
+        component: index i of the component along which the belief is split; -1 is the last.
+
+    Raises:
+        ValueError: if parts or component is out of its range.
+
+    Source: Alspach, Sorenson (1972), "Nonlinear Bayesian estimation using Gaussian sum approximations"; splitting
+    along one direction: Faubel, McDonough, Klakow (2009), "The split and merge unscented Gaussian mixture filter".
+    """
+
+    name: ClassVar[str] = "gsf"
+    page: ClassVar[MixturePage] = MixturePage(split, update_gaussian_sum)
+    gaussian_likelihood: ClassVar[bool] = False
+    parts: int = 15
+    component: int = -1
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
+        object.__setattr__(self, "component", place_of("component", self.component, self.model.n))
+
+    @cached_property
+    def standard_split(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Nodes t (parts,), weights a (parts,) and variance s^2 of a sum of Gaussians like N(0, 1)."""
+        nodes = np.linspace(-REACH, REACH, self.parts)
+        variance = (OVERLAP * (nodes[1] - nodes[0])) ** 2
+        weights = np.exp(-0.5 * nodes**2)
+        weights /= weights.sum()
+        return nodes * np.sqrt((1.0 - variance) / (weights @ nodes**2)), weights, float(variance)
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """The unit vector of the component, 1 - s^2, and the weights."""
+        _, weights, variance = self.standard_split
+        return {"unit": np.eye(self.model.n)[self.component], "narrower": 1.0 - variance, "weights": weights}
+
+    @cached_property
+    def of_parts(self) -> np.ndarray:
+        """The nodes."""
+        return self.standard_split[0]
+
+
+# The Takagi-Sugeno fuzzy Kalman filter: one Kalman filter a rule, blended by memberships of the state.
+
+
+BLENDINGS = ("weights", "moments", "output")
+
+
+def initial_weights(model, x, P):
+    """Weights of the rules, at the last estimate."""
+    return memberships(x, model.own.low, model.own.high, model.own.premises)
+
+
+def predict_fuzzy(model, c, x, P, u):
+    """The Kalman filter of a rule, whose affine model has the constants c."""
+    return extended.add_process_noise(model, *extended.propagate(model.at(c), x, P, u))
+
+
+def update_fuzzy(model, c, x, P, z):
+    """The measurement z, by a rule."""
+    return extended.update(model.at(c), x, P, z)[:-1]  # memberships, not likelihoods, are the weights
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuzzyKalmanFilter(MixtureFilter):
+    """Takagi-Sugeno fuzzy Kalman filter: 2^k Kalman filters, one for each corner of the range of k states.
+
+        rule r:  if each of these states is low or high, as the bits of r say, then x' = A_r x + B_r u + a_r + w,
+                 z = C_r x + d_r + v: the model linearised at that corner, Q and R the model's
+        w_r:     product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i), each within
+                 0 and 1, of the last estimate x (`rules.memberships`)
+        predict: mean_r = A_r mean + B_r u + a_r,  P_r = A_r P A_r' + Q, from the common mean and P
+        update:  the Kalman filter's of each rule, from its mean_r and P_r, with a gain of its own (Joseph's form)
+        blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r: the belief after each of the two
+
+    `blending` "weights" is this, the recursion of the sources. It ignores the differences between the rules'
+    means, so P is too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'):
+    the first-order generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models'
+    probabilities. "output" has autonomous filters: each rule continues from its own mean_r and P_r, which are
+    blended, by moments, for output only. Innovation and S are blended as mean and P are. With equal rules, as an
+    affine model has them, all three are the Kalman filter.
+
+    A blend of linearisations at the corners approximates a model only if the range is narrow: on the thruster the
+    extended filter, which linearises at the estimate, is far better. `rule_estimates` takes a belief apart.
+
+    Attributes:
+        low: the smallest states (n,); the model's `state_low` if None.
+        high: the largest states (n,); the model's `state_high` if None.
+        blending: "weights", "moments" or "output", see above.
+        premises: indices of the states that the rules depend on, at most 8; if None, all of up to 8 states, or the
+            first state of a larger affine model. Rules are linearised at the middle of the range of other states.
+        offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
+
+    Raises:
+        ValueError: if the range of the states is unknown or empty, or a choice is not one of those above.
+
+    Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
+    autonomous underwater vehicle", Expert Systems with Applications 68, for the recursion and the memberships of
+    minima and maxima (whose names are exchanged in the authors' slides); Takagi, Sugeno (1985), "Fuzzy
+    identification of systems and its applications to modeling and control", for the rules; Simon (2003), "Kalman
+    filtering for fuzzy discrete time dynamic systems", for filters by rule; Bar-Shalom, Li, Kirubarajan (2001),
+    Estimation with Applications to Tracking and Navigation, section 11.6, for GPB1 and autonomous filters.
+    """
+
+    name: ClassVar[str] = "fuzzy"
+    page: ClassVar[MixturePage] = MixturePage(initial_weights, update_fuzzy, predict_fuzzy)
+    one_model: ClassVar[bool] = False
+    any_step: ClassVar[bool] = False
+    low: Any = None
+    high: Any = None
+    blending: str = "weights"
+    offsets: bool = True
+    premises: Any = None
+    rule_estimates = MixtureFilter.part_estimates
+
+    def __post_init__(self):
+        """Check the range and the choices; raise ValueError that states the rule and the value."""
+        one_of("blending", self.blending, BLENDINGS)
+        if not isinstance(self.offsets, bool):
+            raise ValueError(f"offsets must be True or False, but got {short_repr(self.offsets)}")
+        for name, value in checked_corners(self.model, self.low, self.high, self.premises).items():
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def rules(self) -> tuple[AffineModel, ...]:
+        """The affine model of each rule."""
+        return rules_at_corners(self.model, self.low, self.high, self.premises, self.offsets)
+
+    @property
+    def kernel_model(self) -> AffineModel:
+        """The model of the first rule; all have its noise and prior."""
+        return self.rules[0]
+
+    @property
+    def written_page(self) -> MixturePage:
+        """The page of the blending."""
+        afresh = self.blending != "output"  # each step begins with the common mean and P
+        between = self.blending != "weights"  # differences between the rules' means count in P
+        return self.page._replace(afresh=afresh, between=between, fixed=(("premises", self.premises),))
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """The range."""
+        return {"low": self.low, "high": self.high}
+
+    @cached_property
+    def of_parts(self) -> np.ndarray:
+        """The constants of the rules' models."""
+        return np.array([rule.constants for rule in self.rules])

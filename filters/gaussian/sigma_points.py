@@ -1,0 +1,320 @@
+"""Sigma-point filters: unscented, its square-root form, and cubature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from filters.algebra.blocks import hstack, part, triangle, vstack, zeros
+from filters.algebra.matrices import operation
+from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from filters.algebra.points import first, on_circle, ones, others, outer, root, square, units
+from filters.algebra.samples import log_density
+from filters.baselines import place_of
+from filters.gaussian.forms import initial_root, root_result
+from filters.pages.page import Page
+from filters.pages.page_filter import PageFilter
+from thruster_env.core.checks import finite, one_of, positive, short_repr, vector
+from thruster_env.graphs.graphs import where
+from thruster_env.model.affine import AffineModel, linearize
+from thruster_env.model.state_space import StateSpaceModel
+
+# Sigma points of the scaled unscented transform, how they move, and moments of values at them.
+
+
+def unscented_points(model, x, L):
+    """The mean, and the points around it."""
+    return outer(x, ones(units(x))) + (L * model.own.spread) @ units(x)
+
+
+def unscented_moments(model, Y, angles):
+    """Mean and shift of values at the points, and their deviations."""
+    D = wrap(others(Y) - outer(first(Y), ones(others(Y))), angles)
+    s = (D @ ones(D)) * model.own.weight
+    return first(Y) + s, s, D
+
+
+def scatter(model, D, s):
+    """The covariance of such deviations."""
+    return square(D) * model.own.weight + outer(s, s) * model.own.shift_weight
+
+
+def propagate_points(model, X, u):
+    """One of the model's substeps, of each point."""
+    return model.f(X, u)
+
+
+# The square-root form of the unscented filter: P, S and the gain follow from one triangle (`square_root`).
+
+
+def represent_unscented_root(model, x, P):
+    """The points of a belief, by the root that is kept."""
+    return unscented_points(model, x, model.extras["L"])
+
+
+def deviations(model, D, s):
+    """A matrix A with A A' = scatter(D, s)."""
+    return hstack(D * model.own.weight_root, outer(s * model.own.shift_root, ones(part(D, 0, 0, len(s), 1))))
+
+
+def add_process_noise_unscented_root(model, X):
+    """The end of a step."""
+    x, s, D = unscented_moments(model, X, model.state_angles)
+    L = triangle(hstack(deviations(model, D, s), model.Q_root))
+    return wrap(x, model.state_angles), square(L), {"L": L}
+
+
+def update_unscented_root(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    n, m, seen, L = len(x), len(z), present(z), model.extras["L"]
+    y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
+    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - y, model.measurement_angles))
+    of_x = (L * model.own.spread) @ others(units(x)) * model.own.weight_root
+    both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
+    return root_result(model, x, triangle(both), v, seen)
+
+
+UNSCENTED_ROOT = Page(
+    propagate_points,
+    add_process_noise_unscented_root,
+    update_unscented_root,
+    represent_unscented_root,
+    initial_root,
+)
+
+
+# The unscented Kalman filter: moments from the model's values at a few points, without Jacobians.
+
+
+def represent_unscented(model, x, P):
+    """The points of a belief."""
+    return unscented_points(model, x, root(P))
+
+
+def add_process_noise_unscented(model, X):
+    """The end of a step."""
+    x, s, D = unscented_moments(model, X, model.state_angles)
+    return wrap(x, model.state_angles), scatter(model, D, s) + model.Q
+
+
+def update_unscented(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    g, w = model.own.spread, model.own.weight
+    L, U, seen = root(P), others(units(x)), present(z)
+    y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
+    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - y, model.measurement_angles))
+    C = (L @ (U @ D.T)) * (w * g)
+    S = scatter(model, D, s) + R
+    K = divide(C, S)
+    rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
+    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnscentedKalmanFilter(PageFilter):
+    """Unscented Kalman filter with the scaled transform and additive noise.
+
+        points:  X = x 1' + g L U,  L L' = P,  U = [0, I, -I],  g = alpha sqrt(n + kappa)
+        moments: of values Y, with D = [y_i - y_0], i = 1 ... 2n, w = 1/(2 g^2) and b = beta - alpha^2:
+                 s = w D 1,  mean y_0 + s,  cov w D D' + b s s'
+        predict: x, P = mean(f(X, u)), cov(f(X, u)) + Q
+        update:  points again, from the predicted x and P;  v = z - mean(h(X)),  S = cov(h(X)) + R,
+                 K = w g L U h(X)' S^-1,  x += K v,
+                 P = w (g L U - K D) (g L U - K D)' + b K s (K s)' + K R K'
+
+    These are the moments of the usual weights, W_0 = 1 - n/g^2 for the mean, W_0 + 1 - alpha^2 + beta for the
+    covariance and W_i = w, with the point in the centre taken out of the sums: a negative weight, which alpha
+    below one gives the centre, is then in none of them. The last line equals P - K S K' and is for points what
+    Joseph's form is for matrices. Every covariance is symmetric by construction, and positive as long as
+    alpha^2 kappa + beta n is not negative, which is checked.
+
+    Attributes:
+        alpha: distance of the points; 1 puts them sqrt(n + kappa) standard deviations from the mean, where the
+            nonlinearity of f and h shows. With the common 0.001 the filter is hardly more than an extended one.
+        beta: prior knowledge of the distribution beyond its moments; 2 is best for Gaussian ones.
+        kappa: moves the points further out and gives the centre a larger weight; above -n.
+        form: "covariance" as above, or "square-root", which carries L and keeps twice the digits of P; beta must
+            then be at least alpha^2. The estimates are equal to rounding.
+
+    Raises:
+        ValueError: if alpha or n + kappa is not positive, alpha^2 kappa + beta n is negative, or the
+            form is unknown or does not go with beta.
+
+    Source: Julier (2002), "The scaled unscented transformation"; Wan, van der Merwe (2000), "The unscented Kalman
+    filter for nonlinear estimation"; for the square-root form van der Merwe, Wan (2001), "The square-root
+    unscented Kalman filter for state and parameter-estimation".
+    """
+
+    name: ClassVar[str] = "ukf"
+    page: ClassVar[Page] = Page(
+        propagate_points, add_process_noise_unscented, update_unscented, represent_unscented
+    )
+    forms: ClassVar[Mapping[str, Page]] = {"square-root": UNSCENTED_ROOT}
+    alpha: float = 1.0
+    beta: float = 2.0
+    kappa: float = 0.0
+    form: str = "covariance"
+
+    def __post_init__(self):
+        """Check the parameters; raise ValueError that states the rule and the value."""
+        n = self.model.n
+        alpha, beta, kappa = positive("alpha", self.alpha), finite("beta", self.beta), finite("kappa", self.kappa)
+        if n + kappa <= 0:
+            raise ValueError(f"kappa must be above minus the number of states, {-n}, but got {kappa}")
+        if alpha**2 * kappa + beta * n < 0:
+            rule = "alpha^2 kappa + beta n must not be negative, or covariances could be"
+            raise ValueError(f"{rule}, but got alpha={alpha}, beta={beta}, kappa={kappa} for n = {n} states")
+        if one_of("form", self.form, self.known_forms) == "square-root" and beta < alpha**2:
+            rule = "beta of the square-root form must be at least alpha^2"
+            raise ValueError(f"{rule}, {alpha**2:g}, but got {beta}")
+        for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Where the points lie, and their weights."""
+        square, curvature = self.alpha**2 * (self.model.n + self.kappa), self.beta - self.alpha**2
+        found = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": curvature}
+        if self.form == "covariance":
+            return found
+        return found | {"weight_root": found["weight"] ** 0.5, "shift_root": curvature**0.5}
+
+
+# The cubature Kalman filter: moments by the third-degree spherical-radial rule, with equal weights.
+
+
+def represent_cubature(model, x, P):
+    """The points of a belief."""
+    return cubature_points(model, x, root(P))
+
+
+def cubature_points(model, x, L):
+    """The points around the mean."""
+    return outer(x, ones(others(units(x)))) + (L * model.own.spread) @ others(units(x))
+
+
+def cubature_moments(model, Y, angles):
+    """Mean of values at the points, and their deviations; angles first come to one side of their mean."""
+    Y = on_circle(Y, angles)
+    y = (Y @ ones(Y)) * model.own.weight
+    return y, Y - outer(y, ones(Y))
+
+
+def add_process_noise_cubature(model, X):
+    """The end of a step."""
+    x, D = cubature_moments(model, X, model.state_angles)
+    return wrap(x, model.state_angles), square(D) * model.own.weight + model.Q
+
+
+def update_cubature(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    (g, w), L, U, seen = model.own, root(P), others(units(x)), present(z)
+    y, D = cubature_moments(model, model.h(cubature_points(model, x, L)), model.measurement_angles)
+    D, R = only(seen, D), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - y, model.measurement_angles))
+    C = (L @ (U @ D.T)) * (w * g)
+    S = square(D) * w + R
+    K = divide(C, S)
+    rest = square((L * g) @ U - K @ D) * w + sym(K @ R @ K.T)
+    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CubatureKalmanFilter(PageFilter):
+    """Cubature Kalman filter with additive noise.
+
+        points:  X = x 1' + g L U,  L L' = P,  U = [I, -I],  g = sqrt(n): x + sqrt(n) L_i and x - sqrt(n) L_i
+        moments: of values Y, with w = 1/(2n):  mean y = w Y 1,  D = Y - y 1',  cov w D D'
+        predict: x, P = mean(f(X, u)), cov(f(X, u)) + Q
+        update:  points again, from the predicted x and P;  v = z - mean(h(X)),  S = cov(h(X)) + R,
+                 K = w g L U D' S^-1,  x += K v,  P = w (g L U - K D) (g L U - K D)' + K R K'
+
+    The last line equals P - K S K'; sums of squares, all covariances are symmetric and positive by construction.
+    The rule is exact for cubic f and h. It has no parameters: it gives the moments of an unscented filter with
+    alpha = 1 and beta = kappa = 0, and does not ask for f and h at the mean itself.
+
+    Source: Arasaratnam, Haykin (2009), "Cubature Kalman filters", IEEE Trans. Automatic Control 54(6), section IV.
+    """
+
+    name: ClassVar[str] = "ckf"
+    page: ClassVar[Page] = Page(propagate_points, add_process_noise_cubature, update_cubature, represent_cubature)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Where the points lie, and their weight."""
+        n = self.model.n
+        return {"spread": n**0.5, "weight": 0.5 / n}
+
+
+# Rules of a fuzzy filter: a model's affine approximations at the corners of a range of its states.
+
+
+MOST_STATES = 8  # that rules ask for: 256 rules
+
+
+@operation(lambda x, low, high, premises: (2 ** len(premises),))
+def memberships(x, low, high, premises):
+    """Of a state in all rules: products of how low or high it is in each premise, as the bits of the rule say."""
+    w = np.ones(1)
+    for i in premises:
+        part = (x[i] - low[i]) / (high[i] - low[i])
+        of_high = where(part < 0.0, 0.0, where(part > 1.0, 1.0, part))
+        w = np.concatenate([w * (1.0 - of_high), w * of_high])
+    return w
+
+
+def rules_at_corners(
+    model: StateSpaceModel, low: np.ndarray, high: np.ndarray, premises: tuple[int, ...], offsets: bool
+) -> tuple[AffineModel, ...]:
+    """The affine model of each rule, whose bits say where it is linearised: low, or high, in each premise."""
+    control = np.zeros(model.inputs) if model.operating_input is None else model.operating_input
+    rules, before = [], model.n * (model.n + model.inputs)
+    for rule in range(2 ** len(premises)):
+        corner = (low + high) / 2
+        for bit, i in enumerate(premises):
+            corner[i] = (high if rule >> bit & 1 else low)[i]
+        found = linearize(model, corner, control)
+        c = found.constants  # of which the state's offset may be left out
+        without = c[:before] + (0.0,) * model.n + c[before + model.n :]
+        rules.append(found if offsets else found.replace(constants=without))
+    return tuple(rules)
+
+
+def checked_corners(model: StateSpaceModel, low: Any, high: Any, premises: Any) -> dict[str, Any]:
+    """The range of the states and the places of those that rules ask for; ValueError if there are none."""
+    places = _checked_premises(model, premises)
+    low, high = model.state_low if low is None else low, model.state_high if high is None else high
+    if isinstance(model, AffineModel):  # its rules are all alike, whatever the range
+        low = model.prior_mean - model.scales if low is None else low
+        high = model.prior_mean + model.scales if high is None else high
+    if low is None or high is None:
+        raise ValueError(
+            "a fuzzy filter must know the range of the states, but got neither low and high nor "
+            "a model with state_low and state_high"
+        )
+    low, high = vector("low", low, model.n), vector("high", high, model.n)
+    if not (low < high).all():
+        raise ValueError(
+            f"low must be below high in every state, but got {short_repr(low)} and {short_repr(high)}"
+        )
+    return {"premises": places, "low": low, "high": high}
+
+
+def _checked_premises(model: StateSpaceModel, given: Any) -> tuple[int, ...]:
+    """Places of the states that rules ask for, all if None."""
+    n, told = model.n, f"all {model.n} states" if given is None else short_repr(given)
+    if given is None:
+        given = (0,) if n > MOST_STATES and isinstance(model, AffineModel) else range(n)  # all rules are alike
+    try:
+        places = tuple(place_of("premises", place, n) for place in given)
+    except TypeError:
+        places = ()
+    if not 1 <= len(places) <= MOST_STATES or len(set(places)) < len(places):
+        rule = f"premises must name 1 to {MOST_STATES} different states, for there is a rule for each corner"
+        raise ValueError(f"{rule} of their range, but got {told}")
+    return places

@@ -1,1 +1,0 @@
-"""Classical controllers of the vehicle."""

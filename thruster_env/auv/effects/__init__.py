@@ -1,1 +1,0 @@
-"""Disturbances of the vehicle: sensor effects and the current."""
