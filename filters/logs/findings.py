@@ -154,10 +154,10 @@ def verdict(found: LogEstimate, told: LogFindings) -> list[str]:
     elif told.mean_nis < low:
         some = "The innovations are smaller than the filter expects: its Q or R is too large."
     if told.whiteness is not None and told.whiteness.p_value < ALPHA:
-        some += " They are not white: the filter could have known some of them."
+        some += " They are not white: a better model could predict a part of them."
     if spoilt:
         kinds = list(dict.fromkeys(one.kind for one in spoilt))
-        some += f" But this is with what was found in the log ({', '.join(kinds)}): mend that first."
+        some += f" First mend what was found in the log ({', '.join(kinds)}): it spoils these numbers."
     return [*said, some]
 
 
@@ -256,7 +256,8 @@ def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray
     others = list(dict.fromkeys(alarm.test for alarm in some if alarm is not one))
     if not others:
         return found
-    return f"{found}; {len(some) - 1} more until {at[2]} s ({', '.join(others)})"
+    more = len(some) - 1
+    return f"{found}; {more} more alarm{'s' * (more > 1)} until {at[2]} s ({', '.join(others)})"
 
 
 # An estimate of a log as columns of a file.

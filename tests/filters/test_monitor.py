@@ -237,12 +237,12 @@ def test_episodes_are_told_in_words():
     alarms = [Alarm("cusum", 0, 30, 20, 0.5), Alarm("glr", 0, 40, 21, 0.6), Alarm("outlier", 0, 95, 95, -4.0)]
     first, second = episodes(alarms, 50)
     assert episode_sentence(first, thrust, times) == (
-        "T: a bias of +0.5 N since 2 s, found at 3 s (cusum); 1 more until 4 s (glr)"
+        "T: a bias of +0.5 N since 2 s, found at 3 s (cusum); 1 more alarm until 4 s (glr)"
     )
     assert episode_sentence(second, thrust, times) == "T: an outlier -4 N off at 9.5 s (outlier)"
     dead = [Alarm("outlier", 0, 30, 30, 0.5), Alarm("stuck", 0, 38, 29, 10.0), Alarm("glr", 0, 40, 31, 0.6)]
     assert episode_sentence(dead, thrust, times) == (
-        "T: equal readings since 2.9 s, found at 3.8 s (stuck); 2 more until 4 s (outlier, glr)"
+        "T: equal readings since 2.9 s, found at 3.8 s (stuck); 2 more alarms until 4 s (outlier, glr)"
     )
 
 

@@ -103,7 +103,7 @@ def test_a_value_whose_interval_holds_zero_is_not_determined():
     found = identify(recorded(8, 150, offset=0.0), pendulum, FREE, starts=1)
     inside = abs(found.values["offset"]) < 1.96 * found.standard_errors["offset"]
     assert inside and not found.determined["offset"]
-    assert "The data do not distinguish offset from zero: it lies in a 95 % interval." in found.sentences()
+    assert "The data do not distinguish offset from zero, which lies in a 95 % interval." in found.sentences()
 
 
 @pytest.mark.parametrize("gate", [2.0, 2.5, 3.0, 4.0])

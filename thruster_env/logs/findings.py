@@ -109,7 +109,7 @@ def sentences(findings: Sequence[Finding]) -> list[str]:
             said += [f"{one.sentence}." for one in some]
             continue
         longest = max(some, key=lambda one: one.count)
-        more = f"; so in {len(some)} places, {sum(one.count for one in some)} rows in all"
+        more = f" (the longest of {len(some)}, {sum(one.count for one in some)} rows in all)"
         said.append(f"{longest.sentence}{more}.")
     return said
 
@@ -133,7 +133,8 @@ def remarks_on(logs: Sequence[Log]) -> list[str]:
         longest = max(some, key=lambda one: one.count)
         places = sum(map(len, of_logs.values()))
         rows = sum(one.count for found in of_logs.values() for one in found)
-        said.append(f"{name}: {longest.sentence}; so in {len(of_logs)} logs, {places} places, {rows} rows in all.")
+        more = f"the longest of {places} in {len(of_logs)} logs, {rows} rows in all"
+        said.append(f"{name}: {longest.sentence} ({more}).")
     return said
 
 

@@ -160,7 +160,7 @@ def _report(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
         rows.insert(1, ["whiteness, p-value", f"{white.p_value:.3g}", f"above {ALPHA:g}"])
     shown: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
     columns = ["", "RMSE", "bias", "rows"]
-    shown.append(table("One step ahead, prediction less measurement", columns, list(map(_row, told.predictions))))
+    shown.append(table("One-step prediction less measurement", columns, list(map(_row, told.predictions))))
     if told.references:
         what = "Smoother" if found.smoothed else "Estimate"
         shown.append(table(f"{what} less reference, not seen", columns, list(map(_row, told.references))))

@@ -38,7 +38,7 @@ def report(
     title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
     shown = [table(title, ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"], rows)]
     where = (
-        f"Validation on {', '.join(log.name for log in proving)}"
+        f"Validation on {'; '.join(log.name for log in proving)}"
         if proving
         else "On the runs used for identification"
     )

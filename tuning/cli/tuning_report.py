@@ -341,10 +341,12 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
     ends, without = {row.size: row.ratio.high for row in result.sizes}, left_out(result.sizes, kept)
     among = ""
     if without:
-        some = f"N = {', '.join(map(str, without))}"
-        among = f" among those whose mean NIS is in its band (that of {some} is not)"
+        among = f", where N = {', '.join(map(str, without))} is left out: the mean NIS is outside its band"
     if gave_way(result):
-        return f"N = {kept} is the larger of the rule of thumb's and the smallest sufficient one{among}."
+        return (
+            f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}, but at least that of "
+            f"the rule of thumb{among}."
+        )
     if ends[kept] < 1 + SIZE_TOLERANCE:
         return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
     return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."

@@ -156,10 +156,10 @@ class Identification(NamedTuple):
         if not ends and not loose:
             said.append("The data determine every free parameter.")
         if wide:
-            rule = "a 95 % interval takes half the range, or a factor of ten"
+            rule = "a 95 % interval is as wide as a factor of ten, or as half the range"
             said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
         if zero:
-            said.append(f"The data do not distinguish {', '.join(zero)} from zero: it lies in a 95 % interval.")
+            said.append(f"The data do not distinguish {', '.join(zero)} from zero, which lies in a 95 % interval.")
         said += self._end_sentences() + self._needless()
         for one, other, correlation in self.traded:
             said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
@@ -167,7 +167,7 @@ class Identification(NamedTuple):
             parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.least_determined.items())
             said.append(f"Least determined is a change of several together (as fractions of the ranges): {parts}.")
         if len(self.optima) > 1:
-            said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
+            said.append(f"{self.agreement} of {len(self.optima)} starts reached this maximum.")
         if self.begun_elsewhere:
             said.append(self._starts_sentence())
         if self.left_out:

@@ -124,7 +124,7 @@ def known_table(found: Identifiability) -> Table:
         [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
         for name, tuned, best, factor, known in zip(*columns, strict=True)
     ]
-    header = ["", "tuned", "most likely", "known within a factor of", "determined"]
+    header = ["", "tuned", "maximum likelihood", "known within a factor of", "determined"]
     return Table(
         "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
     )

@@ -146,12 +146,12 @@ def test_many_of_one_kind_are_one_sentence():
     kept = np.concatenate([np.arange(start, start + 180 - 5 * (start // 200)) for start in range(0, 2000, 200)])
     _, log = found({name: values[kept] for name, values in table.items()})
     (said,) = sentences(log.findings)
-    assert len(log.pieces) == 10 and "; so in 9 places, " in said
+    assert len(log.pieces) == 10 and " (the longest of 9, " in said
     assert remarks_on([log, log]) == [f"a table: {said}"]
     (both,) = remarks_on([log, replace(log, name="another")])
     rows = sum(one.count for one in log.findings)
     assert both.startswith("a table: a gap: ") and both.endswith(
-        f"; so in 2 logs, 18 places, {2 * rows} rows in all."
+        f" (the longest of 18 in 2 logs, {2 * rows} rows in all)."
     )
 
 

@@ -74,7 +74,10 @@ def test_a_log_is_shown_with_what_was_found(folder, thruster, as_json):  # noqa:
 def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json):  # noqa: F811
     data = as_json("estimate", "stuck.csv", *MODEL)
     assert data["findings"][0]["kind"] == "stuck"
-    assert "mend that first" in data["sentences"][-1] and "is stuck at" in data["sentences"][0]
+    assert (
+        "First mend what was found in the log (stuck)" in data["sentences"][-1]
+        and "is stuck at" in data["sentences"][0]
+    )
     said = " ".join(thruster("estimate", "gap.csv", *MODEL).stdout.split())
     assert "a gap: 40 rows (4 s) are missing" in said and "predicts with the last input held" in said
     clean = as_json("estimate", "whole.csv", *MODEL)
