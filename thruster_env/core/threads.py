@@ -20,7 +20,6 @@ from functools import cache
 from queue import SimpleQueue
 
 import numpy as np
-import torch
 
 from thruster_env.core.checks import one_of
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, overloaded
@@ -34,6 +33,8 @@ def one_thread() -> Iterator[None]:
 
     Several wait for one another a dozen times a step, which takes most of the time if the cores are busy.
     """
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

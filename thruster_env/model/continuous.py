@@ -11,7 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
 
 from thruster_env.core.checks import (
     ROUNDING,
@@ -71,6 +70,8 @@ def noise_of_densities(densities: ArrayLike, slope: ArrayLike, dt: float) -> np.
     Source: van Loan (1978), "Computing integrals involving the matrix exponential", IEEE Transactions on Automatic
     Control 23(3).
     """
+    from scipy.linalg import expm
+
     a, s = as_floats(slope), as_floats(densities)
     n = len(a)
     found = expm(np.block([[-a, s], [np.zeros((n, n)), a.T]]) * positive("dt", dt))

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import as_floats, short_repr
-from thruster_env.core.text_tables import verbatim
 
 LONG = 60  # characters of a name that an axis has room for
 
@@ -49,6 +48,8 @@ class Quantity(NamedTuple):
     @property
     def plot_label(self) -> str:
         """Name, symbol and unit, for axes of figures."""
+        from thruster_env.core.text_tables import verbatim  # which imports rich
+
         symbol = "" if self.symbol == self.name else f" ${_mathtext(self.symbol)}$"
         return f"{verbatim(self.name, most=LONG)}{symbol}" + (f" [{verbatim(self.unit)}]" if self.unit else "")
 
