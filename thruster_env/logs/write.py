@@ -25,7 +25,6 @@ from thruster_env.core.plots import (
     thinned,
     tidy,
 )
-from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import TIME_NAMES, parted, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SATURATED, STUCK, outliers
 from thruster_env.logs.grid import digits_for
@@ -190,6 +189,8 @@ def findings_figure(path: str | Path, log: Log) -> Path:
 
 def draw_findings(log: Log) -> Figure:
     """Inputs, then measurements, one below the other; findings are shaded, outliers have rings."""
+    from thruster_env.core.text_tables import TITLE, verbatim  # which imports rich
+
     times = log.start + log.times
     inputs = np.vstack((log.inputs, np.full((1, log.inputs.shape[1]), np.nan)))
     panels = [("", one, inputs[:, place]) for place, one in enumerate(log.input_quantities)]
