@@ -49,7 +49,7 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
     """
     places = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
     gains = [f"{worth(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
-    subject = "On held-out runs that" if chosen else "Tuning"
+    subject = "On held-out runs the tuned filter" if chosen else "Tuning"
     parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
