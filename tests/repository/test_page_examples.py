@@ -42,7 +42,11 @@ NOT_RUN = {  # programs, by page and what is in them
     ("size.md", "lorenz_96"): "a fragment of a model",
     ("policies.md", "VecNormalize"): "needs Stable-Baselines3, as howto/stable_baselines.md does, which runs",
 }
-QUICK = (("trials=30", "trials=3"), ("runs=200, steps=1000", "runs=24, steps=8"))  # smaller numbers
+QUICK = (
+    ("trials=30", "trials=3"),
+    ("runs=200, steps=1000", "runs=24, steps=8"),
+    ('.file], "outliers"', '.file], "outliers", seeds=4'),
+)  # smaller numbers
 SHOWN_ONLY = ("FOLDER", "...", "10.77.5.1")  # in commands: what the reader has to fill in
 
 

@@ -90,11 +90,6 @@ QUICK = {
     ),
     "lorenz63, regularised particles": (lorenz63, Published("pf", lorenz63.particles(800, 0.9, 0.2), 0.28), 0.018),
     "lorenz96": (lorenz96, Published("enkf", {"ensemble_size": 40, "inflation": 1.06}, 0.22), 0.008),
-    "lorenz96, localised": (
-        lorenz96,
-        Published("letkf", {"ensemble_size": 7, "radius": 4, "inflation": 1.04, "rotations": 1}, 0.22),
-        0.008,
-    ),
     "lorenz96, finite size": (
         lorenz96,
         Published("enkf-n", {"ensemble_size": 24, "rotations": 1, "certainty": 2.0}, 0.18),
@@ -257,6 +252,7 @@ def test_a_study_finds_the_acceleration_of_a_target():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
 def test_a_study_tunes_inflation_and_nothing_else():
     short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
     choice, score = tune_inflation("etkf", short, trials=3, runs=4)
