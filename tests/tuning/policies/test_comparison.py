@@ -258,7 +258,8 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 
 
 @pytest.mark.slow
-def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path):
+def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.policies.comparison.plan.QUICK", QUICK._replace(episodes=4))
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
     command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page
