@@ -63,7 +63,7 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     words = " ".join(again.stdout.split())
     for word in (
         "tuned",
-        "that of the scaled default, x",
+        "that of the scaled default",
         "the rule of thumb with its Q times",
         "bound",
         "NEES",
