@@ -35,7 +35,7 @@ def has_gradient(name: str) -> bool:
 def keeps_more(name: str) -> bool:
     """Whether a filter with a page keeps more than mean and covariance, such as an estimate of R."""
     kind = filter_type(name).filter_class
-    return issubclass(kind, PageFilter) and kind.page.start is not None
+    return issubclass(kind, PageFilter) and kind.page.initial is not None
 
 
 def check_gradient(name: str, what: str = "filter") -> None:
