@@ -42,7 +42,7 @@ class Unknown(NamedTuple):
 
 
 def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unknown]) -> StateSpaceModel:
-    """Make a model in which some constants of another one are further states, which any filter can estimate.
+    """Make a model whose states include some constants of another model, so that any filter can estimate them.
 
         (x, theta)' = (f(x, u, c with theta), theta) + (w, walk),  z = h(x, c with theta) + v
 
@@ -64,32 +64,32 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
     AIAA Journal 1(10).
     """
     fields = getattr(model.constants, "_fields", range(len(model.constants)))
-    places, means, variances, walks = [], [], [], []
+    positions, means, variances, walks = [], [], [], []
     for name, unknown in parameters.items():
         if name not in fields:
             known = ", ".join(map(str, fields))
             raise ValueError(f"a parameter must be one of the model's constants {known}, but got {name!r}")
         unknown = Unknown(*unknown)
-        place = list(fields).index(name)
-        mean = model.constants[place] if unknown.mean is None else unknown.mean
-        places.append(place)
+        position = list(fields).index(name)
+        mean = model.constants[position] if unknown.mean is None else unknown.mean
+        positions.append(position)
         means.append(finite(f"mean of {name}", mean))
         variances.append(positive(f"std of {name}", unknown.std) ** 2)
         walks.append(positive(f"walk_std of {name}", unknown.walk_std, zero_allowed=True) ** 2)
-    if not places:
+    if not positions:
         raise ValueError("parameters must name at least one constant, but got none")
-    functions: dict[str, Any] = _augmented_functions(*model.functions, model.shape, tuple(places))
+    functions: dict[str, Any] = _augmented_functions(*model.functions, model.shape, tuple(positions))
     spread = np.sqrt(np.add(variances, walks))
     further: dict[str, Any] = {
         "operating_state": means,
         "state_low": np.subtract(means, 2.0 * spread),
         "state_high": np.add(means, 2.0 * spread),
     }
-    given = {name: getattr(model, name) for name in further}
+    original = {name: getattr(model, name) for name in further}
     helpful: dict[str, Any] = {
-        name: None if value is None else np.append(value, further[name]) for name, value in given.items()
+        name: None if value is None else np.append(value, further[name]) for name, value in original.items()
     }
-    further_states = [Quantity(str(name), str(name), Unknown(*one).unit) for name, one in parameters.items()]
+    further_states = [Quantity(str(name), str(name), Unknown(*prior).unit) for name, prior in parameters.items()]
     return StateSpaceModel(
         **functions,
         process_noise_cov=_block_diagonal(model.process_noise_cov, walks),
@@ -106,36 +106,39 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         input_quantities=model.input_quantities,
         measurements=model.measurements,
         outputs={
-            symbol: Output(one.quantity, partial(_output, one.function, model.shape, tuple(places)))
-            for symbol, one in model.outputs.items()
+            symbol: Output(output.quantity, partial(_output, output.function, model.shape, tuple(positions)))
+            for symbol, output in model.outputs.items()
         },
         **helpful,
     )
 
 
-def _output(function: Callable, shape, places: tuple[int, ...], x, c):
-    """An output of the model, function(x, c), at the model's states and with the constants that are states."""
+def _output(function: Callable, shape, positions: tuple[int, ...], x, c):
+    """An output of the model, function(x, c), with its states and estimated constants taken from x."""
     values = list(c[: shape.constants])
-    for q, place in enumerate(places):
-        values[place] = x[shape.n + q]
+    for q, position in enumerate(positions):
+        values[position] = x[shape.n + q]
     tuples = isinstance(shape.form, int) or constants_are_array(shape.form)
     return function(x[: shape.n], tuple(values) if tuples else shape.form(*values))
 
 
 def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
     n = len(cov)
-    whole = np.diag(np.append(np.zeros(n), variances))
-    whole[:n, :n] = cov
-    return whole
+    combined = np.diag(np.append(np.zeros(n), variances))
+    combined[:n, :n] = cov
+    return combined
 
 
 @cache
-def _filler(form, count: int, places: tuple[int, ...]) -> Callable:
-    """Return `fill(t, c)`: the model's constants, of which those at some places are t and the others c."""
+def _filler(form, count: int, positions: tuple[int, ...]) -> Callable:
+    """Return `fill(t, c)`: the model's constants, t at these positions and c at the others."""
     if constants_are_array(form):
-        lines = f"filled = c[:{count}].copy()", *(f"filled[{place}] = t[{q}]" for q, place in enumerate(places))
+        lines = (
+            f"filled = c[:{count}].copy()",
+            *(f"filled[{i}] = t[{q}]" for q, i in enumerate(positions)),
+        )
         return written_out("fill", "t, c", *lines, "filled")
-    values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
+    values = [f"t[{positions.index(i)}]" if i in positions else f"c[{i}]" for i in range(count)]
     source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
     return written_out("fill", "t, c", source, Constants=form)
 
@@ -153,14 +156,14 @@ def _difference_quotient(size: int, angles: tuple[bool, ...]) -> Callable:
 
 @makes_functions
 def _augmented_functions(
-    transition, transition_jacobian, observe, observe_jacobian, shape, places
+    transition, transition_jacobian, observe, observe_jacobian, shape, positions
 ) -> dict[str, Callable | None]:
     """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
-    n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(places)
+    n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(positions)
     names: dict[str, Any] = {
         "f": transition,
         "h": observe,
-        "fill": _filler(form, count, places),
+        "fill": _filler(form, count, positions),
         "states": vector_part(n, n + added),
         "parameters": vector_part(added, n + added, n),
         "join": joiner(n, added),

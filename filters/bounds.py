@@ -76,9 +76,9 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
     if missing is not None:
         measured = np.where(missing, np.nan, measured)
     # Measurements that are right leave the estimate on the path.
-    found = run(ExtendedKalmanFilter(model=model), keys, inputs, measured)
-    expected = np.einsum("bkii->bki", found.innovation_covs) / np.diag(model.measurement_noise_cov)
-    if (expected < STIFF).all() and not found.divergences.any():
-        return found.covs
-    found = run(ExtendedKalmanFilter(model=model, form="square-root"), keys, inputs, measured)
-    return np.where((found.divergences > 0)[:, None, None, None], np.nan, found.covs)
+    estimates = run(ExtendedKalmanFilter(model=model), keys, inputs, measured)
+    expected = np.einsum("bkii->bki", estimates.innovation_covs) / np.diag(model.measurement_noise_cov)
+    if (expected < STIFF).all() and not estimates.divergences.any():
+        return estimates.covs
+    estimates = run(ExtendedKalmanFilter(model=model, form="square-root"), keys, inputs, measured)
+    return np.where((estimates.divergences > 0)[:, None, None, None], np.nan, estimates.covs)

@@ -73,9 +73,9 @@ class Filter:
         session = self._borrowed()
         session.set_key(key)
         session.run("start")
-        found = session.belief()
+        belief = session.belief()
         self._put_back(session)
-        return found
+        return belief
 
     def predict(self, belief: Belief, u, *, process_noise_cov=None) -> Belief:
         """Predict the belief one step ahead under input u (p,), in the units of the model's inputs.
@@ -91,9 +91,9 @@ class Filter:
         if process_noise_cov is not None:
             session.set_noise(process_noise_cov=process_noise_cov)
         session.run("predict", u=u)
-        found = session.belief()
+        predicted = session.belief()
         self._put_back(session)
-        return found
+        return predicted
 
     def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
         """Update the belief with measurement z (m,); return it and the innovation. NaN marks a missing channel.
@@ -107,24 +107,24 @@ class Filter:
         if measurement_noise_cov is not None:
             session.set_noise(measurement_noise_cov=measurement_noise_cov)
         session.run("update", z=z)
-        found = session.belief(), session.innovation_copy()
+        updated = session.belief(), session.innovation_copy()
         self._put_back(session)
-        return found
+        return updated
 
     def sample(self, belief: Belief) -> np.ndarray:
         """Members that stand for a belief, (n, N); where they have weights, a row behind holds the logarithms."""
         return belief.members[: self.kernel_model.n + 1]
 
     def _borrowed(self) -> Session:
-        """A session as if it were new, whose memory nobody else uses: to make one takes longer than a step.
+        """A spare session in its initial state, else a new one, which takes longer to make than a step.
 
-        It is put back with `_put_back`, but after an error.
+        `_put_back` returns it, except after an error.
         """
-        kept = self._kept_sessions()
+        spare = self._spare_sessions()
         source = self.kernel_model.numbers_from, self.own_parameters
-        if kept:
+        if spare:
             try:
-                was, session = kept.pop()  # which no other thread has then
+                was, session = spare.pop()  # then no other thread has it
             except IndexError:
                 was, session = None, None
             if session is not None and was == source:
@@ -135,15 +135,15 @@ class Filter:
         return session
 
     def _put_back(self, session: Session) -> None:
-        kept = self._kept_sessions()
-        if not kept:
-            kept.append((session.source, session))
+        spare = self._spare_sessions()
+        if not spare:
+            spare.append((session.source, session))
 
-    def _kept_sessions(self) -> list:
-        """Sessions that are not in use: one at most, unless threads have put back theirs at the same moment."""
-        held = vars(self)
+    def _spare_sessions(self) -> list:
+        """Sessions that are not in use: at most one, unless several threads put theirs back at once."""
+        attributes = vars(self)
         name = SPARE_IN_PYTHON if is_interpreting() else SPARE
-        return held.get(name) or held.setdefault(name, [])
+        return attributes.get(name) or attributes.setdefault(name, [])
 
     def __getstate__(self) -> dict:
         """The fields, without memory that is kept for the next call."""

@@ -34,12 +34,12 @@ def likelihood(
         log L = -1/2 sum_k (v' S^-1 v + log det 2 pi S),  v = z - h(m),  S = H P H' + R
 
     or with the v and S of another filter. Beside mean m and covariance P the recursion carries dm and dP for each
-    parameter: the derivative of every equation of the filter (`filters.pages`), in which what all parameters share
-    is formed once a step. Sigma-point filters carry the slope of P's root, too; it is NaN where P is singular and
-    a parameter makes it regular.
-    F = df/dx and H = dh/dx depend on the parameters through m. Of functions that can be traced, which is
-    arithmetic with a few decisions, their derivatives along dm are exact; of others they are central differences
-    of the model's Jacobians, of large models along each component of x.
+    parameter: the derivative of every equation of the filter (`filters.pages`). Terms that all parameters share
+    are computed once a step. Sigma-point filters carry the slope of P's root, too; it is NaN where P is singular
+    and a parameter makes it regular.
+    F = df/dx and H = dh/dx depend on the parameters through m. Their derivatives along dm are exact if the
+    functions can be traced (arithmetic with a few branches); else they are central differences of the model's
+    Jacobians, of large models along each component of x.
 
     Args:
         model: holds Q and R, at which the gradient is taken.
@@ -75,37 +75,37 @@ def information(
         I_ij = sum_k dv_i' S^-1 dv_j + 1/2 tr(S^-1 dS_i S^-1 dS_j)
 
     with v and S of the filter along that trajectory: the expectation of minus the second derivatives of log L
-    where the model is right. Arguments and errors are those of `likelihood`, and about what it costs.
+    where the model is right. Arguments and errors are those of `likelihood`, and the cost is about the same.
 
     Source: Gupta, Mehra (1974), as above.
     """
-    _, found = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), True, filter)
-    return found
+    _, information = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), True, filter)
+    return information
 
 
 def _derivatives(
     model: StateSpaceModel,
-    given: tuple,
+    arguments: tuple,
     informative: bool,
     used: Filter | None,
     own_slopes: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
-    inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(value)) for value in given)
+    inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(value)) for value in arguments)
     n, m, p = model.n, model.m, len(q_slopes)
     arrays = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
     check_shapes(arrays, model, (p, n, n), (p, m, m))
     slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=informative, constants=False, tails=False)
-    out, found = derivatives(model, inputs, measurements, slopes, wanted, used=used, own_slopes=own_slopes)
-    return out[:, 0], found
+    out, information = derivatives(model, inputs, measurements, slopes, wanted, used=used, own_slopes=own_slopes)
+    return out[:, 0], information
 
 
-def check_shapes(given: dict[str, np.ndarray], model: StateSpaceModel, *of_slopes: tuple[int, ...]) -> None:
+def check_shapes(arrays: dict[str, np.ndarray], model: StateSpaceModel, *of_slopes: tuple[int, ...]) -> None:
     """Raise ValueError unless inputs, measurements and slopes have the shapes that fit the model."""
-    shapes = tuple(array.shape for array in given.values())
-    count, steps = len(given["measurements"]), given["inputs"].shape[1] if given["inputs"].ndim == 3 else 0
+    shapes = tuple(array.shape for array in arrays.values())
+    count, steps = len(arrays["measurements"]), arrays["inputs"].shape[1] if arrays["inputs"].ndim == 3 else 0
     wanted = (count, steps, model.inputs), (count, steps + 1, model.m), *of_slopes
     if shapes != wanted:
-        *names, last = given
+        *names, last = arrays
         raise ValueError(f"{', '.join(names)} and {last} must have the shapes {wanted}, but got {shapes}")

@@ -20,23 +20,23 @@ if TYPE_CHECKING:
 
 
 class Event(NamedTuple):
-    """Something that was done, and the belief and the monitor before it."""
+    """A prediction or an update, with the belief and the monitor's memory before it."""
 
     begin: float
     end: float  # a prediction from `begin` to here; the same for an update
-    given: np.ndarray  # u (p,) of a prediction, z (m,) of an update
+    signal: np.ndarray  # u (p,) of a prediction, z (m,) of an update
     before: Belief
     length: float  # of the step before it
-    tests: tuple  # what the monitor remembered
+    tests: tuple  # the monitor's memory
 
     @property
     def is_prediction(self) -> bool:
-        """Whether time goes on in it."""
+        """Whether it moves the clock."""
         return self.end > self.begin
 
 
 class Live:
-    """One belief, moved on to any time and updated with any sensor.
+    """One belief, predicted to any time and updated with any sensor.
 
         live = make_filter("ekf", thruster_model()).live(late=0.5)
         live.start(12.30)
@@ -50,20 +50,20 @@ class Live:
     Args:
         filter_: any filter of such a model.
         noise: Q (n, n) of a step by its length [s], as `ContinuousModel.noise`; None for Gaussian diffusion.
-        late: samples that are so late [s] are put in order: the filter goes back, takes them, and repeats what
-            came after. The estimate is that of the right order.
+        late: how late [s] a sample may arrive. The filter goes back, updates with it and repeats all later steps,
+            so the estimate is as if it had arrived in time.
         skip_missing: whether a NaN is left out; else it is refused.
-        monitor: tests on the innovations, as wrappers take them. It sees all samples in the order in which they
-            were measured: where a late one comes in, it goes back as well. Its steps are updates, of any sensor.
-        resolution: of the stamps [s]; float64's where that is coarser, as of seconds since 1970. Two stamps that
-            are no further apart are one, and a step that is longer than the sample time by no more is one step.
+        monitor: tests on the innovations, as wrappers take them. It tests samples in the order of measurement, so
+            it goes back for a late one, too. Each update, of any sensor, is one of its steps.
+        resolution: of the stamps [s]; that of float64 where it is coarser, as for seconds since 1970. Two stamps
+            no further apart are equal, and a step that exceeds the sample time by no more is one step.
 
     Attributes:
         time: of the belief [s].
         mean, cov: views on its mean (n,) and covariance (n, n).
         innovation, innovation_cov: of the last update.
-        health: what the monitor said at the last update, with the alarms that a late sample brought about at later
-            ones; None without a monitor.
+        health: the monitor's verdict at the last update, with the alarms that a late sample raised at later ones;
+            None without a monitor.
 
     Raises:
         ValueError: for a model without such a constant, or a wrong argument.
@@ -89,7 +89,7 @@ class Live:
         self._watch, self._first = watch_of(monitor_of(monitor), filter_), FirstRestart(filter_)
         self._filter = filter_
         model = filter_.model
-        self._channels = {one.symbol: i for i, one in enumerate(model.measurements)}
+        self._channels = {quantity.symbol: i for i, quantity in enumerate(model.measurements)}
         self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
         self._events: list[Event] = []
         self._raised: list[tuple[Alarm, ...]] = []  # by the monitor at each event
@@ -136,15 +136,17 @@ class Live:
     def start(self, time: float, z: Sequence[float] | np.ndarray | None = None, key=(0, 0)) -> None:
         """Begin with the prior at a time [s], updated with a measurement z (m,) if there is one."""
         time = finite("time", time)
-        given = self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
+        measured = (
+            self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
+        )
         self._set_length(self._step)
-        self._session.start(key, given)
+        self._session.start(key, measured)
         self._first, self._last = FirstRestart(self._filter), None
-        self._first.note(self._session, None, given)
+        self._first.note(self._session, None, measured)
         self._events, self._raised, self.time, self._held = [], [], time, np.zeros(0)
         if self._watch is not None:
             self._watch.restart()
-            self.health = self._watch.step(self.innovation, self.innovation_cov, given)
+            self.health = self._watch.step(self.innovation, self.innovation_cov, measured)
 
     def predict_to(self, time: float, u: Sequence[float] | np.ndarray | None = None) -> None:
         """Move the belief on to a time [s], under the input u (p,) that has acted since the last one.
@@ -156,17 +158,17 @@ class Live:
         near = self._near(time)
         if time < self.time - near:
             raise ValueError(f"time must not step back behind {self.time:.9g} s, but got {time:.9g}")
-        given = as_floats(() if u is None else u).reshape(-1)
-        if given.shape != (self._inputs,) or not np.isfinite(given).all():
+        checked = as_floats(() if u is None else u).reshape(-1)
+        if checked.shape != (self._inputs,) or not np.isfinite(checked).all():
             raise ValueError(f"u must be {self._inputs} finite numbers, but got {short_repr(u)}")
         if time > self.time + near:
-            self._predict(time, given)
+            self._predict(time, checked)
 
     def update(self, time: float, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> None:
-        """Take what a sensor measured at a time [s].
+        """Update with a sensor's measurement at a time [s].
 
-        A later time than that of the belief is first predicted to, under the last input. An earlier one is put in
-        order, if it is not later than `late`.
+        If that is later than the belief, the filter first predicts to it under the last input. If it is earlier by
+        at most `late`, the filter goes back and repeats all later steps.
 
         Args:
             time: at which it was measured, not at which it arrived.
@@ -178,19 +180,19 @@ class Live:
                 too late.
         """
         self._has_begun()
-        time, given = finite("time", time), self._measured(sensor, z)
+        time, measured = finite("time", time), self._measured(sensor, z)
         near = self._near(time)
         if time > self.time + near:
             self._predict(time, self._held)
         if time >= self.time - near:
-            alarms = self._update(given)
+            alarms = self._update(measured)
         elif time < self.time - self._late - near:
             raise ValueError(
                 f"a sample must be at most late = {self._late:g} s late, but one of {time:.9g} s came at "
                 f"{self.time:.9g} s"
             )
         else:
-            alarms = self._insert(time, given, near)
+            alarms = self._insert(time, measured, near)
         if self.health is not None:
             self.health = Health(self.health.ok, alarms)
 
@@ -207,11 +209,11 @@ class Live:
         names = [sensor] if isinstance(sensor, str) else list(self._channels) if sensor is None else list(sensor)
         if len(values) != len(names):
             raise ValueError(f"z must have a number for each of {', '.join(names)}, but got {short_repr(z)}")
-        given = self._nothing.copy()
+        measured = self._nothing.copy()
         for name, value in zip(names, values.tolist(), strict=True):
-            given[self._channels[one_of("sensor", name, tuple(self._channels))]] = value
+            measured[self._channels[one_of("sensor", name, tuple(self._channels))]] = value
         self._checked(values)
-        return given
+        return measured
 
     def _checked(self, values: np.ndarray) -> np.ndarray:
         vector_like("z", values, values, missing_allowed=True)
@@ -240,7 +242,7 @@ class Live:
         self.time, self._held = time, u
 
     def _repeat(self, u: np.ndarray, count: int) -> None:
-        """Predictions under one input; if they end at no finite number once more, to hold the last one that is."""
+        """Predict under one input; if the result is not finite, repeat it and note the last finite belief."""
         session, before = self._session, self._session.belief()
         self._first.hold(session)
         session.run("predict", u=u, count=count)
@@ -272,26 +274,23 @@ class Live:
             self._raised[-1] = self.health.alarms
         return self.health.alarms
 
-    def _remember(self, end: float, given: np.ndarray) -> None:
-        """Keep what is about to be done as long as a late sample may come before it."""
+    def _remember(self, end: float, signal: np.ndarray) -> None:
+        """Keep the next event for as long as a late sample may precede it."""
         if self._late > 0.0:
             tests = () if self._watch is None else self._watch.memory()
-            self._events.append(Event(self.time, end, given, self._session.belief(), self._length, tests))
+            self._events.append(Event(self.time, end, signal, self._session.belief(), self._length, tests))
             self._raised.append(())
             oldest = end - self._late - self._near(end)
             while self._events[0].end < oldest:
                 del self._events[0], self._raised[0]
 
     def _insert(self, time: float, z: np.ndarray, near: float) -> tuple[Alarm, ...]:
-        """Go back to a time, take what was measured there, and do again what came after it.
-
-        Returns the alarms that there were not before.
-        """
-        place = next((i for i, one in enumerate(self._events) if one.end > time + near), None)
-        if place is None or self._events[place].begin > time + near:
+        """Go back to a time, update with its measurement, and repeat all later events; return the new alarms."""
+        index = next((i for i, event in enumerate(self._events) if event.end > time + near), None)
+        if index is None or self._events[index].begin > time + near:
             raise ValueError(f"a sample must not be earlier than the start, but got one at {time:.9g} s")
-        again, self._events = self._events[place:], self._events[:place]
-        raised, self._raised = self._raised[place:], self._raised[:place]
+        again, self._events = self._events[index:], self._events[:index]
+        raised, self._raised = self._raised[index:], self._raised[:index]
         first = again[0]
         self._session.load(first.before)
         self._set_length(first.length)
@@ -299,14 +298,14 @@ class Live:
         if self._watch is not None:
             self._watch.recall(first.tests)
         if time > first.begin + near:
-            self._predict(time, first.given)
+            self._predict(time, first.signal)
         alarms = list(self._update(z))
-        for one in again:
-            if one.is_prediction:
-                self._predict(one.end, one.given)
+        for event in again:
+            if event.is_prediction:
+                self._predict(event.end, event.signal)
             else:
-                alarms += self._update(one.given)
-        for old in (alarm for some in raised for alarm in some):  # of which one may come some steps later now
+                alarms += self._update(event.signal)
+        for old in (alarm for alarms_before in raised for alarm in alarms_before):  # it may now come later
             same = [new for new in alarms if (new.test, new.channel) == (old.test, old.channel)]
             if same:
                 alarms.remove(same[0])

@@ -96,8 +96,8 @@ def posterior_variances(
         ValueError: if Q is singular.
     """
     inputs, keys = as_floats(inputs), _truth_keys(len(inputs), truths, seed)
-    some = sequences_taken(inputs, truths, model)
-    inputs, keys = np.ascontiguousarray(inputs[some], dtype=np.float64), np.ascontiguousarray(keys[some])
+    rows = sequences_taken(inputs, truths, model)
+    inputs, keys = np.ascontiguousarray(inputs[rows], dtype=np.float64), np.ascontiguousarray(keys[rows])
     count, steps = inputs.shape[:2]
     most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
     variances = np.empty((count, steps + 1, model.n))
@@ -145,9 +145,9 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
     # Some truths at a time, in the same order: Ctrl-C is heard in between.
     size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
     parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, keys.shape[1], size)]
-    for some in told("truths", parts, [part.shape[1] for part in parts]):
-        spread(partial(add, some, done, *fixed), count)
-        done += some.shape[1]
+    for batch in told("truths", parts, [part.shape[1] for part in parts]):
+        spread(partial(add, batch, done, *fixed), count)
+        done += batch.shape[1]
     spread_of_f /= done
     information /= done
 
@@ -157,8 +157,8 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
     root = _informed(np.broadcast_to(prior, (count, n, n)), information[:, 0])
     bound[:, 0] = _square(root)
     for k in range(steps):
-        moved = f_mean[:, k] @ _informed(root, spread_of_f[:, k])
-        rows = np.concatenate([np.swapaxes(moved, -1, -2), noises], axis=-2)
+        propagated = f_mean[:, k] @ _informed(root, spread_of_f[:, k])
+        rows = np.concatenate([np.swapaxes(propagated, -1, -2), noises], axis=-2)
         root = _informed(np.swapaxes(np.linalg.qr(rows, mode="r"), -1, -2), information[:, k + 1])
         bound[:, k + 1] = _square(root)
     return bound
@@ -236,17 +236,17 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
                 share = 1.0 / (before + truth + 1.0)  # of this truth in the mean, as Welford (1962) has it
                 begin(x, draws, key_0, key_1, numbers)
                 for k in range(f_mean.shape[1]):
-                    seen = quadratic_m(observation_matrix(state(x), s, c), weight_r)
-                    accumulate(information, b, k, seen, 1.0)
+                    measured = quadratic_m(observation_matrix(state(x), s, c), weight_r)
+                    accumulate(information, b, k, measured, 1.0)
                     if k == inputs.shape[1]:
                         break
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k, i]
-                    f, moved = whole_step(state(x), control(u), numbers, c, eye)
+                    f, predicted = whole_step(state(x), control(u), numbers, c, eye)
                     apart = quadratic_n(less_mean(f, f_mean, b, k, state(x), s), weight_q)
                     accumulate(spread_of_f, b, k, apart, 1.0 - share)
                     move_mean(f_mean, b, k, f, share)
-                    store_state(x, moved)
+                    store_state(x, predicted)
                     disturb(x, draws, k + 1, key_0, key_1, numbers)
 
     return CompiledOrPython(gather)

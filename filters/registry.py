@@ -110,14 +110,15 @@ class FilterType(NamedTuple):
     @property
     def declared(self) -> tuple:
         """The tunable parameters that an estimator declares, `Parameter`s; none by default."""
-        found = getattr(self.found, "parameters", ()) if self.is_estimator else ()
-        return tuple(found) if isinstance(found, list | tuple) else ()  # of a network in torch it is a method
+        parameters = getattr(self.found, "parameters", ()) if self.is_estimator else ()
+        is_list = isinstance(parameters, list | tuple)  # of a network in torch it is a method
+        return tuple(parameters) if is_list else ()
 
     @property
     def numbers(self) -> tuple[str, ...]:
         """Names of its parameters beside its model, or of those that an estimator declares as tunable."""
         if self.is_estimator:
-            return tuple(one.name for one in self.declared)
+            return tuple(parameter.name for parameter in self.declared)
         return tuple(field.name for field in dataclasses.fields(self.filter_class) if field.name != "model")
 
     def make(self, model: StateSpaceModel, **numbers) -> Filter:
@@ -135,19 +136,19 @@ class FilterType(NamedTuple):
 
 
 def filter_type(name) -> FilterType:
-    """What a filter's name means.
+    """The filter type of a name.
 
     Args:
-        name: of a filter in `FILTERS`; "module:object" or a trained estimator's file; or an estimator, or what
-            makes one from a model, itself.
+        name: of a filter in `FILTERS`; "module:object" or a trained estimator's file; or an estimator itself, or a
+            function that makes one from a model.
 
     Raises:
         ValueError: for an unknown name.
     """
     if not is_foreign(name):
         return FilterType(name, FILTERS[one_of("filter", name, tuple(FILTERS), LISTED)])
-    found = estimator_named(name)
-    return FilterType(name, found if is_filter_class(found) else ForeignFilter, found)
+    estimator = estimator_named(name)
+    return FilterType(name, estimator if is_filter_class(estimator) else ForeignFilter, estimator)
 
 
 def make_filter(name, model: StateSpaceModel, **numbers) -> Filter:

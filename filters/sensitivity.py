@@ -77,13 +77,13 @@ def sensitivity(
     inputs, measurements = (np.ascontiguousarray(as_floats(a)) for a in (inputs, measurements))
     slopes = ModelSlopes(*(np.ascontiguousarray(slope, dtype=np.float64) for slope in slopes))
     n, m, p = model.n, model.m, len(slopes.constants)
-    given = {"inputs": inputs, "measurements": measurements, **slopes._asdict()}
-    check_shapes(given, model, (p, len(model.constants)), (p, n, n), (p, m, m), (p, n), (p, n, n))
-    seen = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
-    if seen.shape != (m,):
+    arrays = {"inputs": inputs, "measurements": measurements, **slopes._asdict()}
+    check_shapes(arrays, model, (p, len(model.constants)), (p, n, n), (p, m, m), (p, n), (p, n, n))
+    counts = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
+    if counts.shape != (m,):
         raise ValueError(f"predicted must be true or false for each of {m} channels, but got {predicted!r}")
     wanted = Wanted(information=True, constants=True, tails=True)
-    density = Density(float(degrees), seen)
+    density = Density(float(degrees), counts)
     out, information = derivatives(
         *(model, inputs, measurements, slopes, wanted),
         density=density,

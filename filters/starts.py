@@ -22,7 +22,7 @@ from thruster_env.model.state_space import StateSpaceModel
 # Restarts from the prior, in words: how many, the first step and state, and the likely cause.
 
 
-Found = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
+Flaw = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
 Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
 UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
 
@@ -68,16 +68,16 @@ class Restarts(NamedTuple):
 @wraps(batch.run)
 def run(filter_: Filter, keys=None, inputs=None, measurements=None, **noise) -> Estimates:
     """`filters.engine.batch.run`, with a `RestartWarning` if the filter restarted."""
-    found = batch.run(filter_, keys, inputs, measurements, **noise)
-    warn_of_restarts(filter_, found.divergences, keys, inputs, measurements, **noise)
-    return found
+    estimates = batch.run(filter_, keys, inputs, measurements, **noise)
+    warn_of_restarts(filter_, estimates.divergences, keys, inputs, measurements, **noise)
+    return estimates
 
 
 def warn_of_restarts(filter_: Filter, divergences: np.ndarray, keys, inputs, measurements, **noise) -> None:
-    """Warn, for the function that called the caller, with what `restarts_of` says, if it says anything."""
-    told = restarts_of(filter_, divergences, keys, inputs, measurements, **noise)
-    if told is not None:
-        warnings.warn(told.sentence, RestartWarning, stacklevel=3)
+    """Warn the caller's caller with the sentence of `restarts_of`, if the filter restarted."""
+    restarts = restarts_of(filter_, divergences, keys, inputs, measurements, **noise)
+    if restarts is not None:
+        warnings.warn(restarts.sentence, RestartWarning, stacklevel=3)
 
 
 def restarts_of(
@@ -90,33 +90,33 @@ def restarts_of(
     process_noise_covs=None,
     measurement_noise_covs=None,
 ) -> Restarts | None:
-    """The restarts of a filter on runs, by its `divergences` (B,) there; None if it never restarted.
+    """The restarts of a filter on runs, from its `divergences` (B,); None if it never restarted.
 
     The other arguments are those of `filters.run`. The first run that restarted is stepped once more.
     """
     divergences = np.atleast_1d(divergences)
     if not divergences.any():
         return None
-    place, session, first = int(np.flatnonzero(divergences)[0]), Session(filter_), FirstRestart(filter_)
+    b, session, first = int(np.flatnonzero(divergences)[0]), Session(filter_), FirstRestart(filter_)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
-    for k, one in enumerate(z[place]):
+    for k, measured in enumerate(z[b]):
         if measurement_noise_covs is not None:
             session.set_noise(measurement_noise_cov=measurement_noise_covs[k])
         if k == 0:
-            session.start(keys[place], one)
+            session.start(keys[b], measured)
         else:
             if process_noise_covs is not None:
                 session.set_noise(process_noise_cov=process_noise_covs[k - 1])
-            session.step(inputs[place, k - 1], one)
-        first.note(session, inputs[place, k - 1] if k else None, one)
+            session.step(inputs[b, k - 1], measured)
+        first.note(session, inputs[b, k - 1] if k else None, measured)
         if session.divergences:
             break
     runs = int((divergences > 0).sum())
-    return Restarts(int(divergences.sum()), runs, len(divergences), place, *first.found)
+    return Restarts(int(divergences.sum()), runs, len(divergences), b, *first.found)
 
 
 class FirstRestart:
-    """The first restart of a filter that is stepped by hand: `note` what each step did.
+    """The first restart of a filter that is stepped by hand; `note` records each step.
 
     Attributes:
         found: the step, symbols of the states that were lost, and the likely cause.
@@ -145,12 +145,12 @@ class FirstRestart:
             self._step += 1
 
     def restarts(self, count: int) -> Restarts | None:
-        """So many restarts of one run; None if there were none."""
+        """The restarts of one run, `count` in number; None if there were none."""
         return Restarts(count, 1, 1, 0, *self.found) if count else None
 
 
 class FirstRestarts:
-    """The same of N copies of a filter at once."""
+    """The first restarts of N copies of a filter."""
 
     def __init__(self, filter_: Filter, count: int):
         """Begin before the first measurements."""
@@ -166,7 +166,7 @@ class FirstRestarts:
             self._found[i] = None
 
     def note(self, which: np.ndarray, counts: np.ndarray, moments: Moments, u, z) -> np.ndarray | None:
-        """What there is to say of copies that restarted in this step, (N,) of sentences and None; None of none.
+        """Sentences on copies that restarted in this step, (N,) with None for the others; None if none restarted.
 
         Args:
             which: copies that made a step, or were started, (N,) bool.
@@ -176,19 +176,19 @@ class FirstRestarts:
             z: measurements (N, m).
         """
         lost = np.flatnonzero(which & (counts > self._counts)).tolist()
-        told = np.full(len(counts), None, dtype=object)
+        sentences = np.full(len(counts), None, dtype=object)
         for i in lost:
             step = int(self._steps[i])
             before = [(self._means[i], self._covs[i])] if step else None
             first = self._found[i] or (step, *_states_and_cause(self._filter, None, before, u[i], z[i]))
             self._found[i] = first
-            told[i] = Restarts(int(counts[i]), 1, 1, 0, *first).sentence
+            sentences[i] = Restarts(int(counts[i]), 1, 1, 0, *first).sentence
         self._steps[which] += 1
         self._counts = np.where(which, counts, self._counts)
         everywhere, (means, covs) = which.all(), moments
         self._means = means if everywhere else np.where(which[:, None], means, self._means)
         self._covs = covs if everywhere else np.where(which[:, None, None], covs, self._covs)
-        return told if lost else None
+        return sentences if lost else None
 
 
 def _moments(filter_: Filter, session: Any) -> list[Moments]:
@@ -202,23 +202,23 @@ def _moments(filter_: Filter, session: Any) -> list[Moments]:
 def _states_and_cause(
     filter_: Filter, numbers: np.ndarray | None, before: list[Moments] | None, u, z
 ) -> tuple[tuple[str, ...], str]:
-    """Symbols of the states that were lost in a step, and why: of the first mode that has a reason, if there are.
+    """Symbols of the states that were lost in a step, and the cause, of the first mode that has one.
 
     Args:
         filter_: the filter.
-        numbers: that it read, if they are known.
+        numbers: the packed parameters that it read, if they are known.
         before: moments before the step, of each mode or of all together; None for the first measurement.
         u: input (p,); None without a prediction.
         z: measurement (m,).
     """
     modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
-    models = [one.kernel_model for one in modes] or [_as_set(filter_.kernel_model, numbers)]
+    models = [mode.kernel_model for mode in modes] or [_as_set(filter_.kernel_model, numbers)]
     begun = before if before is None or len(before) == len(models) else before * len(models)
     for j, model in enumerate(models):
         states, cause = likely_cause(model, None if begun is None else begun[j], u, z)
         if cause != UNKNOWN:
             break
-    symbols = (one.symbol for one, lost in zip(filter_.model.states, states, strict=True) if lost)
+    symbols = (state.symbol for state, lost in zip(filter_.model.states, states, strict=True) if lost)
     return tuple(symbols), f"{cause} in modes[{j}]" if modes and cause != UNKNOWN else cause
 
 
@@ -239,7 +239,7 @@ def _as_set(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceMod
         return model
 
 
-def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Found:
+def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Flaw:
     """Which states were lost in a step, (n,) bool, and why, by the equations of an extended Kalman filter.
 
     Args:
@@ -251,37 +251,37 @@ def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Found:
     x, p = (model.prior_mean, model.prior_cov) if before is None else before
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = None
+        flaw = None
         if before is not None and u is not None:
-            x, p, found = _predicted(model, x, p, u)
-        return found or _updated(model, x, p, z)
+            x, p, flaw = _predicted(model, x, p, u)
+        return flaw or _updated(model, x, p, z)
 
 
-def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Found | None]:
+def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Flaw | None]:
     slopes = transition_slopes(model.functions, model.shape)
     for _ in range(model.substeps):
-        moved = _called(model.functions.transition, model.n, as_value(x), as_value(u), model.constants)
-        if not np.isfinite(moved).all():
-            return x, p, (~np.isfinite(moved), f"f(x, u) is {_kind(moved)}")
+        propagated = _called(model.functions.transition, model.n, as_value(x), as_value(u), model.constants)
+        if not np.isfinite(propagated).all():
+            return x, p, (~np.isfinite(propagated), f"f(x, u) is {_kind(propagated)}")
         f = _called(slopes, (model.n, model.n), as_value(x), as_value(model.scales), as_value(u), model.constants)
         if not np.isfinite(f).all():
             return x, p, (~np.isfinite(f).all(axis=1), f"F = df/dx is {_kind(f)}")
-        x, p = moved, f @ p @ f.T
+        x, p = propagated, f @ p @ f.T
     p = p + model.process_noise_cov
     return x, p, _flaw_of(p, "prediction")
 
 
-def _updated(model: StateSpaceModel, x, p, z) -> Found:
+def _updated(model: StateSpaceModel, x, p, z) -> Flaw:
     everything = np.ones(model.n, dtype=bool)
     expected = _called(model.functions.observe, model.m, as_value(x), model.constants)
-    seen = ~np.isnan(z)
-    if not np.isfinite(expected[seen]).all():
-        return everything, f"h(x) is {_kind(expected[seen])}"
+    measured = ~np.isnan(z)
+    if not np.isfinite(expected[measured]).all():
+        return everything, f"h(x) is {_kind(expected[measured])}"
     slopes = observation_slopes(model.functions, model.shape)
-    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), model.constants)[seen]
+    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), model.constants)[measured]
     if not np.isfinite(h).all():
         return ~np.isfinite(h).all(axis=0), f"H = dh/dx is {_kind(h)}"
-    s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(seen, seen)]
+    s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(measured, measured)]
     try:
         root = np.linalg.cholesky(s)
     except np.linalg.LinAlgError:
@@ -291,7 +291,7 @@ def _updated(model: StateSpaceModel, x, p, z) -> Found:
     return flaw or (~everything, UNKNOWN)
 
 
-def _flaw_of(p: np.ndarray, when: str) -> Found | None:
+def _flaw_of(p: np.ndarray, when: str) -> Flaw | None:
     if not np.isfinite(p).all():
         return ~np.isfinite(p).all(axis=1), f"the covariance overflows in the {when}"
     if (np.diag(p) < 0.0).any():
@@ -331,16 +331,16 @@ class Starts(NamedTuple):
 
     def numbers(self, model: StateSpaceModel) -> np.ndarray:
         """The row of numbers of each trajectory's model, (B, count): the model's with other priors."""
-        rows, places, n = np.tile(model.numbers, (len(self.free), 1)), number_places(model.n, model.m), model.n
-        rows[self.free, places.prior_mean : places.prior_mean + n] = self.means[self.free]
-        rows[self.free, places.prior_cov : places.prior_cov + n * n] = self.covs[self.free].reshape(-1, n * n)
+        rows, layout, n = np.tile(model.numbers, (len(self.free), 1)), number_places(model.n, model.m), model.n
+        rows[self.free, layout.prior_mean : layout.prior_mean + n] = self.means[self.free]
+        rows[self.free, layout.prior_cov : layout.prior_cov + n * n] = self.covs[self.free].reshape(-1, n * n)
         return rows
 
-    def model(self, model: StateSpaceModel, place: int) -> StateSpaceModel:
+    def model(self, model: StateSpaceModel, b: int) -> StateSpaceModel:
         """The model with the prior of one trajectory."""
-        if not self.free[place]:
+        if not self.free[b]:
             return model
-        return model.replace(prior_mean=self.means[place], prior_cov=self.covs[place])
+        return model.replace(prior_mean=self.means[b], prior_cov=self.covs[b])
 
     @property
     def counted_from(self) -> np.ndarray:
@@ -398,7 +398,7 @@ def cov_of_measured_starts(model: StateSpaceModel, first: np.ndarray) -> np.ndar
     inverse = np.linalg.pinv(a, rcond=FAINT)
     off = difference(first, np.array(model.functions.observe(x, c)), shape.measurement_angles) / deviations
     reach = scales * np.abs(np.where(np.isfinite(off), off, 0.0) @ inverse.T).max(axis=0, initial=0.0)
-    seen, scaling = inverse @ a, np.outer(scales, scales)
-    unseen = np.eye(model.n) - seen
-    found = seen @ (wide_cov(model, reach) / scaling) @ seen + unseen @ (model.prior_cov / scaling) @ unseen
-    return (found + found.T) / 2 * scaling
+    observed, scaling = inverse @ a, np.outer(scales, scales)
+    unseen = np.eye(model.n) - observed
+    cov = observed @ (wide_cov(model, reach) / scaling) @ observed + unseen @ (model.prior_cov / scaling) @ unseen
+    return (cov + cov.T) / 2 * scaling

@@ -53,12 +53,12 @@ def state_score(
     Science and Systems, criteria (ii) and (iii); here with exact gradients.
     """
     one_of("score", score, (LOG_SCORE, SQUARES))
-    given = (np.ascontiguousarray(as_floats(a)) for a in (inputs, measurements, states, q_slopes, r_slopes))
-    inputs, measurements, states, q_slopes, r_slopes = given
+    arrays = (inputs, measurements, states, q_slopes, r_slopes)
+    inputs, measurements, states, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(a)) for a in arrays)
     n, m, p = model.n, model.m, len(q_slopes)
-    arrays = {"inputs": inputs, "measurements": measurements, "states": states}
+    sequences = {"inputs": inputs, "measurements": measurements, "states": states}
     wanted_shapes = (*measurements.shape[:2], n), (p, n, n), (p, m, m)
-    check_shapes({**arrays, "q_slopes": q_slopes, "r_slopes": r_slopes}, model, *wanted_shapes)
+    check_shapes({**sequences, "q_slopes": q_slopes, "r_slopes": r_slopes}, model, *wanted_shapes)
     of_squares = np.ones(n) if weights is None else as_floats(weights)
     if of_squares.shape != (n,):
         raise ValueError(f"weights must have the shape ({n},), but got {of_squares.shape}")

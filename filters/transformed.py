@@ -35,26 +35,27 @@ def transformed_model(model: StateSpaceModel, bounds: Mapping[str | int, tuple] 
 
     Source: Limpert, Stahel, Abbt (2001), "Log-normal distributions across the sciences".
     """
-    found = model.bounds if bounds is None else checked_bounds(bounds, model.states)
-    if not found:
+    all_bounds = model.bounds if bounds is None else checked_bounds(bounds, model.states)
+    if not all_bounds:
         raise ValueError("a model is transformed by bounds of its states, but it has none: pass bounds=...")
     x, n = model.prior_mean, model.n
     slopes, states = np.ones(n), list(model.states)
-    for place, low, high in found:
-        if not low < x[place] < high:
-            raise ValueError(f"prior_mean of {states[place].symbol} must be within its bounds, but got {x[place]}")
-        slopes[place] = (low > -np.inf) / (x[place] - low) + (high < np.inf) / (high - x[place])
+    for i, low, high in all_bounds:
+        if not low < x[i] < high:
+            raise ValueError(f"prior_mean of {states[i].symbol} must be within its bounds, but got {x[i]}")
+        slopes[i] = (low > -np.inf) / (x[i] - low) + (high < np.inf) / (high - x[i])
         kind, word = ("logit", "logit") if np.isfinite([low, high]).all() else ("log", "logarithm")
-        one = states[place]
-        states[place] = Quantity(f"{word} of {one.name}", f"{kind}_{one.symbol}")
-    functions = dict(_functions(model.functions.transition, model.functions.observe, n, found))
+        state = states[i]
+        states[i] = Quantity(f"{word} of {state.name}", f"{kind}_{state.symbol}")
+    functions = dict(_functions(model.functions.transition, model.functions.observe, n, all_bounds))
     to_new, to_old = functions.pop("to_new"), functions.pop("to_old")
     outputs = {
-        symbol: Output(one.quantity, _OfStates(to_old, one.function)) for symbol, one in model.outputs.items()
+        symbol: Output(output.quantity, _OfStates(to_old, output.function))
+        for symbol, output in model.outputs.items()
     }
-    for place, *_ in found:
-        outputs[model.states[place].symbol] = Output(model.states[place], _OfStates(to_old, place))
-    kept = [one for one in model.bounds if one.place not in {other.place for other in found}]
+    for i, *_ in all_bounds:
+        outputs[model.states[i].symbol] = Output(model.states[i], _OfStates(to_old, i))
+    remaining = [bound for bound in model.bounds if bound.place not in {other.place for other in all_bounds}]
     helpful: dict[str, Any] = {}
     for name in ("operating_state", "state_low", "state_high"):
         value = getattr(model, name)
@@ -72,7 +73,7 @@ def transformed_model(model: StateSpaceModel, bounds: Mapping[str | int, tuple] 
         analytic=model.analytic,
         substeps=model.substeps,
         operating_input=None if helpful["operating_state"] is None else model.operating_input,
-        bounds=kept,
+        bounds=remaining,
         bounded_by=model.bounded_by,
         states=states,
         input_quantities=model.input_quantities,
@@ -106,7 +107,7 @@ class _OfStates:
 @makes_functions
 def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...]) -> dict[str, Callable]:
     """The functions of the new model, and T and X themselves."""
-    by_place = {one.place: one for one in bounds}
+    by_place = {bound.place: bound for bound in bounds}
 
     def entry(logit: str, above: str, below: str) -> Callable:
         def of(i: int) -> str:

@@ -27,7 +27,7 @@ KEYS = ("digest", "dt", *VECTORS)
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
     """A model's digest, sample time [s] and quantities, as JSON can hold them; of any steps, of one of dt."""
     model = of_one_step(model)
-    named = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
+    named = {key: [list(quantity) for quantity in getattr(model, name)] for key, name in VECTORS.items()}
     return {"digest": model.digest, "dt": dt, **named}
 
 
@@ -41,11 +41,11 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         file: its path.
     """
     model = of_one_step(model)
-    here = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
+    here = {key: [list(quantity) for quantity in getattr(model, name)] for key, name in VECTORS.items()}
     differing = [
         f"{key} {_listed(tuned_for[key])} (here {_listed(here[key])})"
         for key in VECTORS
-        if [one[1:] for one in tuned_for[key]] != [one[1:] for one in here[key]]  # whatever they are called
+        if [q[1:] for q in tuned_for[key]] != [q[1:] for q in here[key]]  # symbols may differ
     ]
     then = tuned_for["dt"]
     if then is not None and dt is not None and abs(then - dt) > 1e-9 * then:
@@ -70,23 +70,21 @@ def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | Non
         )
 
 
-def check_model_data(given) -> None:
+def check_model_data(data) -> None:
     """Raise ValueError unless data are such as `model_data` makes."""
-    sound = isinstance(given, dict) and set(given) == set(KEYS) and isinstance(given["digest"], str)
-    sound = sound and (given["dt"] is None or (isinstance(given["dt"], float | int) and given["dt"] > 0))
-    if not sound or not all(
-        isinstance(given[key], list) and all(map(_is_quantity, given[key])) for key in VECTORS
-    ):
-        raise ValueError(f"the model of a tuned file must have {', '.join(KEYS)}, but got {short_repr(given)}")
+    sound = isinstance(data, dict) and set(data) == set(KEYS) and isinstance(data["digest"], str)
+    sound = sound and (data["dt"] is None or (isinstance(data["dt"], float | int) and data["dt"] > 0))
+    if not sound or not all(isinstance(data[key], list) and all(map(_is_quantity, data[key])) for key in VECTORS):
+        raise ValueError(f"the model of a tuned file must have {', '.join(KEYS)}, but got {short_repr(data)}")
 
 
-def _is_quantity(given) -> bool:
-    return isinstance(given, list) and [type(part) for part in given] == [str, str, str, bool]
+def _is_quantity(entry) -> bool:
+    return isinstance(entry, list) and [type(part) for part in entry] == [str, str, str, bool]
 
 
-def _listed(quantities: list) -> str:
-    ones = [Quantity(*one) for one in quantities]
-    return ", ".join(f"{one.symbol} [{one.unit}]" if one.unit else one.symbol for one in ones) or "none"
+def _listed(entries: list) -> str:
+    quantities = [Quantity(*entry) for entry in entries]
+    return ", ".join(f"{q.symbol} [{q.unit}]" if q.unit else q.symbol for q in quantities) or "none"
 
 
 # The tuned file as every program reads it: data, checked entry by entry, that can name no code.
@@ -160,7 +158,7 @@ def tune_options(content: Mapping[str, Any]) -> dict[str, Any]:
     name, *constants = re.split(r"\+(?=[A-Za-z_])", str(content["problem"]))
     augment = {"augment": constants} if constants else {}
     if isinstance(stored, dict) and isinstance(stored.get("logs"), list):
-        logs = [one.get("file") for one in stored["logs"] if isinstance(one, dict)]
+        logs = [log.get("file") for log in stored["logs"] if isinstance(log, dict)]
         return {"log": logs, **(stored["options"] if isinstance(stored.get("options"), dict) else {}), **augment}
     scenario, bracket, preset = name.removesuffix(")").partition(" (")
     return {"problem": scenario, **({"preset": preset} if bracket else {}), **augment}
@@ -175,21 +173,21 @@ def made_with(content: Mapping[str, Any]) -> str:
             parts.append(option)
         else:
             parts += [
-                f"{option} {shlex.quote(str(one))}" for one in (value if isinstance(value, list) else [value])
+                f"{option} {shlex.quote(str(entry))}" for entry in (value if isinstance(value, list) else [value])
             ]
     return " ".join(parts)
 
 
-def check_preset_file(options: Mapping[str, Any], given: Any, path: str | Path) -> None:
-    """Raise ValueError if a tuned file names a preset file that is not there, and no other one is given.
+def check_preset_file(options: Mapping[str, Any], user_preset: Any, path: str | Path) -> None:
+    """Raise ValueError if a tuned file names a preset file that does not exist, and the caller passes no other.
 
     Args:
         options: from `tune_options`.
-        given: the preset that the caller gives, or None.
+        user_preset: the preset that the caller passes, or None.
         path: of the tuned file.
     """
     preset = options.get("preset")
-    if given is None and isinstance(preset, str) and preset.endswith(".toml") and not Path(preset).is_file():
+    if user_preset is None and isinstance(preset, str) and preset.endswith(".toml") and not Path(preset).is_file():
         raise ValueError(
             f"the preset of {path} must be where it was, but there is no file {preset}: say where it is "
             "now (--preset FILE)"

@@ -46,10 +46,10 @@ def _curve() -> Callable:
     from scipy.interpolate import CubicHermiteSpline
 
     multipliers = np.geomspace(MOST, LEAST, POINTS)
-    found = np.array([_ground_state(mu) for mu in multipliers])
-    roots = np.sqrt(found[:, 0])
+    points = np.array([_ground_state(mu) for mu in multipliers])
+    roots = np.sqrt(points[:, 0])
     # For little information v = pi^2/3 - 2 sqrt(2 J), by perturbation of the uniform density.
-    ends = np.append(0.0, roots), np.append(np.pi**2 / 3.0, found[:, 1])
+    ends = np.append(0.0, roots), np.append(np.pi**2 / 3.0, points[:, 1])
     return CubicHermiteSpline(*ends, np.append(-2.0 * np.sqrt(2.0), -2.0 * multipliers * roots))
 
 
