@@ -191,10 +191,10 @@ def _of_arrays(function: Callable, part: str = "") -> Callable:
 
 
 FUNCTIONS: dict[Operation, Callable] = {
-    called_unit_upper: _of_arrays(called_unit_upper),
-    called_upper_root: _of_arrays(called_upper_root),
-    called_factors: _of_arrays(called_factors),
-    called_weighted_factors: _of_arrays(called_weighted_factors),
+    unit_upper: _of_arrays(called_unit_upper),
+    upper_root: _of_arrays(called_upper_root),
+    factors: _of_arrays(called_factors),
+    weighted_factors: _of_arrays(called_weighted_factors),
     measured_factors: _of_arrays(measured, "[0]"),
     measured_gain: _of_arrays(measured, "[1]"),
 }

@@ -74,7 +74,7 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
         tell(memory[0])
 
     kept = kernels.extras + kernels.scratch + size
-    return kernels._replace(initial=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
+    return kernels._replace(start=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
 
 
 def constrained(
