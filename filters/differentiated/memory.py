@@ -7,7 +7,7 @@ from math import prod
 from filters.algebra.matrices import Matrix, given
 from filters.algebra.points import root
 from filters.pages.equations import PagedModel
-from filters.pages.kernels import together
+from filters.pages.kernels import as_tuple
 from filters.pages.page import NumbersMemory, Page
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Shape, number_places, starts_of
@@ -40,7 +40,7 @@ class Memory(NumbersMemory):
         super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, like=x), own)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
-        flying = (x, self.P) if page.represent is None else together(page.represent(model, x, self.P))
+        flying = (x, self.P) if page.represent is None else as_tuple(page.represent(model, x, self.P))
         started = page.started(model)
         self.begun, self.notes = n + n * n, m + m * m
         starts = starts_of(*(prod(one.shape) for one in flying))

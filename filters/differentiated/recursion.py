@@ -20,7 +20,7 @@ from filters.algebra.scalars import slopes_of
 from filters.differentiated.memory import Memory
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.equations import Equations
-from filters.pages.kernels import Stage, as_calls, as_programs, stage_of, with_kept
+from filters.pages.kernels import Stage, as_calls, as_programs, stage_of, with_extras
 from filters.pages.page import Page
 from filters.pages.traced import MOST
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
@@ -163,7 +163,7 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
 
     def moved(results: Any, more: dict | None = None, slopes: dict | None = None) -> Stage:
         """What is predicted or kept, where it lies after the stage, and its slopes."""
-        *values, changed = with_kept(results)
+        *values, changed = with_extras(results)
         kept = {name: changed.get(name, one) for name, one in memory.kept.items()}
         starts = starts_of(*(prod(one.shape) for one in values))
         left = dict(zip(starts, values, strict=False)) | _by_place(memory, kept)
@@ -183,7 +183,7 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
         moved(page.propagate(model, *memory.flying, memory.u)),
         moved(page.add_process_noise(model, *memory.flying)),
     ]
-    mean, cov, v, s, _, changed = with_kept(page.update(model, x, p, memory.z))
+    mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
     if wanted.of_truth:
         known = present(memory.truth)
         off = only(known, wrap(memory.truth - mean, model.state_angles))

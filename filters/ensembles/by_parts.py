@@ -150,7 +150,7 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     look, rows, _ = works_of(page, functions, shape, with_unit_noise, n + m)["update"]
     tell, summarise, first = plain.update, plain.summarise, scratch_place(page, shape)
     serial, move = moves_of is not None, gaussian_moves if moves_of is None else moves_of
-    places = page.places(own_place(shape))
+    places = page.parameter_offsets(own_place(shape))
     taper, relaxation, tail = places["taper"], places["relaxation"], places["tail"]
 
     @inlined

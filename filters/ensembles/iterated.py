@@ -139,7 +139,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     )
     row_places, substeps = memory_places(n, m), number_places(n, m).substeps
     step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
-    own = page.places(own_place(shape))
+    own = page.parameter_offsets(own_place(shape))
     inflation, relaxation, rows = own["inflation"], own["relaxation"], n * (length + 1)
     window, moved, slopes, pulls, _, steps, inputs, then_place, _, _ = at
     constants, constants_place = shape.constants, number_places(n, m).constants

@@ -25,12 +25,12 @@ from filters.pages.equations import Equations, PagedModel
 from filters.pages.kernels import (
     Stage,
     anything_measured,
+    as_tuple,
     nothing_to_summarise,
     page_kernels,
     prior_start,
     programs_of,
     stored,
-    together,
     works_of,
 )
 from filters.pages.page import RowMemory
@@ -235,7 +235,7 @@ def mixture_kernels(
     plain = ExtendedKalmanFilter.page._replace(own=parameters, fixed=page.fixed)
     memory = RowMemory(shape, plain)
     memory.end = given + wide + length
-    begun = together(page.represent(PagedModel(memory), memory.x, memory.P))
+    begun = as_tuple(page.represent(PagedModel(memory), memory.x, memory.P))
     shared = [memory.another(one) for one in begun[1:]]
     told = (places.innovation, m), (places.innovation_cov, m, m)
     v, S = (memory.read("rows", *one) for one in told)

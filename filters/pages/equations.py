@@ -1,13 +1,11 @@
-"""A model as pages of filters see it, and how its equations change along a parameter.
+"""The model that pages of filters get, and the slopes of its equations along a parameter.
 
 A parameter moves the mean by dx and the constants by dc, and so
 
     df = F dx + f_c dc,   dF = F_x dx + F_c dc
 
-Where the model's functions can be traced, all of it follows from their graphs. Others are called, and what is
-not known of them is found by central differences (`differences`).
-
-What a model says of Jacobians is used as it is; their own slopes, and those along its constants, are differences.
+If the model's functions can be traced, all of these follow from their graphs. Otherwise the functions are called:
+Jacobians that the model has are used, and all other slopes are central differences.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from thruster_env.core.derivatives import RELATIVE_STEP, step_of, stretch
 from thruster_env.core.sources import Source, entrywise, is_array, scaled_sum, tuple_of, vector_reader, written_out
 from thruster_env.model.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
 
-# How equations of a model change along a parameter, of functions that are called: by central differences.
+# Slopes of functions that are called, by central differences.
 
 
 @cache
@@ -38,11 +36,11 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
         y_c dc = [y(c + h dc) - y(c - h dc)]/2h
         dY = [Y(x + h dx, c + h dc) - Y(x - h dx, c - h dc)]/2h
 
-    the first a function of (x, scales, ..., c, dc, size), with the relative size of dc, the second one of (x,
-    scales, ..., c, dx, dc, size), or without the last two where constants do not move. Far from zero steps grow
-    with `stretch`, as a value is rounded there whatever moves. Large Jacobians of such are differentiated by each
-    component of x, of which there are fewer than directions: then a derivative (columns, rows, columns) and its
-    contraction with dx follow.
+    y_c dc is a function of (x, scales, ..., c, dc, size), where size is the relative size of dc, and dY one of (x,
+    scales, ..., c, dx, dc, size), without the last two if constants do not move. Far from zero steps grow with
+    `stretch`, because values are rounded more coarsely. If constants do not move, a large Jacobian F is
+    differentiated by each component of x, because there are fewer components than directions: then two more
+    functions follow, the derivative (columns, rows, columns) and its contraction with dx.
 
     Args:
         functions: of the model.
@@ -52,21 +50,21 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
     """
     if which == "motion":
         value, matrix = functions.transition, transition_slopes(functions, shape)
-        rows, angles, others = shape.n, shape.state_angles, "u, c"
+        rows, angles, inputs = shape.n, shape.state_angles, "u, c"
     else:
         value, matrix = functions.observe, observation_slopes(functions, shape)
-        rows, angles, others = shape.m, shape.measurement_angles, "c"
-    by_constants = _by_constants(value, rows, shape, angles, others)
+        rows, angles, inputs = shape.m, shape.measurement_angles, "c"
+    by_constants = _by_constants(value, rows, shape, angles, inputs)
     size = rows, shape.n
     entry = "(a[{0}][{1}] - b[{0}][{1}]) / (2.0 * h)"
     difference = entrywise("difference", "a, b, h", size, lambda i, j: entry.format(i, j), a=size, b=size)
-    parts = value, matrix, by_constants, slope_of(matrix, difference, shape, others, constants_move)
+    parts = value, matrix, by_constants, slope_of(matrix, difference, shape, inputs, constants_move)
     large = is_array(rows, shape.n) and which == "motion" and not constants_move
-    return (*parts, _curvature(matrix, rows, shape.n, others), _contraction(rows, shape.n)) if large else parts
+    return (*parts, _curvature(matrix, rows, shape.n, inputs), _contraction(rows, shape.n)) if large else parts
 
 
-def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], others: str) -> Callable:
-    sides = [others.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
+def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], inputs: str) -> Callable:
+    sides = [inputs.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
     lines = (
         f"h = {RELATIVE_STEP} * stretch(x, scales) / max(size, 1e-300)",
         f"above, below = {', '.join(f'value(x, {side})' for side in sides)}",
@@ -78,22 +76,22 @@ def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, 
         "difference": difference_of_values(rows, angles),
         "stretch": stretch(shape.n),
     }
-    return written_out("by_constants", f"x, scales, {others}, dc, size", *lines, **names)
+    return written_out("by_constants", f"x, scales, {inputs}, dc, size", *lines, **names)
 
 
 def difference_of_values(rows: int, angles: tuple[bool, ...]) -> Callable:
-    """`difference(above, below, h)`: the slope between two vectors that lie 2 h apart, of angles the short way."""
+    """`difference(above, below, h)`: (above - below)/2h, where differences of angles are in (-pi, pi]."""
     source = Source("difference", "above, below, h", result=(rows,), above=(rows,), below=(rows,))
     entries = source.vector(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
     return source.function(entries, **NAMES)
 
 
 def slope_of(
-    function: Callable, difference: Callable, shape: Shape, others: str, constants_move: bool
+    function: Callable, difference: Callable, shape: Shape, inputs: str, constants_move: bool
 ) -> Callable:
     """`slope(x, scales, ..., c, dx)` of a function (x, scales, ..., c); with dc and its size if constants move."""
     sides = [
-        (sign, others.replace("c", f"shift(c, {sign}h, dc)") if constants_move else others) for sign in ("", "-")
+        (sign, inputs.replace("c", f"shift(c, {sign}h, dc)") if constants_move else inputs) for sign in ("", "-")
     ]
     calls = (f"function(move(x, {sign}h, dx), scales, {side})" for sign, side in sides)
     lines = (
@@ -108,12 +106,12 @@ def slope_of(
         "shift": _constants_shift(shape),
         "difference": difference,
     }
-    return written_out("slope", f"x, scales, {others}, dx" + ", dc, size" * constants_move, *lines, **names)
+    return written_out("slope", f"x, scales, {inputs}, dx" + ", dc, size" * constants_move, *lines, **names)
 
 
 @cache
 def _step(count: int) -> Callable:
-    """Return `step(x, scales, d, size)`: how far to go along d, and along constants of a relative size."""
+    """Return `step(x, scales, d, size)`: the step h along d, and along a relative change of constants."""
     source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
     source.line("far = stretch(x, scales)")
     source.line("h = max(1e-300, size / far)")
@@ -133,7 +131,7 @@ def _constants_shift(shape: Shape) -> Callable:
     return written_out("shift", "c, h, dc", f"Constants({', '.join(values)})", Constants=shape.form)
 
 
-def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callable:
+def _curvature(matrix: Callable, rows: int, columns: int, inputs: str) -> Callable:
     """`curved(x, scales, ..., c)`: a Jacobian's derivative by each component of x, (columns, rows, columns)."""
     lines = (
         f"out, unit = np.empty(({columns}, {rows}, {columns})), np.zeros({columns})",
@@ -142,8 +140,8 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
         "    unit[k] = 1.0",
         "    h = step_of(x[k], scales[k], far)",
         "    d = read(unit)",
-        f"    above = matrix(move(x, h, d), scales, {others})",
-        f"    below = matrix(move(x, -h, d), scales, {others})",
+        f"    above = matrix(move(x, h, d), scales, {inputs})",
+        f"    below = matrix(move(x, -h, d), scales, {inputs})",
         f"    for i in range({rows}):",
         f"        for j in range({columns}):",
         "            out[k, i, j] = (above[i, j] - below[i, j]) / (2.0 * h)",
@@ -152,11 +150,11 @@ def _curvature(matrix: Callable, rows: int, columns: int, others: str) -> Callab
     )
     names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
     names |= {"np": np, "step_of": step_of, "stretch": stretch(columns)}
-    return written_out("curved", f"x, scales, {others}", *lines, _loops=True, **names)
+    return written_out("curved", f"x, scales, {inputs}", *lines, _loops=True, **names)
 
 
 def _contraction(rows: int, columns: int) -> Callable:
-    """`slope(curvature, dx)`: a Jacobian's derivative along dx, from that by each component of x."""
+    """`slope(curvature, dx)`: a Jacobian's derivative along dx, from its derivatives by each component of x."""
     lines = (
         f"out = np.zeros(({rows}, {columns}))",
         f"for k in range({columns}):",
@@ -168,9 +166,6 @@ def _contraction(rows: int, columns: int) -> Callable:
     return written_out("slope", "curvature, dx", *lines, _loops=True, np=np)
 
 
-# Equations of a model at points, the columns of a matrix, and their slopes, of functions that are called.
-
-
 @cache
 def called_at_points(
     functions: Functions, shape: Shape, which: str, constants_move: bool, points: int
@@ -179,25 +174,25 @@ def called_at_points(
 
         dy = [y(x + h dx, c + h dc) - y(x - h dx, c - h dc)]/2h
 
-    Where parameters move constants the slope takes (X, scales, ..., c, dX, dc, size). Other arguments are those of
-    `differences.called_parts`.
+    If parameters move constants, the slope takes (X, scales, ..., c, dX, dc, size). Other arguments are those of
+    `called_parts`.
     """
     if which == "motion":
-        value, rows, angles, others = functions.transition, shape.n, shape.state_angles, "u, c"
+        value, rows, angles, inputs = functions.transition, shape.n, shape.state_angles, "u, c"
     else:
-        value, rows, angles, others = functions.observe, shape.m, shape.measurement_angles, "c"
-    plain = written_out("plain", f"x, scales, {others}", f"value(x, {others})", value=value)
-    slope = slope_of(plain, difference_of_values(rows, angles), shape, others, constants_move)
+        value, rows, angles, inputs = functions.observe, shape.m, shape.measurement_angles, "c"
+    plain = written_out("plain", f"x, scales, {inputs}", f"value(x, {inputs})", value=value)
+    slope = slope_of(plain, difference_of_values(rows, angles), shape, inputs, constants_move)
     behind = ", dc, size" if constants_move else ""
     size = shape.n, points
     return (
-        _by_columns(value, f"x, {others}", rows, x=size),
-        _by_columns(slope, f"x, scales, {others}, dx{behind}", rows, x=size, dx=size),
+        _by_columns(value, f"x, {inputs}", rows, x=size),
+        _by_columns(slope, f"x, scales, {inputs}, dx{behind}", rows, x=size, dx=size),
     )
 
 
 def _by_columns(function: Callable, arguments: str, rows: int, **matrices: Any) -> Callable:
-    """A function (rows,) of vectors as one (rows, points) of matrices, which it takes column by column."""
+    """A function of vectors, with results (rows,), applied to each column of matrices: (rows, points)."""
     n, points = matrices["x"]
     source = Source("by_columns", arguments, result=(rows, points), **matrices)
     out = source.local("out", rows, points)
@@ -208,8 +203,8 @@ def _by_columns(function: Callable, arguments: str, rows: int, **matrices: Any) 
             else tuple_of(f"{name}[{i}][{j}]" for i in range(n))
             for name in matrices
         }
-        given = (columns.get(name, name) for name in arguments.split(", "))
-        source.line(f"y = function({', '.join(given)})")
+        operands = (columns.get(name, name) for name in arguments.split(", "))
+        source.line(f"y = function({', '.join(operands)})")
         if source.loops:
             source.line(f"store(out, {j}, y)")
         else:
@@ -222,14 +217,14 @@ def _by_columns(function: Callable, arguments: str, rows: int, **matrices: Any) 
 
 
 class PagedModel:
-    """What pages find in a model besides its equations f, F, h and H.
+    """Attributes of the model that pages get, besides its equations f, F, h and H.
 
     Attributes:
         Q, R: its covariances; Q of a model with a step ratio is that of the step's length.
         Q_root, R_root, prior_root: lower triangular roots of Q, R and the prior covariance.
         prior_mean: of the state.
         own: the filter's parameters.
-        kept: what the filter keeps besides mean and covariance, by name.
+        extras: what the filter keeps besides mean and covariance, by name.
         state_angles, measurement_angles: flags of components that are angles.
     """
 
@@ -255,7 +250,7 @@ class Equations(PagedModel):
     """A model whose functions take Matrices.
 
     Attributes:
-        called: if functions are to be called, those that work out the model's operations.
+        called: the functions that evaluate the model's operations, if these are calls.
     """
 
     def __init__(
@@ -267,10 +262,10 @@ class Equations(PagedModel):
         trace: bool,
         partly: bool = False,
     ):
-        """Take the model's functions, where its numbers lie, and whether parameters move its constants.
+        """Take the model's functions, the matrices of its numbers, and whether parameters move its constants.
 
-        They are traced, or to be called. If they are traced `partly`, what needs one that cannot be traced raises
-        TypeError when it is worked out; else that is raised here.
+        The functions are traced if `trace`, otherwise called. A function that cannot be traced raises TypeError:
+        here, or with `partly` only if a matrix that depends on it is evaluated.
         """
         shape = memory.shape
         super().__init__(memory)
@@ -281,7 +276,7 @@ class Equations(PagedModel):
         parts: list[tuple[Callable, ...]]
         if trace:
             traced = traced_model(functions, shape, partly)
-            parts = [one.parts for one in traced]
+            parts = [function.parts for function in traced]
             self._parts_at_points: Callable = lambda which, points: traced[which == "sight"].of_points
         else:
             parts = [called_parts(*chosen, which, bool(self._moves)) for which in ("motion", "sight")]
@@ -314,11 +309,11 @@ class Equations(PagedModel):
     ) -> tuple[Operation, Operation]:
         """An equation (x, ..., c) and its Jacobian (x, scales, ..., c); their derivatives are operations, too."""
         shapes = (rows,), (rows, n), (rows,), (rows, n), (n, rows, n), (rows, n)
-        made = [
+        operations = [
             Operation(part if trace else not_known, lambda *_, shape=shape: shape, never)
             for part, shape in zip(parts, shapes, strict=False)
         ]
-        value, matrix, by_constants, slope, *curved = made
+        value, matrix, by_constants, slope, *curved = operations
         value.name, matrix.name, by_constants.name, slope.name = (
             name,
             name.upper(),
@@ -326,13 +321,13 @@ class Equations(PagedModel):
             f"d{name.upper()}",
         )
         if not trace:
-            self.called |= dict(zip(made, parts, strict=True))
+            self.called |= dict(zip(operations, parts, strict=True))
 
         @value.derivative
         def of_value(result, arguments, slopes):
-            x, *others = arguments
-            moved = through(lambda dx: matrix(x, self._scales, *others) @ dx, slopes[0])
-            return plus(moved, by_constants(x, self._scales, *others, *self._moves) if self._moves else None)
+            x, *inputs = arguments
+            along_x = through(lambda dx: matrix(x, self._scales, *inputs) @ dx, slopes[0])
+            return plus(along_x, by_constants(x, self._scales, *inputs, *self._moves) if self._moves else None)
 
         @matrix.derivative
         def of_matrix(result, arguments, slopes):
@@ -359,7 +354,7 @@ class Equations(PagedModel):
 
         @value.derivative
         def of_value(result, arguments, slopes):
-            x, *others = arguments
-            return slope(x, self._scales, *others, slopes[0], *self._moves)
+            x, *inputs = arguments
+            return slope(x, self._scales, *inputs, slopes[0], *self._moves)
 
         return value

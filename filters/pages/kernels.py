@@ -1,8 +1,9 @@
-"""A page as kernels of the engine: what it says of matrices, worked out in the memory of a belief.
+"""A page as kernels of the engine: its equations of matrices, evaluated in the memory of a belief.
 
-The first is called once, the second for each parameter. What slopes need of the values is worked out with them
-and kept in memory: in the graph of the slopes it is what does not depend on a parameter, and is an argument of
-what does.
+A stage of a filter with derivatives is two functions. The first computes values and is called once; the second
+computes their slopes and is called once for each parameter. The first also stores intermediate results that the
+slopes need: the arguments, in the graph of the slopes, of operations that depend on a parameter, if they do not
+depend on one themselves.
 """
 
 from __future__ import annotations
@@ -28,53 +29,52 @@ from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, needed_by, unc
 from thruster_env.graphs.programs import ARRAYS, BY_MEMBERS, OF_STEPS, Place, callable_of, program_of
 from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
 
-# A stage of a filter with derivatives: two functions, of which one works out values, the other slopes of these.
-
-
-OF_PARAMETER = ("change", "move")  # arrays whose numbers are those of a parameter
-FREE = ("given", "constant", *CONDITIONS)  # operations whose results are at hand, or cannot be kept as floats
+OF_PARAMETER = ("change", "move")  # arrays that differ between parameters
+FREE = ("given", "constant", *CONDITIONS)  # operations whose results are in memory, or cannot be stored as floats
 
 
 class Stage(NamedTuple):
-    """What a stage leaves in memory: values in `rows`, and in `change` what is a parameter's."""
+    """What a stage stores: values in `rows`, and slopes along a parameter in `change`."""
 
     values: dict[int | Place, Matrix]
     slopes: dict[int, Matrix]
 
     @property
     def of_rows(self) -> dict[int, Matrix]:
-        """Values by their places in `rows`, where all are of a filter without an ensemble."""
-        return {at.at if isinstance(at, Place) else at: one for at, one in self.values.items()}
+        """Values by their offsets in `rows`, of a filter without an ensemble."""
+        return {at.at if isinstance(at, Place) else at: matrix for at, matrix in self.values.items()}
 
     @property
     def stores(self) -> tuple[list[tuple[Place, Matrix]], list[tuple[Place, Matrix]]]:
-        """Places of all values, then of all slopes."""
-        values = [(at if isinstance(at, Place) else Place("rows", at), one) for at, one in self.values.items()]
-        return values, [(Place("change", at), one) for at, one in self.slopes.items()]
+        """All values with the places where they are stored, then all slopes."""
+        values = [
+            (at if isinstance(at, Place) else Place("rows", at), matrix) for at, matrix in self.values.items()
+        ]
+        return values, [(Place("change", at), matrix) for at, matrix in self.slopes.items()]
 
 
 def stage_of(values: Mapping[int, Matrix], slopes: Mapping[int, Matrix], moves: Mapping[Matrix, Matrix]) -> Stage:
     """A stage that stores matrices at some places, and slopes of matrices at others."""
-    found = slopes_of(list(slopes.values()), moves)
-    kept: dict[int | Place, Matrix] = {at: one for at, one in values.items()}
-    return Stage(kept, {at: one for at, one in zip(slopes, found, strict=True) if one is not None})
+    derivatives = slopes_of(list(slopes.values()), moves)
+    stores: dict[int | Place, Matrix] = {at: matrix for at, matrix in values.items()}
+    return Stage(stores, {at: slope for at, slope in zip(slopes, derivatives, strict=True) if slope is not None})
 
 
-class Made(NamedTuple):
-    """A stage as two functions or programs, and how much of memory they use."""
+class StageWork(NamedTuple):
+    """A stage as two functions or programs, and the length of `rows` that they use."""
 
     values: Any
     slopes: Any
     length: int
 
 
-def as_programs(stage: Stage, first: int, most: int) -> Made:
-    """A stage as programs, whose kept numbers lie in rows from `first` on.
+def as_programs(stage: Stage, first: int, most: int) -> StageWork:
+    """A stage as programs, which store intermediate results in `rows` from `first` on.
 
     Raises:
         TypeError: if a function cannot be traced, or there are more than `most` operations.
     """
-    graph, wanted = Graph(most), [one for stores in stage.stores for _, one in stores]
+    graph, wanted = Graph(most), [matrix for stores in stage.stores for _, matrix in stores]
     entries = iter(evaluate(wanted, numbers_of(wanted, graph.given)))
     values, slopes = (
         [
@@ -84,57 +84,65 @@ def as_programs(stage: Stage, first: int, most: int) -> Made:
         ]
         for stores in stage.stores
     )
-    slopes = [(place, number) for place, number in slopes if number.arguments != (place,)]
+    slopes = [(position, number) for position, number in slopes if number.arguments != (position,)]
     order = needed_by([number for _, number in slopes])
-    kept = _kept(order, lambda one: one.of, _of_parameter, lambda one: one.operation in FREE)
-    rows = {number.place: Place("rows", first + k) for k, number in enumerate(kept)}
-    values += [(rows[number.place], number) for number in kept]
-    return Made(program_of(values, {}), program_of(slopes, rows), first + len(kept))
+    retained = _fixed_arguments(
+        order, lambda number: number.of, _of_parameter, lambda number: number.operation in FREE
+    )
+    rows = {number.place: Place("rows", first + k) for k, number in enumerate(retained)}
+    values += [(rows[number.place], number) for number in retained]
+    return StageWork(program_of(values, {}), program_of(slopes, rows), first + len(retained))
 
 
 def numbers_of(wanted: Sequence[Matrix], number: Callable[..., Number]) -> dict[Matrix, Any]:
-    """The entries `number(place)` of all matrices that are given of which some are made.
+    """The entries `number(place)` of all given matrices on which `wanted` depend.
 
-    Of a symmetric one those on and below the diagonal are read; of a member's `number` is told `member=True`.
+    Of a symmetric matrix only entries on and below the diagonal are read; for one of a member, `number` gets
+    `member=True`.
     """
-    return {one: _entries(one, number) for one in in_order(wanted) if isinstance(one.operation, Place)}
+    return {matrix: _entries(matrix, number) for matrix in in_order(wanted) if isinstance(matrix.operation, Place)}
 
 
-def _entries(one: Matrix, number: Callable[..., Number]) -> Any:
-    array, start = one.operation
-    found = np.empty(one.shape, dtype=object)
-    for at in np.ndindex(*one.shape):
-        there = tuple(sorted(at, reverse=True)) if one.symmetric else at
-        place = Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start)
-        found[at] = number(place, member=True) if one.member else number(place)
-    return found if one.shape else found[()]
+def _entries(matrix: Matrix, number: Callable[..., Number]) -> Any:
+    array, start = matrix.operation
+    entries = np.empty(matrix.shape, dtype=object)
+    for at in np.ndindex(*matrix.shape):
+        index = tuple(sorted(at, reverse=True)) if matrix.symmetric else at
+        position = Place(array, start + int(np.ravel_multi_index(index, matrix.shape)) if at else start)
+        entries[at] = number(position, member=True) if matrix.member else number(position)
+    return entries if matrix.shape else entries[()]
 
 
-def _of_parameter(one: Number | Matrix) -> bool:
-    """Whether a number or matrix is given, for each parameter another one."""
-    place = one.operation if isinstance(one, Matrix) else one.arguments[0] if one.operation == "given" else None
-    return isinstance(place, Place) and place.array in OF_PARAMETER
+def _of_parameter(node: Number | Matrix) -> bool:
+    """Whether a number or matrix is read from an array that differs between parameters."""
+    position = (
+        node.operation if isinstance(node, Matrix) else node.arguments[0] if node.operation == "given" else None
+    )
+    return isinstance(position, Place) and position.array in OF_PARAMETER
 
 
-def _kept(order: Sequence, of: Callable, of_parameter: Callable, free: Callable) -> list:
-    """What is no parameter's among the arguments of what is; what is free is worked out anew, of what is kept."""
+def _fixed_arguments(order: Sequence, of: Callable, of_parameter: Callable, free: Callable) -> list:
+    """Arguments of operations that depend on a parameter, which do not depend on one themselves.
+
+    Free ones are computed again instead of stored, so their own arguments take their place.
+    """
     moving: set[int] = set()
-    found: dict[int, Any] = {}
+    fixed: dict[int, Any] = {}
 
-    def keep(one) -> None:
-        if free(one):
-            for argument in of(one):
+    def keep(node) -> None:
+        if free(node):
+            for argument in of(node):
                 keep(argument)
         else:
-            found[id(one)] = one
+            fixed[id(node)] = node
 
-    for one in order:
-        if of_parameter(one) or any(id(a) in moving for a in of(one)):
-            moving.add(id(one))
-            for argument in of(one):
+    for node in order:
+        if of_parameter(node) or any(id(a) in moving for a in of(node)):
+            moving.add(id(node))
+            for argument in of(node):
                 if id(argument) not in moving:
                     keep(argument)
-    return list(found.values())
+    return list(fixed.values())
 
 
 def as_calls(
@@ -143,22 +151,23 @@ def as_calls(
     functions: Mapping[Operation, Callable],
     readers: Mapping,
     arrays: Sequence[str] = ARRAYS,
-) -> Made:
-    """A stage as functions that call others, whose kept matrices lie in rows from `first` on."""
+) -> StageWork:
+    """A stage as functions that call others, which store intermediate matrices in `rows` from `first` on."""
     values, slopes = stage.stores
-    slopes = [(place, one) for place, one in slopes if one.operation != place]
-    order = in_order([one for _, one in slopes], (), arguments_of)
-    kept = _kept(order, arguments_of, _of_parameter, lambda one: one.operation is present or not one.of)
-    rows = {}
-    for one in kept:
-        rows[one] = Place("rows", first)
-        first += prod(one.shape)
-    known = {one: one.operation for one in in_order([one for _, one in values + slopes]) if not one.of} | dict(
-        readers
+    slopes = [(position, matrix) for position, matrix in slopes if matrix.operation != position]
+    order = in_order([matrix for _, matrix in slopes], (), arguments_of)
+    retained = _fixed_arguments(
+        order, arguments_of, _of_parameter, lambda matrix: matrix.operation is present or not matrix.of
     )
-    values = values + [(place, one) for one, place in rows.items()]
+    rows = {}
+    for matrix in retained:
+        rows[matrix] = Place("rows", first)
+        first += prod(matrix.shape)
+    known = {matrix: matrix.operation for matrix in in_order([y for _, y in values + slopes]) if not matrix.of}
+    known |= readers
+    values = values + [(position, matrix) for matrix, position in rows.items()]
     of_values = calls_of(values, known, functions, arrays)
-    return Made(of_values, calls_of(slopes, known | rows, functions, arrays), first)
+    return StageWork(of_values, calls_of(slopes, known | rows, functions, arrays), first)
 
 
 # Stages of a page as programs, or, of models that cannot be traced, as calls.
@@ -178,19 +187,19 @@ def programs_of(
 ) -> Programs:
     """Stages of a filter with some page, for a model's functions and shape.
 
-    They are programs without calls where the functions can be traced and a stage has at most some ten thousand
-    operations; else each operation on matrices is a call of a function for its sizes, and so is the model.
+    They are programs without calls if the functions can be traced and a stage has at most some ten thousand
+    operations. Otherwise each operation on matrices is a call of a function for its sizes, and so is the model.
     """
     try:
-        memory, model = _seen(page, functions, shape, trace=True)
-        # The update, the largest stage, comes first: one that is too large shows at once.
-        programs = [as_programs(one, 0, MOST).values for one in stages(memory, model)[::-1]][::-1]
+        memory, model = _memory_and_model(page, functions, shape, trace=True)
+        # The update, the largest stage, comes first: if it is too large, no time is spent on the others.
+        programs = [as_programs(stage, 0, MOST).values for stage in stages(memory, model)[::-1]][::-1]
         works = [callable_of(program, 1, OF_STEPS) for program in programs]
         return Programs(memory, works, tuple(callable_of(program, LANES, OF_STEPS) for program in programs))
-    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
-        memory, model = _seen(page, functions, shape, trace=False)
-        made, readers = stages(memory, model), {memory.constants: constants_reader(shape)}
-        works = [as_calls(one, 0, model.called, readers, OF_STEPS).values for one in made]
+    except Exception:  # whatever a user's function raises if it gets Numbers: then it is called instead
+        memory, model = _memory_and_model(page, functions, shape, trace=False)
+        stage_list, readers = stages(memory, model), {memory.constants: constants_reader(shape)}
+        works = [as_calls(stage, 0, model.called, readers, OF_STEPS).values for stage in stage_list]
         return Programs(memory, works, ())
 
 
@@ -198,66 +207,70 @@ def programs_of(
 def works_of(*stages: Stage) -> list[Callable]:
     """Stages without a model as functions (rows, given, numbers): programs, or calls where these are too long."""
     try:
-        return [callable_of(as_programs(one, 0, MOST).values, 1, OF_STEPS) for one in stages]
+        return [callable_of(as_programs(stage, 0, MOST).values, 1, OF_STEPS) for stage in stages]
     except TypeError:
-        return [as_calls(one, 0, {}, {}, OF_STEPS).values for one in stages]
+        return [as_calls(stage, 0, {}, {}, OF_STEPS).values for stage in stages]
 
 
-def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool) -> tuple[RowMemory, Equations]:
+def _memory_and_model(
+    page: Page, functions: Functions, shape: Shape, *, trace: bool
+) -> tuple[RowMemory, Equations]:
     memory = RowMemory(shape, page)
     return memory, Equations(functions, memory, constants_move=False, trace=trace)
 
 
 def stored(
-    results: tuple, targets: Sequence[Matrix | Place | int], kept: Mapping[str, Matrix] | None = None
+    results: tuple, targets: Sequence[Matrix | Place | int], extras: Mapping[str, Matrix] | None = None
 ) -> Stage:
-    """The stage that leaves results of a page where some matrices lie, or at places.
+    """The stage that stores results of a page.
 
     Args:
-        results: matrices, behind which a dictionary may say what changes of what is kept.
-        targets: where they are to lie.
-        kept: where what is kept lies.
+        results: matrices, then perhaps a dictionary of extras that change.
+        targets: for each matrix of the results a place, or a matrix whose place it takes.
+        extras: all extras, by name, as they are read from memory.
     """
-    *values, changed = with_kept(results)
-    places = [*targets, *((kept or {})[name] for name in changed)]
+    *values, changed = with_extras(results)
+    positions = [*targets, *((extras or {})[name] for name in changed)]
     stores: dict[int | Place, Matrix] = {}
-    for place, value in zip(places, (*values, *changed.values()), strict=True):
-        if isinstance(place, Matrix):
-            if place.symmetric and not value.symmetric or place.shape != value.shape:
-                raise TypeError(f"a page must return the symmetric part of {value!r}, by sym, and {place.shape}")
-            place = place.operation
-        if value.member and not (isinstance(place, Place) and place.array in BY_MEMBERS):
+    for position, value in zip(positions, (*values, *changed.values()), strict=True):
+        if isinstance(position, Matrix):
+            if position.symmetric and not value.symmetric or position.shape != value.shape:
+                raise TypeError(
+                    f"a page must return the symmetric part of {value!r}, by sym, and {position.shape}"
+                )
+            position = position.operation
+        if value.member and not (isinstance(position, Place) and position.array in BY_MEMBERS):
             raise TypeError(f"a page must return {value!r} of all members, such as a mean, not of each")
-        stores[place] = value
+        stores[position] = value
     return Stage(stores, {})
 
 
-def with_kept(results: Any) -> tuple:
-    """What a page returns, with what changes of what is kept behind it."""
-    found = together(results)
-    return found if found and isinstance(found[-1], dict) else (*found, {})
+def with_extras(results: Any) -> tuple:
+    """The results of a page, then a dictionary of the extras that change, empty if it returns none."""
+    values = as_tuple(results)
+    return values if values and isinstance(values[-1], dict) else (*values, {})
 
 
-def together(results: Any) -> tuple:
-    """What a page returns, as a tuple."""
+def as_tuple(results: Any) -> tuple:
+    """The results of a page, one or several, as a tuple."""
     return results if isinstance(results, tuple) else (results,)
 
 
 def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
-    """What a page stores: at the start, where a prediction begins, in each substep, at its end, in an update."""
-    places, x, p = memory_places(memory.shape.n, memory.shape.m), memory.x, memory.P
+    """Stages of a page: the start; the representation, a substep and the end of a prediction; the update."""
+    layout, x, p = memory_places(memory.shape.n, memory.shape.m), memory.x, memory.P
     started = page.started(model)
     model.extras = memory.keep(started)
-    begun = (x, p) if page.represent is None else together(page.represent(model, x, p))
-    flying = (x, p) if page.represent is None else [memory.another(one) for one in begun]
-    advanced = together(page.propagate(model, *flying, memory.u))
-    told = places.innovation, places.innovation_cov, places.log_likelihood
+    begun = (x, p) if page.represent is None else as_tuple(page.represent(model, x, p))
+    predicted = (x, p) if page.represent is None else [memory.another(matrix) for matrix in begun]
+    advanced = as_tuple(page.propagate(model, *predicted, memory.u))
+    outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     return [
         stored((started,), (), memory.kept),
-        Stage({}, {}) if page.represent is None else stored(begun, flying),
-        stored(advanced, flying, memory.kept),
-        stored(page.add_process_noise(model, *flying), (x, p), memory.kept),
-        stored(page.update(model, x, p, memory.z), (x, p, *told), memory.kept),
+        Stage({}, {}) if page.represent is None else stored(begun, predicted),
+        stored(advanced, predicted, memory.kept),
+        stored(page.add_process_noise(model, *predicted), (x, p), memory.kept),
+        stored(page.update(model, x, p, memory.z), (x, p, *outputs), memory.kept),
     ]
 
 
@@ -266,22 +279,22 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of a page for a model's functions and shape."""
     n, m = shape.n, shape.m
     memory, works, vectors = programs_of(page, functions, shape, partial(stages_of, page))
-    start, begin, advance, settle, correct = works
-    places, kept = memory_places(n, m), sum(prod(one.shape) for one in memory.kept.values())
-    prior, step_place, substeps_place = prior_start(shape), places.step, number_places(n, m).substeps
+    start_extras, represent, advance, add_process_noise, correct = works
+    layout, extras_size = memory_places(n, m), sum(prod(matrix.shape) for matrix in memory.kept.values())
+    prior, step_place, substeps_place = prior_start(shape), layout.step, number_places(n, m).substeps
 
     @inlined
     def begin_belief(memory, numbers, size):
         prior(memory, numbers, size)
-        start(memory[0], numbers, numbers)
+        start_extras(memory[0], numbers, numbers)
 
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
-        begin(row, u, numbers)
+        represent(row, u, numbers)
         for _ in range(int(numbers[substeps_place])):
             advance(row, u, numbers)
-        settle(row, u, numbers)
+        add_process_noise(row, u, numbers)
         row[step_place] += 1.0
 
     @inlined
@@ -290,8 +303,8 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
 
     return Kernels(
         *(n, m, n, 0, begin_belief, predict, update, nothing_to_summarise),
-        extras=kept,
-        scratch=memory.end - places.extras - kept,
+        extras=extras_size,
+        scratch=memory.end - layout.extras - extras_size,
         vectors=vectors[1:],
     )
 
@@ -315,7 +328,7 @@ def prior_start(shape: Shape) -> Callable:
 
 @inlined
 def nothing_to_summarise(memory, size):
-    """Mean and covariance are the belief itself."""
+    """Do nothing: mean and covariance are the belief itself."""
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""A page of an ensemble filter as kernels of the engine: what it says of a member is done for each of them."""
+"""A page of an ensemble filter as kernels of the engine: equations of a member are evaluated for each member."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import quotient, wrap
 from filters.engine.belief import Kernels, memory_places, own_place
 from filters.pages.equations import Equations, PagedModel
-from filters.pages.kernels import Stage, as_calls, as_programs, stored, with_kept
+from filters.pages.kernels import Stage, as_calls, as_programs, stored, with_extras
 from filters.pages.page import NumbersMemory, Page
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -21,14 +21,14 @@ from thruster_env.graphs.loops import cut
 from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of
 from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
 
-# Operations and sums of a stage: beyond, instructions take longer to compile than calls.
+# Operations and sums of a stage; with more, programs without calls take longer to compile than calls.
 MOST, MOST_SUMS = 14_000, 600
 
 
 class MembersMemory(NumbersMemory):
     """The memory of an ensemble.
 
-    rows     the row of `filters.engine.belief`: its extras are what the filter keeps beside its members
+    rows     the row of `filters.engine.belief`, with the filter's extras
     given    u or z
     numbers  the model's, then the filter's own
     table    a row for each component of the members x, then scratch
@@ -48,20 +48,20 @@ class MembersMemory(NumbersMemory):
 
 
 def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
-    """What a page stores: at the start, in each substep, at its end, in an update; and the belief's moments."""
-    x, places = memory.x, memory_places(memory.shape.n, memory.shape.m)
-    told = places.innovation, places.innovation_cov, places.log_likelihood
+    """Stages of a page by name: the start, a substep, the end of a step, the update, and the belief's moments."""
+    x, layout = memory.x, memory_places(memory.shape.n, memory.shape.m)
+    outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
     started = page.started(model)
-    kept = model.extras = memory.keep(started)
-    moved, *rest, changed = with_kept(page.update(model, x, memory.z, memory.e))
+    extras = model.extras = memory.keep(started)
+    updated, *rest, changed = with_extras(page.update(model, x, memory.z, memory.e))
     of_belief = memory.mean, memory.P
     return {
-        "start": stored((prior, started), (x,), kept),
+        "start": stored((prior, started), (x,), extras),
         "advance": stored((page.propagate(model, x, memory.u),), (x,)),
         "settle": stored((page.add_process_noise(model, x, memory.w),), (x,)),
-        "analyse": stored((moved,), (x,)),
-        "update": stored((moved, *rest, *moments(model, moved), changed), (x, *told, *of_belief), kept),
+        "analyse": stored((updated,), (x,)),
+        "update": stored((updated, *rest, *moments(model, updated), changed), (x, *outputs, *of_belief), extras),
         "summarise": stored(moments(model, x), of_belief),
     }
 
@@ -85,14 +85,14 @@ def works_of(
 ) -> dict[str, Works]:
     """Stages of an ensemble's page, for a model's functions and shape.
 
-    They are programs without calls, as `programs.programs_of` makes them. Of a large model all are calls, and of a
-    function that cannot be traced those that need it. `stages(page, memory, model)` names them; they leave rows of
-    the table before `first` alone, n by default, but for those that they store.
+    They are programs without calls, as `kernels.programs_of` makes them. Stages of a large model are calls, and so
+    are those that need a function that cannot be traced. `stages(page, memory, model)` returns them by name; in
+    the table's rows before `first`, by default n, they write only what they store.
     """
-    memory, model, called = _seen(page, functions, shape, stages, trace=False)
+    memory, model, called = _stages_for(page, functions, shape, stages, trace=False)
     readers, first = {memory.constants: constants_reader(shape)}, shape.n if first is None else first
     if not _is_large(called["update"]):
-        _, _, traced = _seen(page, functions, shape, stages, trace=True)
+        _, _, traced = _stages_for(page, functions, shape, stages, trace=True)
         try:
             return {name: _work_of(traced[name], stage, model, readers, first) for name, stage in called.items()}
         except TooLarge:
@@ -101,10 +101,16 @@ def works_of(
 
 
 def _is_large(stage: Stage) -> bool:
-    """Whether a stage has so many sums over members and quotients C S^-1 that calls are compiled sooner."""
-    made = in_order(list(stage.values.values()))
-    sums = sum(prod(one.shape) // (1 + one.symmetric) for one in made if getattr(one.operation, "reduces", False))
-    quotients = sum(2 * prod(one.shape) * one.shape[-1] for one in made if one.operation is quotient)
+    """Whether a stage has so many sums over members and quotients C S^-1 that calls compile faster."""
+    matrices = in_order(list(stage.values.values()))
+    sums = sum(
+        prod(matrix.shape) // (1 + matrix.symmetric)
+        for matrix in matrices
+        if getattr(matrix.operation, "reduces", False)
+    )
+    quotients = sum(
+        2 * prod(matrix.shape) * matrix.shape[-1] for matrix in matrices if matrix.operation is quotient
+    )
     return sums > MOST_SUMS or quotients > MOST
 
 
@@ -117,14 +123,14 @@ def _work_of(traced: Stage, called: Stage, model: Equations, readers: dict, firs
         return _as_calls(called, model, readers, first)
 
 
-def _seen(page: Page, functions: Functions, shape: Shape, stages: Callable, *, trace: bool):
+def _stages_for(page: Page, functions: Functions, shape: Shape, stages: Callable, *, trace: bool):
     memory = MembersMemory(shape, page)
     model = Equations(functions, memory, constants_move=False, trace=trace, partly=True)
     return memory, model, stages(page, memory, model)
 
 
 def of_members(stage: Stage, first: int) -> Works:
-    """A stage as a program, which keeps numbers of members in rows of the table from `first` on.
+    """A stage as a program, which stores intermediate numbers of members in rows of the table from `first` on.
 
     Raises:
         TypeError: if a function cannot be traced, or there are too many operations.
@@ -134,26 +140,26 @@ def of_members(stage: Stage, first: int) -> Works:
     return Works(
         work,
         cut(program, first).rows,
-        max((place.at + 1 for place, _ in program.reads if place.array == "draws"), default=0),
+        max((position.at + 1 for position, _ in program.reads if position.array == "draws"), default=0),
     )
 
 
 def _as_calls(stage: Stage, model: Equations, readers: dict, first: int) -> Works:
     work = as_calls(stage, 0, model.called, readers, OF_MEMBERS).values
-    given = [one for one in in_order(list(stage.values.values())) if isinstance(one.operation, Place)]
-    draws = (one.operation.at + prod(one.shape) for one in given if one.operation.array == "draws")
+    inputs = [matrix for matrix in in_order(list(stage.values.values())) if isinstance(matrix.operation, Place)]
+    draws = (matrix.operation.at + prod(matrix.shape) for matrix in inputs if matrix.operation.array == "draws")
     return Works(work, first, max(draws, default=0))
 
 
 def analysis_of(page: Page, functions: Functions, shape: Shape) -> Callable:
-    """Return `analyse(memory, z, numbers, size)`, which moves the members by a measurement and does no more."""
+    """Return `analyse(memory, z, numbers, size)`: update the members, without innovation and likelihood."""
     return _correction(works_of(page, functions, shape)["analyse"], shape)
 
 
 def _correction(work: Works, shape: Shape) -> Callable:
-    places, m = memory_places(shape.n, shape.m), shape.m
+    layout, m = memory_places(shape.n, shape.m), shape.m
     correct, _, draws_noise = work
-    step, key_0, key_1 = places.step, places.key_0, places.key_1
+    step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined
     def update(memory, z, numbers, size):
@@ -170,15 +176,15 @@ def _correction(work: Works, shape: Shape) -> Callable:
 
 
 def kept_size(page: Page, shape: Shape) -> int:
-    """How many numbers a page keeps beside the members."""
-    return sum(prod(one.shape) for one in page.started(PagedModel(MembersMemory(shape, page))).values())
+    """Count of a page's extras: numbers that it keeps besides the members."""
+    return sum(prod(matrix.shape) for matrix in page.started(PagedModel(MembersMemory(shape, page))).values())
 
 
 def predictor(works: dict[str, Works], shape: Shape) -> Callable:
-    """Return `predict(memory, u, numbers, size)`: members moved in all substeps, then the end of the step."""
-    places, substeps = memory_places(shape.n, shape.m), number_places(shape.n, shape.m).substeps
-    advance, (settle, _, drawn) = works["advance"].work, works["settle"]
-    step, key_0, key_1 = places.step, places.key_0, places.key_1
+    """Return `predict(memory, u, numbers, size)`: propagate members in all substeps, then add process noise."""
+    layout, substeps = memory_places(shape.n, shape.m), number_places(shape.n, shape.m).substeps
+    advance, (add_process_noise, _, drawn) = works["advance"].work, works["settle"]
+    step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined
     def predict(memory, u, numbers, size):
@@ -187,7 +193,7 @@ def predictor(works: dict[str, Works], shape: Shape) -> Callable:
             advance(row, u, numbers, table, draws, size)
         row[step] += 1.0
         fill_normals(draws, drawn * table.shape[1], row[step], FILTER_PROCESS, row[key_0], row[key_1])
-        settle(row, u, numbers, table, draws, size)
+        add_process_noise(row, u, numbers, table, draws, size)
 
     return predict
 
@@ -196,14 +202,14 @@ def predictor(works: dict[str, Works], shape: Shape) -> Callable:
 def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of an ensemble's page for a model's functions and shape."""
     n, m, works = shape.n, shape.m, works_of(page, functions, shape)
-    begin, moments_of, places = works["start"].work, works["summarise"].work, memory_places(n, m)
-    step, key_0, key_1 = places.step, places.key_0, places.key_1
+    draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_places(n, m)
+    step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         fill_normals(draws, n * table.shape[1], row[step], FILTER_PRIOR, row[key_0], row[key_1])
-        begin(row, numbers, numbers, table, draws, size)
+        draw_prior(row, numbers, numbers, table, draws, size)
 
     @inlined
     def summarise(memory, size):

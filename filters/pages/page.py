@@ -1,17 +1,17 @@
-"""What a filter is that is written as in a textbook: pure functions of small matrices.
+"""A page: a filter as a textbook writes it, pure functions of a model and small matrices.
 
-The functions take a model, whose f(x, u), F(x, u), h(x), H(x), Q and R are those of the equations, and matrices.
-Without points or other forms of the belief a step is
+The model has f(x, u), F(x, u), h(x), H(x), Q and R of the equations. If the belief is a mean and a covariance, a
+step is
 
     x, P = add_process_noise(model, *propagate(model, x, P, u)),  propagate once for each of the model's substeps
     x, P, v, S, log N(v; 0, S) = update(model, x, P, z)
 
-Filters that predict another form of the belief, such as sigma points X, have a `represent` that makes it:
+Filters that propagate another representation of the belief, such as sigma points X, compute it in `represent`:
 
     x, P = add_process_noise(model, propagate(model, represent(model, x, P), u))
 
-What else a filter carries, such as an estimate of R, `initial(model)` returns as a dictionary. The functions
-read it from `model.extras`, and return what changes in a dictionary behind their other results.
+A filter may keep extras, such as an estimate of R: `initial(model)` returns them as a dictionary at the prior. The
+functions read them from `model.extras`; as their last result they may return a dictionary of those that change.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from thruster_env.model.shape import Shape, number_places
 
 
 class Page(NamedTuple):
-    """The functions of a filter, and what stands in `model.own`."""
+    """The functions of a filter, and the parameters that they read from `model.own`."""
 
     propagate: Callable  # in each of the model's substeps
     add_process_noise: Callable  # at the end of a step
@@ -37,34 +37,34 @@ class Page(NamedTuple):
     represent: Callable | None = None
     initial: Callable | None = None
     own: tuple[tuple[str, tuple[int, ...]], ...] = ()  # parameters and their shapes
-    fixed: tuple[tuple[str, Any], ...] = ()  # values that stand in programs, such as how often a loop runs
-    rejuvenate: Callable | None = None  # of particles that were resampled
-    lookahead: Callable | None = None  # of particles that are resampled in the update, before that
-    per_particle: tuple[str, ...] = ()  # what is kept of each particle
+    fixed: tuple[tuple[str, Any], ...] = ()  # constants of the program, such as the number of iterations
+    rejuvenate: Callable | None = None  # particle filters: after resampling
+    lookahead: Callable | None = None  # particle filters that resample in the update: before resampling
+    per_particle: tuple[str, ...] = ()  # names of extras that each particle has
 
     def started(self, model: Any) -> dict[str, Any]:
-        """What a filter keeps, at the prior."""
+        """The filter's extras at the prior."""
         return {} if self.initial is None else self.initial(model)
 
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
-        """What pages find in `model.own`: `read(place, shape)` of each parameter, and fixed values."""
-        values, place = [], 0
+        """`model.own` of pages: `read(offset, shape)` of each parameter, and the fixed values."""
+        values, offset = [], 0
         for _, shape in self.own:
-            values.append(read(place, shape))
-            place += prod(shape)
+            values.append(read(offset, shape))
+            offset += prod(shape)
         names = tuple(name for name, _ in (*self.own, *self.fixed))
         return _own_class(names)(*values, *(value for _, value in self.fixed))
 
-    def places(self, first: int) -> dict[str, int]:
-        """Where each parameter begins, if they lie one behind the other from `first` on."""
-        found = {}
+    def parameter_offsets(self, first: int) -> dict[str, int]:
+        """The offset of each parameter, if the first has the offset `first`."""
+        offsets = {}
         for name, shape in self.own:
-            found[name], first = first, first + prod(shape)
-        return found
+            offsets[name], first = first, first + prod(shape)
+        return offsets
 
     @property
     def own_size(self) -> int:
-        """How many numbers the parameters are."""
+        """Number of floats that the parameters take."""
         return sum(prod(shape) for _, shape in self.own)
 
 
@@ -73,40 +73,37 @@ def _own_class(names: tuple[str, ...]) -> type:
     return namedtuple("Own", names)
 
 
-# The matrices that stand for numbers in memory: a model's and a filter's, and those of a belief's row.
-
-
 class NumbersMemory:
-    """What `numbers` holds: Q, R, scales, constants, and the filter's parameters.
+    """Matrices read from `numbers`: Q, R, scales, constants, and the filter's parameters.
 
     Attributes:
-        own: parameters, as pages find them.
-        kept: what the filter keeps besides mean and covariance, by name.
-        end: the next place in a filter's row, behind what is kept.
-        constants_slope, size: along a parameter that moves constants, if there are such.
+        own: parameters, as pages read them.
+        kept: the filter's extras, by name.
+        end: the first free offset in a filter's row, after the extras.
+        constants_slope, size: along a parameter that moves constants, if there are any.
         ratio: the last input as a number, if it is the step ratio.
-        belief: where mean and covariance lie.
-        told: where the innovation, its covariance and its log density lie.
+        belief: places of mean and covariance.
+        told: places of the innovation, its covariance and its log density.
     """
 
-    def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, own: int):
-        """Take the sizes, matrices that stand for a belief, and where the filter's parameters begin."""
+    def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, first_parameter: int):
+        """Take the sizes, matrices that stand for a belief, and the offset of the filter's first parameter."""
         n, m = shape.n, shape.m
-        places, row = number_places(n, m), memory_places(n, m)
+        layout, row = number_places(n, m), memory_places(n, m)
         self.belief = Place("rows", row.mean), Place("rows", row.cov)
         self.told = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
-        self.Q = self.read("numbers", places.q, n, n, symmetric=True)
-        self.R = self.read("numbers", places.r, m, m, symmetric=True)
-        self.Q_root = self.read("numbers", places.q_root, n, n)
-        self.R_root = self.read("numbers", places.r_root, m, m)
-        self.prior_mean = self.read("numbers", places.prior_mean, n)
-        self.prior_root = self.read("numbers", places.prior_root, n, n)
-        self.scales = self.read("numbers", places.scales, n)
-        # Where there are none, they must not lie where the filter's parameters begin: tensors are known by place.
-        at = places.constants if shape.constants else places.substeps
+        self.Q = self.read("numbers", layout.q, n, n, symmetric=True)
+        self.R = self.read("numbers", layout.r, m, m, symmetric=True)
+        self.Q_root = self.read("numbers", layout.q_root, n, n)
+        self.R_root = self.read("numbers", layout.r_root, m, m)
+        self.prior_mean = self.read("numbers", layout.prior_mean, n)
+        self.prior_root = self.read("numbers", layout.prior_root, n, n)
+        self.scales = self.read("numbers", layout.scales, n)
+        # Tensors are found by place: without constants this must not be the place of the filter's first parameter.
+        at = layout.constants if shape.constants else layout.substeps
         self.constants = self.read("numbers", at, shape.constants)
-        self.own = page.parameters(lambda place, size: self.read("numbers", own + place, *size))
+        self.own = page.parameters(lambda offset, size: self.read("numbers", first_parameter + offset, *size))
         self.kept: Mapping[str, Matrix] = {}
         self.end = row.extras
         self.constants_slope: Matrix | None = None
@@ -114,35 +111,35 @@ class NumbersMemory:
         self.size: Matrix | None = None
 
     def ratio_in(self, array: str, inputs: int) -> Matrix | None:
-        """The last of the inputs, which lie in an array from a place on, of a model with a step ratio."""
+        """The last of the inputs, which begin at offset `inputs` of an array, if it is the step ratio."""
         return self.read(array, inputs + self.shape.inputs - 1) if self.shape.step_ratio else None
 
     def read(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
-        """A matrix that lies in an array from a place on."""
+        """A matrix stored in an array from the offset `first` on."""
         return given(Place(array, first), shape, symmetric=symmetric, like=self.x)
 
     def keep(self, started: Mapping[str, Any]) -> Mapping[str, Matrix]:
-        """Give what a filter keeps its place, one behind the other."""
-        self.kept = {name: self.another(one, symmetric=one.symmetric) for name, one in started.items()}
+        """Lay out the extras of a filter in its row, and return them as matrices read from there."""
+        self.kept = {name: self.another(value, symmetric=value.symmetric) for name, value in started.items()}
         return self.kept
 
     def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
-        """A matrix of the same shape in the next places of the row."""
-        made = self.read("rows", self.end, *like.shape, symmetric=symmetric)
+        """A matrix of the same shape at the first free offset of the row."""
+        matrix = self.read("rows", self.end, *like.shape, symmetric=symmetric)
         self.end += prod(like.shape)
-        return made
+        return matrix
 
 
 class RowMemory(NumbersMemory):
     """The memory of a filter that runs.
 
-    rows     the row of `filters.engine.belief`: its extras are what the filter keeps, then scratch
+    rows     the row of `filters.engine.belief`, with the filter's extras, then scratch
     given    u or z
     numbers  the model's, then the filter's own
     """
 
     def __init__(self, shape: Shape, page: Page):
-        """Take the sizes; what is kept or in flight finds its place when it is known."""
+        """Take the sizes. Extras and other representations of the belief are laid out once they are known."""
         row = memory_places(shape.n, shape.m)
         x = given(Place("rows", row.mean), (shape.n,))
         p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)

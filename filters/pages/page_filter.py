@@ -20,14 +20,14 @@ __all__ = ["FilterWithPage", "Page", "PageFilter"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FilterWithPage(Filter):
-    """What filters that have a page share; subclasses name it, and add their parameters as fields.
+    """Base of filters that have a page; subclasses set `page`, and add their parameters as fields.
 
     Attributes:
         page: its functions.
-        unrolled: fields that are whole numbers and say how often something is repeated; each value has a program
-            of its own. Other fields are numbers that programs read.
-        ranges: of fields that studies may tune, the smallest and the largest value.
-        resampled: whether it has particles that are resampled, which is done here alone.
+        unrolled: names of integer fields that count repetitions; each value has a program of its own. Other fields
+            are numbers that programs read.
+        ranges: the smallest and the largest value of each field that studies may tune.
+        resampled: whether it has particles that are resampled; only the engine runs such a filter.
     """
 
     page: ClassVar[Page]
@@ -37,12 +37,12 @@ class FilterWithPage(Filter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Numbers and arrays that the page finds in `model.own`: fields, unless a filter says otherwise."""
+        """Numbers and arrays that the page reads from `model.own`: by default the fields."""
         return {name: getattr(self, name) for name in self._fields() if name not in self.unrolled}
 
     @property
     def follows_from(self) -> Mapping[str, tuple[str, ...]]:
-        """Parameters that are worked out of numbers of the model when the filter is made, and these numbers."""
+        """Parameters that are computed from numbers of the model when the filter is made, and these numbers."""
         return {}
 
     def _fields(self) -> Iterator[str]:
@@ -56,12 +56,14 @@ class FilterWithPage(Filter):
     @property
     def plain_page(self) -> Page:
         """The page, with the shapes of the parameters."""
-        own = tuple((name, np.shape(value)) for name, value in self.parameters.items())
-        return self.page._replace(own=own, fixed=tuple((name, getattr(self, name)) for name in self.unrolled))
+        parameters = tuple((name, np.shape(value)) for name, value in self.parameters.items())
+        return self.page._replace(
+            own=parameters, fixed=tuple((name, getattr(self, name)) for name in self.unrolled)
+        )
 
     @property
     def written_page(self) -> Page:
-        """The page that is run: the plain one, unless a filter says otherwise."""
+        """The page that is run: by default the plain one."""
         return self.plain_page
 
 
@@ -70,7 +72,7 @@ class PageFilter(FilterWithPage):
     """Base of filters that have a page of mean and covariance; see `FilterWithPage`.
 
     Attributes:
-        forms: pages of the same estimates in other arithmetic, by what the field `form` is for them.
+        forms: pages of the same estimates in other arithmetic, by the value of the field `form`.
     """
 
     forms: ClassVar[Mapping[str, Page]] = {}
@@ -95,7 +97,7 @@ class PageFilter(FilterWithPage):
 
 
 def with_page(filter_: Filter, what: str) -> FilterWithPage:
-    """A filter whose page has no resampling; of another one, and of a model with bounds, raise ValueError."""
+    """Return the filter; raise ValueError unless its page has no resampling and its model no bounds."""
     if not isinstance(filter_, FilterWithPage) or filter_.resampled:
         which = " without resampling" if isinstance(filter_, FilterWithPage) else ""
         raise ValueError(f"{what} must have a page{which}, as 'ekf' and 'enkf' have, but got {filter_.name!r}")

@@ -14,7 +14,7 @@ from filters.algebra.samples import effective_size, normalised, weighted_covaria
 from filters.algebra.scalars import at_least
 from filters.engine.belief import Kernels, memory_places, own_place
 from filters.pages.equations import PagedModel
-from filters.pages.kernels import Stage, anything_measured, stored, with_kept
+from filters.pages.kernels import Stage, anything_measured, stored, with_extras
 from filters.pages.members import MembersMemory, predictor, works_of
 from filters.pages.page import Page
 from thruster_env.core.compiled import inlined, not_inlined
@@ -51,7 +51,7 @@ class Layout:
         self.x, self.logarithm = memory.x, given(Place("table", n), (), member=True, like=memory.x)
         self.size, self.kept = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
-        self.start = with_kept(page.initial(model, memory.w))  # type: ignore[misc]
+        self.start = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
         for name, one in self.start[-1].items():
             if name in page.per_particle:
                 place = Place("table", rows)
@@ -99,7 +99,7 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
             found |= dict(zip(memory.belief, at.moments(model, mu, w, None)[1:], strict=True))
         stages["foresee"] = stored(tuple(found.values()), tuple(found))
         log_w = log_w + memory.read("rows", likelihood.at)
-    x, log_w, *told, changed = with_kept(page.update(model, x, log_w, memory.z, memory.e))
+    x, log_w, *told, changed = with_extras(page.update(model, x, log_w, memory.z, memory.e))
     w, level = normalised(log_w)
     x, *moments = at.moments(model, x, w, changed.get("P"))
     log_w = at_least(log_w - level, LOWEST)  # a particle that expects no number has hardly any weight
@@ -182,7 +182,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     step, key_0, key_1, likelihood = places.step, places.key_0, places.key_1, places.log_likelihood
     innovation, cov, r_place, mean_place = places.innovation, places.innovation_cov, source.r, places.mean
     logarithm, size_place = n, layout.size.at
-    threshold = page.places(own_place(shape)).get("resampling_threshold", 0)
+    threshold = page.parameter_offsets(own_place(shape)).get("resampling_threshold", 0)
     move = systematic_resampler(n + 1 if page.lookahead else layout.rows, layout.weight.at, scratch)
     (begin, _, drawn), (correct, _, proposed) = works["start"], works["update"]
     choose, moments, predict = works["choose"].work, works["summarise"].work, predictor(works, shape)

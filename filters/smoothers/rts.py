@@ -22,7 +22,7 @@ from filters.engine.batch import Estimates
 from filters.engine.belief import memory_places
 from filters.gaussian.kalman import constants_at
 from filters.pages.equations import Equations
-from filters.pages.kernels import Stage, programs_of, stored, together
+from filters.pages.kernels import Stage, as_tuple, programs_of, stored
 from filters.pages.page import Page, RowMemory
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.angles import difference
@@ -146,12 +146,12 @@ def _smoother(
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
         x, p = memory.x, memory.P
-        begun = together(relation.represent(model, x, p))
+        begun = as_tuple(relation.represent(model, x, p))
         flying = [memory.another(one) for one in begun]
         linked = relation.link(model, x, p, *flying)
         links = [memory.another(one, symmetric=one.symmetric) for one in linked]
         later = memory.another(x), memory.another(p, symmetric=True)
-        advanced = together(relation.propagate(model, *flying, memory.u))
+        advanced = as_tuple(relation.propagate(model, *flying, memory.u))
         return [
             stored(begun, flying),
             stored(advanced, flying),

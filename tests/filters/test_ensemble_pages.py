@@ -12,7 +12,7 @@ from filters.algebra.members import mean
 from filters.algebra.operations import divide
 from filters.differentiated.runs import differentiable
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
-from filters.pages.kernels import with_kept
+from filters.pages.kernels import with_extras
 from filters.pages.page import Page
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, wide_pendulum
@@ -76,7 +76,7 @@ def run_page(filter_, key, inputs, measurements):
                 x = page.propagate(equations, x, inputs[k - 1][:, None])
             x = page.add_process_noise(equations, x, normals(model.n, k, FILTER_PROCESS))
         told = page.update(equations, x, z[:, None], normals(model.m, k, FILTER_MEASUREMENT))
-        x, v, s, level, equations.extras = with_kept(told)
+        x, v, s, level, equations.extras = with_extras(told)
         mean = x.mean(axis=1)
         wrapped = np.where(equations.state_angles, np.angle(np.exp(1j * mean)), mean)
         found.append((wrapped, np.cov(x).reshape(model.n, model.n), v[:, 0], s, level))
