@@ -252,7 +252,6 @@ def test_a_study_finds_the_acceleration_of_a_target():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("as_python")
 def test_a_study_tunes_inflation_and_nothing_else():
     short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
     choice, score = tune_inflation("etkf", short, trials=3, runs=4)
