@@ -77,6 +77,7 @@ def test_what_is_reported_to_the_pruner_is_an_equal_share_of_each_problem(proble
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_path):
     found = tuning.tune(list(problems), "ekf", trials=14, consistent=False, progress=False)
     complete = (trial for trial in found.trials if trial.state == TrialState.COMPLETE)
