@@ -1,6 +1,6 @@
-"""What pages of square-root and information filters say: inverses, orthogonal triangles, and blocks of matrices.
+"""Operations of square-root and information filters: inverses, orthogonal triangles, and blocks of matrices.
 
-Filters in these forms are differentiated in the covariance form, so that most of them have no derivative.
+Most have no derivative, because filters in these forms are differentiated in the covariance form.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from filters.algebra import matrices, scalars
 from filters.algebra.matrices import Operation, minus, operation, same, through
 from filters.algebra.operations import factor, forward, mirrored, pivoted
-from thruster_env.core import matrices as made
+from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.matrices import NEGLIGIBLE
 from thruster_env.core.sources import Source, assembled, is_array, matrix_of, part_of, written_out, zeros_of
 from thruster_env.graphs.graphs import where
@@ -27,7 +27,7 @@ def inverse_of(s):
 
 @operation(same, lambda of: True)
 def inverted(of):
-    """S^-1 = W' W of a factor of S, with W = d^(-1/2) L^-1: symmetric and positive by construction."""
+    """S^-1 = W' W from a factor of S, with W = d^(-1/2) L^-1: symmetric and positive by construction."""
     lower, d = of
     w = forward(np.array(np.eye(len(d)), dtype=d.dtype), lower).T  # L^-1
     return mirrored.compute((w.T * (1.0 / d)) @ w)
@@ -35,21 +35,20 @@ def inverted(of):
 
 @operation(same)
 def careful(s):
-    """The factor of a positive semidefinite S, for `operations.quotient`, with which quotients are finite.
+    """The factor of a positive semidefinite S, with which `operations.quotient` is finite.
 
-    Where a pivot is zero but for rounding d is infinite, so that dividing gives zero there. For a numerator in the
-    range of S that is a solution: components known exactly have no share in a gain.
+    If a pivot is zero but for rounding, d is infinite, so that dividing by it gives zero. For a numerator in the
+    range of S that is a solution: the gain of components that are known exactly is zero.
     """
     return pivoted(s, lambda d, variance: d > NEGLIGIBLE * variance, math.inf)
 
 
 @operation(lambda a: (a[0], a[0]))
 def triangle(a):
-    """The lower triangular L with L L' = A A'; a row that depends on those above it has a zero there.
+    """The lower triangular L with L L' = A A'; the diagonal is zero in a row that depends on those above it.
 
-    Its rows are those of A in the basis that Gram and Schmidt's method makes of them: the modified method, whose
-    L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
-    Gram-Schmidt orthogonalization".
+    The modified Gram-Schmidt method orthogonalises the rows of A; L is as accurate as by Householder's method.
+    Source: Bjorck (1967), "Solving linear least squares problems by Gram-Schmidt orthogonalization".
     """
     rows, lower = [row for row in np.array(a)], np.full((len(a), len(a)), 0.0, dtype=a.dtype)
     for i, row in enumerate(rows):
@@ -77,7 +76,7 @@ def vstack(a, b):
 
 @operation(lambda a, top, left, rows, columns: (rows, columns))
 def part(a, top, left, rows, columns):
-    """The block of so many rows and columns whose first entry stands at (top, left)."""
+    """The block with `rows` rows and `columns` columns whose first entry is a[top, left]."""
     return a[top : top + rows, left : left + columns]
 
 
@@ -85,38 +84,38 @@ def part(a, top, left, rows, columns):
     lambda a, rows, columns: (len(rows), len(columns)), lambda a, rows, columns: a.symmetric and rows == columns
 )
 def pick(a, rows, columns):
-    """These rows and columns of a matrix, in this order."""
+    """The given rows and columns of a matrix, in the given order."""
     return a[np.ix_(rows, columns)]
 
 
 @operation(lambda a, *shape: shape)
 def zeros(a, *shape):
-    """A matrix or vector of zeros, beside another one."""
+    """A matrix or vector of zeros in the graph of a."""
     return np.zeros(shape)
 
 
 @operation(lambda lower, v: v)
 def forward_quotient(lower, v):
     """L^-1 v of a lower triangular L."""
-    found = np.array(v)
+    y = np.array(v)
     for i in range(len(v)):
-        found[i] = (found[i] - sum(lower[i, k] * found[k] for k in range(i))) / lower[i, i]
-    return found
+        y[i] = (y[i] - sum(lower[i, k] * y[k] for k in range(i))) / lower[i, i]
+    return y
 
 
 @operation(same)
 def triangle_quotient(a, lower):
     """A L^-1 of a lower triangular L."""
-    found = np.array(a, dtype=np.result_type(a, lower))
+    quotient = np.array(a, dtype=np.result_type(a, lower))
     for i in reversed(range(len(lower))):
-        rest = found[:, i] - sum(found[:, k] * lower[k, i] for k in range(i + 1, len(lower)))
-        found[:, i] = rest * (1.0 / lower[i, i])
-    return found
+        rest = quotient[:, i] - sum(quotient[:, k] * lower[k, i] for k in range(i + 1, len(lower)))
+        quotient[:, i] = rest * (1.0 / lower[i, i])
+    return quotient
 
 
 @operation(same)
 def factor_of(lower):
-    """The factor of S = L L', as `operations.factor` makes it of S."""
+    """The factor of S = L L', equal to `operations.factor` of S."""
     d = np.diag(lower)
     return lower * (1.0 / d)[None, :], d * d
 
@@ -133,14 +132,17 @@ def _of_forward_quotient(result, arguments, slopes):
 
 
 def by_entries(template: str, **functions: Any) -> Callable:
-    """What makes functions of a, b, c whose entries have a source, such as "{a} + {b}" or "{a} > {0}"."""
+    """Return `make(result, *arguments)`: a function of a, b, c, entry by entry, by a template such as "{a} + {b}".
 
-    def make(result: tuple, *others: Any) -> Callable:
-        known = [one for one in others if not isinstance(one, tuple)]
-        shapes = dict(zip("abc", others[len(known) :], strict=False))
+    `{0}` stands for the first argument that is no shape.
+    """
 
-        def entry(*place) -> str:
-            at = "".join(f"[{i}]" for i in place)
+    def make(result: tuple, *arguments: Any) -> Callable:
+        known = [argument for argument in arguments if not isinstance(argument, tuple)]
+        shapes = dict(zip("abc", arguments[len(known) :], strict=False))
+
+        def entry(*index) -> str:
+            at = "".join(f"[{i}]" for i in index)
             return template.format(*known, **{name: name + at * bool(shape) for name, shape in shapes.items()})
 
         if not result:
@@ -161,9 +163,9 @@ def _count(result: tuple, z: tuple) -> Callable:
     return source.function(source.sum(f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in source.range(*z)))
 
 
-def _together(result: tuple, a: tuple, b: tuple) -> Callable:
+def _stacked(result: tuple, a: tuple, b: tuple) -> Callable:
     at = (0, a[1]) if a[0] == result[0] else (a[0], 0)
-    return assembled("together", "a, b", result, {"a": (a, 0, 0), "b": (b, *at)})
+    return assembled("stacked", "a, b", result, {"a": (a, 0, 0), "b": (b, *at)})
 
 
 def _diagonal(result: tuple, v: tuple) -> Callable:
@@ -187,7 +189,7 @@ def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tup
 
 
 def _forward_quotient(result: tuple, lower: tuple, v: tuple) -> Callable:
-    return made.forward_solver(*v) if len(v) == 1 else made.column_solver(*v)
+    return matrix_functions.forward_solver(*v) if len(v) == 1 else matrix_functions.column_solver(*v)
 
 
 FUNCTIONS: dict[Operation, Callable] = {
@@ -209,15 +211,15 @@ FUNCTIONS: dict[Operation, Callable] = {
     scalars.trace: _trace,
     scalars.diagonal: _diagonal,
     scalars.count: _count,
-    careful: lambda result, s: made.careful_factor(*s[:1]),
-    inverted: lambda result, of: made.factored_inverse(of[0]),
-    triangle: lambda result, a: made.triangular_root(*a),
-    hstack: _together,
-    vstack: _together,
+    careful: lambda result, s: matrix_functions.careful_factor(*s[:1]),
+    inverted: lambda result, of: matrix_functions.factored_inverse(of[0]),
+    triangle: lambda result, a: matrix_functions.triangular_root(*a),
+    hstack: _stacked,
+    vstack: _stacked,
     part: lambda result, top, left, rows, columns, a: part_of(rows, columns, a, top, left),
     pick: _pick,
-    zeros: lambda result, *others: written_out("zeros", "a", "zero()", zero=zeros_of(*result)),
+    zeros: lambda result, *shapes: written_out("zeros", "a", "zero()", zero=zeros_of(*result)),
     forward_quotient: _forward_quotient,
-    triangle_quotient: lambda result, a, lower: made.triangle_divider(*a),
+    triangle_quotient: lambda result, a, lower: matrix_functions.triangle_divider(*a),
     factor_of: lambda result, lower: written_out("same", "a", "a"),
 }

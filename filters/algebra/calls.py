@@ -1,13 +1,14 @@
-"""Graphs of matrices as calls of functions that are made for their sizes: for models of any size, and of any kind.
+"""Graphs of matrices as calls of functions for their sizes: for models of any size, and of any kind.
 
-Where a model's functions cannot be traced, or the graph of all numbers would be too large, each operation on
-matrices is a line that calls the function for these sizes (`thruster_env.core.matrices`): tuples in registers,
-or loops over arrays.
+If a model's functions cannot be traced, or the graph of all numbers would be too large, each operation on matrices
+is a line that calls the function for these sizes (`thruster_env.core.matrices`): on tuples in registers, or in
+loops over arrays.
 
     v2 = work2(v0, v1)
     store(rows, v2)
 
-What is done with each member of an ensemble by itself stands in a loop, as much of it as the order allows.
+Operations on single members of an ensemble stand in a loop over the members, as many in one loop as their order
+allows.
 """
 
 from __future__ import annotations
@@ -27,54 +28,58 @@ from filters.algebra import samples as densities
 from filters.algebra import upper as upper_called
 from filters.algebra.blocks import by_entries
 from filters.algebra.matrices import Matrix, Operation, in_order
-from thruster_env.core import matrices as made
+from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_of, tuple_of, written_out
 from thruster_env.graphs.programs import ARRAYS, Place
 
-# Operations on matrices as functions made for their sizes, for `calls`: of tuples, or in loops over arrays.
+
+def arguments_of(matrix: Matrix) -> tuple[Matrix, ...]:
+    """The arguments of the function that evaluates a matrix, see `function_of`."""
+    if _by_transpose(matrix):
+        return matrix.arguments[0], matrix.arguments[1].arguments[0]
+    if matrix.operation is operations.congruence:
+        return matrix.arguments[0], matrix.arguments[2]
+    if matrix.operation is operations.of_best_gain:  # P - C K', a function of P, C = P H' and K
+        return matrix.arguments[1], matrix.arguments[2], matrix.arguments[4]
+    return () if matrix.operation is operations.eye else matrix.of
 
 
-def arguments_of(one: Matrix) -> tuple[Matrix, ...]:
-    """What the function of an operation takes."""
-    if _by_transpose(one):
-        return one.arguments[0], one.arguments[1].arguments[0]
-    if one.operation is operations.congruence:
-        return one.arguments[0], one.arguments[2]
-    if one.operation is operations.of_best_gain:  # of P, C = P H' and K it is P - C K'
-        return one.arguments[1], one.arguments[2], one.arguments[4]
-    return () if one.operation is operations.eye else one.of
+def _by_transpose(matrix: Matrix) -> bool:
+    """Whether a matrix is A B', for which functions do not form B'."""
+    return matrix.operation is matrices.multiply and matrix.arguments[1].operation is matrices.transposed
 
 
-def _by_transpose(one: Matrix) -> bool:
-    """Whether a product is by a transposed matrix, which functions do not form."""
-    return one.operation is matrices.multiply and one.arguments[1].operation is matrices.transposed
-
-
-def function_of(one: Matrix) -> Callable:
-    """The function that works out an operation of ours, of what `arguments_of` says."""
-    others = tuple(a for a in one.arguments if not isinstance(a, Matrix))
-    return _function(one.operation, one.shape, _by_transpose(one), others, *(a.shape for a in one.of))
+def function_of(matrix: Matrix) -> Callable:
+    """The function that evaluates a matrix from `arguments_of` it, if its operation is not a model's."""
+    parameters = tuple(a for a in matrix.arguments if not isinstance(a, Matrix))
+    return _function(
+        matrix.operation, matrix.shape, _by_transpose(matrix), parameters, *(a.shape for a in matrix.of)
+    )
 
 
 @cache
-def _function(operation: Operation, result: tuple, by_transpose: bool, others: tuple, *shapes: tuple) -> Callable:
-    """The same for all operations alike: compiled code then has it once."""
+def _function(
+    operation: Operation, result: tuple, by_transpose: bool, parameters: tuple, *shapes: tuple
+) -> Callable:
+    """One function for all equal operations, so that it is compiled once."""
     if operation is matrices.multiply:
         return _product(by_transpose, *shapes)
     if operation not in _FUNCTIONS:
         raise ValueError(f"{operation.name} is for models that are small and can be traced, but this one is not")
-    return _FUNCTIONS[operation](result, *others, *shapes)
+    return _FUNCTIONS[operation](result, *parameters, *shapes)
 
 
-def _multiple(result: tuple, *others) -> Callable:
-    return by_entries("{a} * {0!r}" if isinstance(others[0], float) else "{a} * {b}")(result, *others)
+def _multiple(result: tuple, *arguments) -> Callable:
+    return by_entries("{a} * {0!r}" if isinstance(arguments[0], float) else "{a} * {b}")(result, *arguments)
 
 
 def _product(by_transpose: bool, a: tuple, b: tuple) -> Callable:
     if len(b) == 1:
-        return made.vector_multiplier(*a)
-    return made.transposed_multiplier(*a, b[1]) if by_transpose else made.multiplier(*a, b[1])
+        return matrix_functions.vector_multiplier(*a)
+    return (
+        matrix_functions.transposed_multiplier(*a, b[1]) if by_transpose else matrix_functions.multiplier(*a, b[1])
+    )
 
 
 def _mirrored(shape: tuple, *of: tuple) -> Callable:
@@ -83,12 +88,15 @@ def _mirrored(shape: tuple, *of: tuple) -> Callable:
 
 
 def _congruence(shape: tuple, a: tuple, p: tuple, pa: tuple) -> Callable:
-    names: dict[str, Any] = {"times": made.multiplier(*a, a[0]), "mirror": _mirrored(shape, shape)}
+    names: dict[str, Any] = {"times": matrix_functions.multiplier(*a, a[0]), "mirror": _mirrored(shape, shape)}
     return written_out("congruence", "a, pa", "mirror(times(a, pa))", **names)
 
 
 def _of_best_gain(shape: tuple, value: tuple, p: tuple, c: tuple, s: tuple, k: tuple) -> Callable:
-    names: dict[str, Any] = {"times": made.transposed_multiplier(*c, shape[0]), "mirror": _mirrored(shape, shape)}
+    names: dict[str, Any] = {
+        "times": matrix_functions.transposed_multiplier(*c, shape[0]),
+        "mirror": _mirrored(shape, shape),
+    }
     names["less"] = by_entries("{a} - {b}")(p, p, p)
     return written_out("of_best_gain", "p, c, k", "less(p, mirror(times(c, k)))", **names)
 
@@ -105,32 +113,32 @@ def _identity(shape: tuple, *of: tuple) -> Callable:
 def _on_one_branch(shape: tuple, angles: tuple[bool, ...], *of: tuple) -> Callable:
     source = Source("wrapped_angles", "a", result=shape, a=shape)
 
-    def entry(i, *others) -> str:
-        return short_way(f"a[{i}]" + "".join(f"[{j}]" for j in others), i, angles)
+    def entry(i, *rest) -> str:
+        return short_way(f"a[{i}]" + "".join(f"[{j}]" for j in rest), i, angles)
 
     return source.function(source.entries(shape, entry), **NAMES)
 
 
 def _only(result: tuple, z: tuple, shape: tuple) -> Callable:
-    def entry(i, *others) -> str:
-        return f"(a[{i}]" + "".join(f"[{j}]" for j in others) + f" if z[{i}] == z[{i}] else 0.0)"
+    def entry(i, *rest) -> str:
+        return f"(a[{i}]" + "".join(f"[{j}]" for j in rest) + f" if z[{i}] == z[{i}] else 0.0)"
 
     return entrywise("only", "z, a", shape, entry, z=z, a=shape)
 
 
 def _uncorrelated(result: tuple, z: tuple, shape: tuple) -> Callable:
-    return written_out("uncorrelated", "z, r", "mask(r, z)", mask=made.masked(*z))
+    return written_out("uncorrelated", "z, r", "mask(r, z)", mask=matrix_functions.masked(*z))
 
 
 def _quotient(result: tuple, c: tuple, of: tuple) -> Callable:
-    return made.vector_solver(*c) if len(c) == 1 else made.row_solver(*c)
+    return matrix_functions.vector_solver(*c) if len(c) == 1 else matrix_functions.row_solver(*c)
 
 
 def _inverse(result: tuple, of: tuple, z: tuple) -> Callable:
     source = Source("known", "s, z", result=of, s=of, z=z)
     missing = "(s[{0}][{0}] if z[{0}] == z[{0}] else 0.0)"
     entries = source.entries(of, lambda i, j: source.if_same(i, j, missing.format(i), f"s[{i}][{j}]"))
-    names: dict[str, Any] = {"known": source.function(entries), "invert": made.factored_inverse(of[0])}
+    names: dict[str, Any] = {"known": source.function(entries), "invert": matrix_functions.factored_inverse(of[0])}
     return written_out("inverse", "l, z", "known(invert(l), z)", **names)
 
 
@@ -139,8 +147,8 @@ def _dot(result: tuple, a: tuple, b: tuple) -> Callable:
     return source.function(source.sum(f"a[{i}] * b[{i}]" for i in source.range(*a)))
 
 
-def _stretch(result: tuple, w: tuple, other: tuple, e: tuple, ds: tuple) -> Callable:
-    source = Source("stretch", "w, o, e, ds", work=prod(e), w=w, o=other, e=e, ds=ds)
+def _half_trace(result: tuple, w: tuple, other: tuple, e: tuple, ds: tuple) -> Callable:
+    source = Source("half_trace", "w, o, e, ds", work=prod(e), w=w, o=other, e=e, ds=ds)
     rows = source.range(*w)
     terms = (f"(w[{i}] * o[{j}] - e[{i}][{j}]) * ds[{i}][{j}]" for i in rows for j in source.range(*w))
     return source.function(f"0.5 * ({source.sum(terms)})")
@@ -160,7 +168,7 @@ WEIGHT = "(1.0 + tail[0] * d) / (1.0 - 2.0 * tail[0] + tail[0] * q)"
 
 _FUNCTIONS: dict[Operation, Callable] = {
     matrices.scale: _multiple,
-    matrices.transposed: lambda result, shape: made.transposer(*shape),
+    matrices.transposed: lambda result, shape: matrix_functions.transposer(*shape),
     operations.mirrored: _mirrored,
     operations.with_transposed: _with_transposed,
     operations.congruence: _congruence,
@@ -169,12 +177,12 @@ _FUNCTIONS: dict[Operation, Callable] = {
     operations.on_one_branch: _on_one_branch,
     operations.only: _only,
     operations.uncorrelated: _uncorrelated,
-    operations.factor: lambda result, shape: made.cholesky_factor(shape[0]),
+    operations.factor: lambda result, shape: matrix_functions.cholesky_factor(shape[0]),
     operations.quotient: _quotient,
     operations.inverse: _inverse,
-    densities.density: lambda result, v, of, z: made.innovation_likelihood(*v),
+    densities.density: lambda result, v, of, z: matrix_functions.innovation_likelihood(*v),
     densities.dot: _dot,
-    densities.stretch: _stretch,
+    densities.half_trace: _half_trace,
     densities.heavier: _of_tail(f"({HEAVIER} if tail[0] > 0.0 else 0.0)"),
     densities.outlier_weight: _of_tail(WEIGHT),
     **points_called.FUNCTIONS,
@@ -191,37 +199,37 @@ def calls_of(
     functions: Mapping[Operation, Callable],
     arrays: Sequence[str] = ARRAYS,
 ) -> Callable:
-    """`work(*arrays)`, which makes some stores for one run; compiled functions may call it.
+    """`work(*arrays)`, which evaluates matrices and stores them; compiled functions may call it.
 
     Args:
-        stores: what is to be stored, and from where on.
-        known: of each matrix that is given where it begins, or a function of `numbers` that reads it.
-        functions: what works out operations that are not ours, those of a model.
+        stores: pairs of a place and the matrix to store there.
+        known: for each given matrix its place, or a function of `numbers` that reads it.
+        functions: for each operation of a model the function that evaluates it.
         arrays: names of the arguments.
     """
-    text, last = _Text(known, functions), [one for _, one in stores]
+    text, last = _Text(known, functions), [matrix for _, matrix in stores]
     waiting = in_order(last, known, arguments_of)
     while waiting:
-        for one in waiting:
-            if text.can(one) and not text.is_of_each(one):
-                text.write(one)
-        waiting = [one for one in waiting if one not in text.values]
+        for matrix in waiting:
+            if text.can(matrix) and not text.is_of_each(matrix):
+                text.write(matrix)
+        waiting = [matrix for matrix in waiting if matrix not in text.values]
         loop: dict[Matrix, None] = {}
-        for one in waiting:
-            if text.is_of_each(one) and text.can(one, loop):
-                loop[one] = None
-        waiting = [one for one in waiting if one not in loop]
+        for matrix in waiting:
+            if text.is_of_each(matrix) and text.can(matrix, loop):
+                loop[matrix] = None
+        waiting = [matrix for matrix in waiting if matrix not in loop]
         if loop:
-            text.write_loop(list(loop), {*last, *(a for one in waiting for a in arguments_of(one))})
-    for place, one in stores:
-        if known.get(one) != place:
-            text.lines += _stored(place, one, text.values[one])
-    loops = any(one.member or is_array(*one.shape) for one in text.values if one.shape)
+            text.write_loop(list(loop), {*last, *(a for matrix in waiting for a in arguments_of(matrix))})
+    for position, matrix in stores:
+        if known.get(matrix) != position:
+            text.lines += _stored(position, matrix, text.values[matrix])
+    loops = any(matrix.member or is_array(*matrix.shape) for matrix in text.values if matrix.shape)
     return written_out("work", ", ".join(arrays), *text.lines, "None", _loops=loops, **text.names)
 
 
 class _Text:
-    """Lines, the functions that they call, and names of what they have worked out."""
+    """Lines, the functions that they call, and the names of the matrices that they have evaluated."""
 
     def __init__(self, known: Mapping[Matrix, Place | Callable], functions: Mapping[Operation, Callable]):
         self._known, self._functions = known, functions
@@ -229,66 +237,68 @@ class _Text:
         self.names: dict[str, Any] = {"np": np}
         self.values: dict[Matrix, str] = {}
 
-    def can(self, one: Matrix, others: Collection[Matrix] = ()) -> bool:
-        """Whether all is worked out that something is made of, here or among others."""
-        return one in self._known or all(a in self.values or a in others for a in arguments_of(one))
+    def can(self, matrix: Matrix, loop: Collection[Matrix] = ()) -> bool:
+        """Whether all arguments of a matrix are evaluated, or are to be in a loop."""
+        return matrix in self._known or all(a in self.values or a in loop for a in arguments_of(matrix))
 
-    def is_of_each(self, one: Matrix) -> bool:
-        """Whether something is worked out for each member by itself."""
-        return one.member and one not in self._known and members_called.function_of(one) is None
+    def is_of_each(self, matrix: Matrix) -> bool:
+        """Whether a matrix is evaluated in a loop over the members."""
+        return matrix.member and matrix not in self._known and members_called.function_of(matrix) is None
 
     def _call(self, name: str, function: Callable, *arguments: str) -> str:
         self.names[name] = function
         return f"{name}({', '.join(arguments)})"
 
-    def _function(self, one: Matrix) -> Callable:
-        return self._functions[one.operation] if one.operation in self._functions else function_of(one)
+    def _function(self, matrix: Matrix) -> Callable:
+        return self._functions[matrix.operation] if matrix.operation in self._functions else function_of(matrix)
 
-    def write(self, one: Matrix) -> None:
-        """A line that works something out, or reads it."""
+    def write(self, matrix: Matrix) -> None:
+        """Add the line that evaluates a matrix, or reads it."""
         value, values = f"v{len(self.values)}", self.values
-        if one.operation is operations.present:  # functions look for NaN themselves
-            values[one] = values[one.of[0]]
+        if matrix.operation is operations.present:  # functions look for NaN themselves
+            values[matrix] = values[matrix.of[0]]
             return
-        if one in self._known:
-            at = self._known[one]
-            text = _read(at, one) if isinstance(at, Place) else self._call(f"read_{value}", at, "numbers")
-        elif any(a.member for a in one.of) and (rule := members_called.function_of(one)):
+        if matrix in self._known:
+            at = self._known[matrix]
+            text = _read(at, matrix) if isinstance(at, Place) else self._call(f"read_{value}", at, "numbers")
+        elif any(a.member for a in matrix.of) and (rule := members_called.function_of(matrix)):
             function, sized = rule
-            text = self._call(f"work_{value}", function, *(values[a] for a in one.of), *["size"] * sized)
+            text = self._call(f"work_{value}", function, *(values[a] for a in matrix.of), *["size"] * sized)
         else:
-            text = self._call(f"work_{value}", self._function(one), *(values[a] for a in arguments_of(one)))
-        values[one] = value
+            text = self._call(f"work_{value}", self._function(matrix), *(values[a] for a in arguments_of(matrix)))
+        values[matrix] = value
         self.lines.append(f"{value} = {text}")
 
     def write_loop(self, loop: list[Matrix], wanted: Collection[Matrix]) -> None:
-        """A loop over the members that works some matrices out; of these, some are wanted after it."""
+        """Add a loop over the members that evaluates matrices, and stores those that are wanted after it."""
         inside: dict[Matrix, str] = {}
         lines, columns = [], ""
-        for one in loop:
-            for a in arguments_of(one):
+        for matrix in loop:
+            for a in arguments_of(matrix):
                 if a.member and a not in inside:
                     inside[a] = f"m{len(self.values)}_{len(inside)}"
                     columns = f"{self.values[a]}.shape[1]"
                     read = self._call(f"read_{inside[a]}", members_called.reader(a.shape), self.values[a], "j")
                     lines.append(f"    {inside[a]} = {read}")
             name = f"m{len(self.values)}_{len(inside)}"
-            given = (inside.get(a) or self.values[a] for a in arguments_of(one))
-            lines.append(f"    {name} = {self._call(f'work_{name}', self._function(one), *given)}")
-            inside[one] = name
-        kept = [one for one in loop if one in wanted]
-        for one in kept:
-            value, name = f"v{len(self.values)}", inside[one]
-            self.values[one] = value
-            self.lines.append(f"{value} = np.empty(({prod(one.shape)}, {columns}))")
-            lines.append(f"    {self._call(f'store_{name}', members_called.writer(one.shape), value, 'j', name)}")
+            operands = (inside.get(a) or self.values[a] for a in arguments_of(matrix))
+            lines.append(f"    {name} = {self._call(f'work_{name}', self._function(matrix), *operands)}")
+            inside[matrix] = name
+        results = [matrix for matrix in loop if matrix in wanted]
+        for matrix in results:
+            value, name = f"v{len(self.values)}", inside[matrix]
+            self.values[matrix] = value
+            self.lines.append(f"{value} = np.empty(({prod(matrix.shape)}, {columns}))")
+            lines.append(
+                f"    {self._call(f'store_{name}', members_called.writer(matrix.shape), value, 'j', name)}"
+            )
         self.lines += [f"for j in range({columns}):", *lines]
 
 
-def _read(place: Place, one: Matrix) -> str:
-    """Source of what lies at a place: tuples of its numbers, or a part of the memory itself."""
-    (array, first), shape = place, one.shape
-    if one.member:
+def _read(position: Place, matrix: Matrix) -> str:
+    """Source of the matrix at a place: tuples of its numbers, or a view of the memory."""
+    (array, first), shape = position, matrix.shape
+    if matrix.member:
         if array == "table":
             return f"table[{first}:{first + prod(shape)}]"
         return f"{array}[: {prod(shape)} * table.shape[1]].reshape(({prod(shape)}, table.shape[1]))"
@@ -302,12 +312,12 @@ def _read(place: Place, one: Matrix) -> str:
     return matrix_of(rows[0], columns, lambda i, j: f"{array}[{first + i * columns + j}]")
 
 
-def _stored(place: Place, one: Matrix, value: str) -> list[str]:
-    """Lines that store a value."""
-    (array, first), shape = place, one.shape
+def _stored(position: Place, matrix: Matrix, value: str) -> list[str]:
+    """Lines that store a matrix, named `value`, at a place."""
+    (array, first), shape = position, matrix.shape
     if array == "table":
         loops = [f"for i in range({prod(shape)}):", "    for j in range(table.shape[1]):"]
-        return [*loops, f"        table[{first} + i, j] = {members_called.entry(value, shape, one.member)}"]
+        return [*loops, f"        table[{first} + i, j] = {members_called.entry(value, shape, matrix.member)}"]
     names, strides = "ijk"[: len(shape)], (prod(shape[k + 1 :]) for k in range(len(shape)))
     at = " + ".join([str(first), *(f"{name} * {stride}" for name, stride in zip(names, strides, strict=True))])
     loops = [f"{'    ' * k}for {name} in range({shape[k]}):" for k, name in enumerate(names)]

@@ -16,25 +16,26 @@ from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader
 from thruster_env.graphs.graphs import Graph, called
 from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
 
-ROUNDS = 14  # enough for condition numbers of 1e16: at the end each round doubles the figures
-CLOSE = 1e-10  # of the sum's determinant to what it is where both are equal: one round more, and they are
+ROUNDS = 14  # enough for condition numbers of 1e16: the last rounds each double the number of correct digits
+CLOSE = 1e-10  # if det((a + b)/2)^(1/size), which is at least 1, exceeds 1 by less, one more round is enough
 
 
 @operation(same, lambda a, b: True)
 def geometric_mean(a, b):
     """A # B = A (A^-1 B)^(1/2) of two covariances, itself a covariance.
 
-    Arithmetic and harmonic mean of the two, taken again and again, meet there. With both scaled to determinant 1
-    one round is enough for two channels, and one channel needs none. Of more than two a function is called.
+    Replacing the two by their arithmetic and harmonic mean, again and again, converges to it. With both scaled to
+    determinant 1 one round is enough for two channels, and one channel needs none. For more than two channels
+    programs call a function.
 
     Source: Bhatia (2007), Positive Definite Matrices, chapter 4; scaling by determinants: Higham (2008), Functions
     of Matrices, section 6.5.
     """
     size = len(a)
     if a.dtype == object and size > 2:
-        numbers = [a[0, 0].graph.number(one) for one in (*a.ravel(), *b.ravel())]
-        found = called(_taught(size), size * size, *numbers)
-        return mirrored.compute(np.array(found, dtype=object).reshape(size, size))
+        numbers = [a[0, 0].graph.number(entry) for entry in (*a.ravel(), *b.ravel())]
+        entries = called(_taught(size), size * size, *numbers)
+        return mirrored.compute(np.array(entries, dtype=object).reshape(size, size))
     if size == 1:
         return np.array([[(a[0, 0] * b[0, 0]) ** 0.5]])
     a, b, unit = _scaled(a, b)
@@ -50,7 +51,7 @@ def _scaled(a, b):
 
 
 def _closer(a, b):
-    """A round: arithmetic and harmonic mean, with determinant 1."""
+    """One round: arithmetic and harmonic mean, both with determinant 1."""
     both = a + b
     of = factor(both)
     parallel = mirrored(quotient(a, of) @ b)  # (a^-1 + b^-1)^-1
@@ -59,21 +60,21 @@ def _closer(a, b):
 
 
 def rounds(size: int) -> int:
-    """How many rounds it takes."""
+    """Number of rounds."""
     return 1 if size == 2 else ROUNDS
 
 
 def _unit(of):
-    """A matrix over this has determinant 1, of its factor."""
+    """The number by which a matrix is divided to get determinant 1, from its factor."""
     return math.prod(of[1]) ** (1.0 / len(of[1]))
 
 
 @cache
 def geometric_mean_of(size: int) -> Callable:
-    """Return `mean(a, b)`, the same for `calls`; large ones end as soon as both are close."""
+    """Return `mean(a, b)`, `geometric_mean` for `calls`; for large matrices it stops as soon as both are close."""
     if size == 1:
         return entrywise("mean", "a, b", (1, 1), lambda i, j: "(a[0][0] * b[0][0]) ** 0.5", a=(1, 1), b=(1, 1))
-    count, close = rounds(size), 1.0 + CLOSE if is_array(size, size) else 0.0  # small ones take no time
+    count, close = rounds(size), 1.0 + CLOSE if is_array(size, size) else 0.0  # small matrices do all rounds
     cholesky, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
     times, add = matrices.multiplier(size, size, size), matrices.symmetric_sum(size)
     source = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
@@ -101,30 +102,30 @@ def geometric_mean_of(size: int) -> Callable:
 
 @cache
 def _taught(size: int) -> str:
-    """The name under which programs call it."""
+    """The name under which programs call the mean."""
     mean, name, write = geometric_mean_of(size), f"geometric_mean_{size}", matrix_writer(size, size, 0)
     first, second = (matrix_reader(size, size, at) for at in (0, size * size))
 
     @inlined
-    def work(given, found):
-        write(found, mean(first(given), second(given)))
+    def work(pair, result):
+        write(result, mean(first(pair), second(pair)))
 
     CALLED[name], CALLED_IN_ROUNDS[name] = work, lambda: _as_programs(size)
     return name
 
 
 def _as_programs(size: int) -> tuple[Program, Program, Program, int, int]:
-    """The mean as programs, for `CALLED_IN_ROUNDS`: both matrices are kept, and the factor."""
+    """The mean as programs, for `CALLED_IN_ROUNDS`; "kept" holds both matrices and the factor of the mean."""
     square = size * size
 
     def program(array: str, work: Callable, to: str) -> Program:
         graph = Graph()
-        given = np.array(
+        numbers = np.array(
             [graph.given(Place(array, k)) for k in range(2 * square + (array == "kept"))], dtype=object
         )
-        a, b = (given[k * square : (k + 1) * square].reshape(size, size) for k in range(2))
-        found = np.concatenate([np.ravel(one) for one in work(a, b, *given[2 * square :])])
-        return program_of([(Place(to, k), graph.number(one)) for k, one in enumerate(found)], {})
+        a, b = (numbers[k * square : (k + 1) * square].reshape(size, size) for k in range(2))
+        results = np.concatenate([np.ravel(array) for array in work(a, b, *numbers[2 * square :])])
+        return program_of([(Place(to, k), graph.number(entry)) for k, entry in enumerate(results)], {})
 
     first, again = program("given", _scaled, "kept"), program("kept", lambda a, b, unit: _closer(a, b), "kept")
     last = program("kept", lambda a, b, unit: (a * unit,), "found")

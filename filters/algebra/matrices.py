@@ -1,11 +1,11 @@
-"""Matrices and vectors that are not known yet: an algorithm written with them is a graph of operations.
+"""Symbolic matrices and vectors: an algorithm written with them is a graph of operations.
 
-A page of a textbook, `sym(F @ P @ F.T) + Q`, is a function of matrices. Called with NumPy's arrays it computes;
-called with objects of this class it says what it would compute. What is said so can be differentiated
-(`derivatives`), worked out with Numbers in the places of floats (`evaluate`), or written out as calls of
-functions made for its sizes (`calls`).
+`sym(F @ P @ F.T) + Q`, as a textbook writes it, is a function of matrices. Called with NumPy's arrays it computes;
+called with a `Matrix` it returns the graph of its operations. A graph can be differentiated (`scalars.slopes_of`),
+evaluated with Numbers in the place of floats (`evaluate`), or written out as calls of functions for its sizes
+(`calls`).
 
-An `Operation` knows what it computes of arrays, whose entries may be floats or Numbers; the shape of that; and its
+An `Operation` has a function of arrays, whose entries may be floats or Numbers, the shape of its result, and its
 derivative.
 """
 
@@ -16,28 +16,28 @@ from typing import Any
 
 
 class Matrix:
-    """A matrix (rows, columns), vector (rows,) or number () that an operation makes of others.
+    """A matrix (rows, columns), vector (rows,) or number (), the result of an operation.
 
     Attributes:
-        operation: an `Operation`, or a name for one that is given.
-        arguments: what it is made of, Matrices and other values that can be hashed.
-        shape: of it.
-        symmetric: whether it is its own transpose.
+        operation: an `Operation`, or the name or place of a given matrix.
+        arguments: of the operation, Matrices and other values that can be hashed.
+        shape: (rows, columns), (rows,) or ().
+        symmetric: whether it equals its transpose.
         member: whether each member of an ensemble has one.
     """
 
     __array_ufunc__ = None  # an array's operator leaves it to ours
     __slots__ = ("operation", "arguments", "shape", "symmetric", "member", "_made")
 
-    def __init__(self, operation: Any, arguments: tuple = (), shape: tuple = (), symmetric=False, made=None):
-        """For operations, and for `given`."""
+    def __init__(self, operation: Any, arguments: tuple = (), shape: tuple = (), symmetric=False, created=None):
+        """Only operations, and `input_matrix`, call this."""
         self.operation, self.arguments, self.shape, self.symmetric = operation, arguments, shape, symmetric
         self.member: bool = not getattr(operation, "reduces", False) and any(a.member for a in self.of)
-        self._made: dict = {} if made is None else made
+        self._made: dict = {} if created is None else created
 
     @property
     def of(self) -> tuple[Matrix, ...]:
-        """The matrices that it is made of."""
+        """The matrices among the arguments."""
         return tuple(a for a in self.arguments if isinstance(a, Matrix))
 
     @property
@@ -90,10 +90,10 @@ class Matrix:
 
 
 class Operation:
-    """Something that is done with matrices; called with arrays it is done at once."""
+    """An operation on matrices; called with arrays it computes at once."""
 
     def __init__(self, compute: Callable, shape: Callable, symmetric: Callable, *, reduces: bool = False):
-        """For `operation`, and for the functions of a model."""
+        """`operation` calls this, and so do the functions of a model."""
         self.compute, self.shape, self.symmetric, self.reduces = compute, shape, symmetric, reduces
         self.name, self.__doc__ = compute.__name__, compute.__doc__
         self.slope: Callable = _no_rule
@@ -103,14 +103,14 @@ class Operation:
         known = next((a for a in arguments if isinstance(a, Matrix)), None)
         if known is None:
             return self.compute(*arguments)
-        made, key = known._made, (self, *arguments)
-        if key not in made:
+        created, key = known._made, (self, *arguments)
+        if key not in created:
             shapes = [a.shape if isinstance(a, Matrix) else a for a in arguments]
-            made[key] = Matrix(self, arguments, self.shape(*shapes), self.symmetric(*arguments), made)
-        return made[key]
+            created[key] = Matrix(self, arguments, self.shape(*shapes), self.symmetric(*arguments), created)
+        return created[key]
 
     def derivative(self, rule: Callable) -> Callable:
-        """Decorate rule(result, arguments, slopes): the slope of the result, of slopes of which None are zero."""
+        """Decorate rule(result, arguments, slopes), the slope of the result; None stands for a slope of zero."""
         self.slope = rule
         return rule
 
@@ -120,7 +120,7 @@ def _no_rule(result: Matrix, arguments: Sequence, slopes: Sequence) -> Matrix:
 
 
 def never(*arguments) -> bool:
-    """Of results that are not symmetric, whatever they are made of."""
+    """Return False: the `symmetric` of operations whose results are not symmetric."""
     return False
 
 
@@ -128,14 +128,14 @@ def operation(shape: Callable, symmetric: Callable = never, *, reduces: bool = F
     """Decorate a function of arrays.
 
     Args:
-        shape: of the result, a function of the arguments' shapes; an argument that is no matrix stands for itself.
+        shape: of the result, a function of the arguments' shapes, and of arguments that are no matrices.
         symmetric: whether the result is, a function of the arguments.
         reduces: whether the result is one for all members of an ensemble, such as their mean.
     """
     return lambda compute: Operation(compute, shape, symmetric, reduces=reduces)
 
 
-def given(
+def input_matrix(
     name: Any,
     shape: tuple[int, ...],
     *,
@@ -143,13 +143,13 @@ def given(
     member: bool = False,
     like: Matrix | None = None,
 ) -> Matrix:
-    """A matrix that is known when the others are worked out; `like` one that it occurs together with."""
-    found = Matrix(name, (), shape, symmetric, None if like is None else like._made)
-    found.member = member
-    return found
+    """An input of a graph, called `name`; `like` is another matrix of the same graph."""
+    matrix = Matrix(name, (), shape, symmetric, None if like is None else like._made)
+    matrix.member = member
+    return matrix
 
 
-def same(shape, *others):
+def same(shape, *shapes):
     """The shape of the first argument."""
     return shape
 
@@ -184,7 +184,7 @@ def entries_product(a, b):
 
 @operation(same)
 def shifted(a, value):
-    """A number, or each entry, plus a number that is known now."""
+    """A number, or each entry, plus the float `value`."""
     return a + value
 
 
@@ -196,7 +196,7 @@ def reciprocal(a):
 
 @operation(same)
 def power(a, exponent):
-    """A number, or each entry, to a power that is known now."""
+    """A number, or each entry, to the power of the float `exponent`."""
     return a**exponent
 
 
@@ -214,25 +214,25 @@ def transposed(a):
 
 @operation(_product_shape)
 def multiply(a, b):
-    """The product a b; its derivative stands in `operations`, with that of quotients."""
+    """The product a b; its derivative is in `operations`, with that of quotients."""
     return a @ b
 
 
 def plus(*slopes: Matrix | None) -> Matrix | None:
-    """The sum of slopes, of which None are zero."""
+    """The sum of slopes; None is zero."""
     moving = [slope for slope in slopes if slope is not None]
     return sum(moving[1:], moving[0]) if moving else None
 
 
 def minus(first: Matrix | None, second: Matrix | None) -> Matrix | None:
-    """The difference of two slopes, of which None are zero."""
+    """The difference of two slopes; None is zero."""
     return (
         first - second if first is not None and second is not None else plus(first, through(lambda a: -a, second))
     )
 
 
 def through(operate: Callable, *arguments) -> Matrix | None:
-    """What an operation that is linear in all of these makes of them; zero where one is."""
+    """An operation that is linear in each argument; None, which is zero, if an argument is None."""
     return None if any(a is None for a in arguments) else operate(*arguments)
 
 
@@ -258,31 +258,31 @@ def _of_transpose(result, arguments, slopes):
 
 
 def evaluate(wanted: Sequence[Matrix], known: dict[Matrix, Any]) -> list:
-    """Values of matrices, of those of the matrices that are given: arrays, of floats or of Numbers."""
+    """Values of matrices from those of the given ones: arrays of floats or of Numbers."""
     values = dict(known)
-    for one in in_order(wanted, known):
-        if one not in values:
-            arguments = (values[a] if isinstance(a, Matrix) else a for a in one.arguments)
-            values[one] = one.operation.compute(*arguments)
-    return [values[one] for one in wanted]
+    for matrix in in_order(wanted, known):
+        if matrix not in values:
+            arguments = (values[a] if isinstance(a, Matrix) else a for a in matrix.arguments)
+            values[matrix] = matrix.operation.compute(*arguments)
+    return [values[matrix] for matrix in wanted]
 
 
-def in_order(wanted: Sequence[Matrix], known=(), of: Callable = lambda one: one.of) -> list[Matrix]:
-    """Matrices and all that they are made of, in an order in which to work them out.
+def in_order(wanted: Sequence[Matrix], known=(), of: Callable = lambda matrix: matrix.of) -> list[Matrix]:
+    """Matrices and all on which they depend, each after its arguments.
 
     Args:
-        wanted: the last ones.
-        known: of which it does not matter what they are made of.
-        of: what a matrix is made of.
+        wanted: the matrices.
+        known: matrices whose arguments are left out.
+        of: the arguments of a matrix.
     """
-    found: dict[Matrix, None] = {}
+    order: dict[Matrix, None] = {}
 
-    def visit(one: Matrix) -> None:
-        if one not in found:
-            for argument in () if one in known else of(one):
+    def visit(matrix: Matrix) -> None:
+        if matrix not in order:
+            for argument in () if matrix in known else of(matrix):
                 visit(argument)
-            found[one] = None
+            order[matrix] = None
 
-    for one in wanted:
-        visit(one)
-    return list(found)
+    for matrix in wanted:
+        visit(matrix)
+    return list(order)

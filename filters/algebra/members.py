@@ -1,9 +1,9 @@
-"""What pages of ensemble filters say of members: means, covariances, angles on one branch, spread.
+"""Operations on members of an ensemble: means, covariances, angles on one branch, spread.
 
-A vector of a member is one for each of N members. Of NumPy's arrays it is a matrix (n, N) with a column a member,
-beside which vectors that are the same for all are columns (n, 1).
+Each of N members has a vector of its own. As NumPy's array the vectors of all members are a matrix (n, N) with a
+column per member; vectors that all members share are columns (n, 1).
 
-Columns behind the last member are worked out, too, but count in no mean and no covariance.
+Tables have columns after the last member. These are computed, too, but enter no mean and no covariance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def _of_numbers(x) -> bool:
 
 
 def _means(x):
-    return np.array([one.graph.make("/", over_members(one), size_of(one)) if one.member else one for one in x])
+    return np.array(
+        [entry.graph.make("/", over_members(entry), size_of(entry)) if entry.member else entry for entry in x]
+    )
 
 
 def _deviations(x):
@@ -53,17 +55,17 @@ def covariance(x, y):
 
 @operation(lambda x, y: (*x, *y), reduces=True)
 def cross_covariance(x, y):
-    """The same of two that differ."""
+    """The sample covariance of two vectors that differ."""
     d, e = _deviations(x), _deviations(y)
     if not _of_numbers(x):
         return d @ e.T / (x.shape[1] - 1)
     factor = 1.0 / (size_of(x[0]) - 1.0)
-    return np.array([[over_members(one * other) * factor for other in e] for one in d])
+    return np.array([[over_members(first * other) * factor for other in e] for first in d])
 
 
 @operation(lambda x: (*x, *x), lambda x: True, reduces=True)
 def scatter(x):
-    """The same of one with itself."""
+    """The sample covariance (n, n) of one vector."""
     return cross_covariance.compute(x, x)
 
 
@@ -74,11 +76,11 @@ def variances(x):
     if not _of_numbers(x):
         return d.var(axis=1, ddof=1, keepdims=True)
     factor = 1.0 / (size_of(x[0]) - 1.0)
-    return np.array([over_members(one * one) * factor for one in d])
+    return np.array([over_members(deviation * deviation) * factor for deviation in d])
 
 
 def correlations(x, y):
-    """The sample correlations (n, m) of two vectors of the members; 0 of what is constant."""
+    """The sample correlations (n, m) of two vectors of the members; 0 for constant components."""
     squares = outer(variances(x), variances(y))
     return covariance(x, y) / choose(exceeds(squares, 0.0), squares, constant(1.0, squares)) ** 0.5
 
@@ -91,19 +93,19 @@ def centred(e):
 
 
 def on_branch(x, angles, *weights):
-    """Members whose angles (flags) lie within half a turn of their circular mean, by weights or not."""
+    """Members with their angles (flags) within half a turn of their circular mean, which may be weighted."""
     return on_one_branch(x, tuple(angles), *weights) if any(angles) else x
 
 
 @operation(same)
 def on_one_branch(x, angles, weights=1.0):
-    """The same, if some are."""
+    """`on_branch`, if there are angles."""
 
-    def moved(row):
+    def aligned(row):
         middle = arctan2(_total(weights * np.sin(row)), _total(weights * np.cos(row)))
         return row - whole_turns(row - middle)
 
-    return np.array([moved(row) if angle else row for row, angle in zip(x, angles, strict=True)])
+    return np.array([aligned(row) if angle else row for row, angle in zip(x, angles, strict=True)])
 
 
 def _total(row):
@@ -114,45 +116,45 @@ def _total(row):
 def stretches(before, after, part):
     """Factors (n,) 1 + part (b - a)/a, of variances b^2 before and a^2 after; 1 if a = 0.
 
-    They give back `part` of what the standard deviation has lost.
+    They restore `part` of the reduction b - a of the standard deviation.
     """
 
     def factor(b, a):
-        there = a > 0.0
-        return where(there, 1.0 + part * ((b / where(there, a, 1.0)) ** 0.5 - 1.0), 1.0)
+        positive = a > 0.0
+        return where(positive, 1.0 + part * ((b / where(positive, a, 1.0)) ** 0.5 - 1.0), 1.0)
 
     return np.array([factor(b, a) for b, a in zip(before, after, strict=True)])
 
 
-# Operations on vectors of members as loops over arrays (n, columns), for `calls`: a column a member.
+# Operations on vectors of members as loops over arrays (n, columns), for `calls`: a column per member.
 
 
 Kinds = tuple[tuple[tuple[int, ...], bool], ...]  # of arguments: the shape, and whether each member has one
 
 
-def function_of(one: Matrix) -> tuple[Callable, bool] | None:
-    """The function that works out an operation on members, and whether their number is its last argument.
+def function_of(matrix: Matrix) -> tuple[Callable, bool] | None:
+    """The function that evaluates an operation on all members, and whether their number is its last argument.
 
-    None if it is to be worked out for each by itself.
+    None if `calls` evaluates the operation in a loop over the members.
     """
-    others = tuple(a for a in one.arguments if not isinstance(a, Matrix))
-    kinds = tuple((a.shape, a.member) for a in one.of)
-    work = _function(one.operation, one.shape, others, kinds) if one.operation in _RULES else None
-    return None if work is None else (work, one.operation in SIZED)
+    parameters = tuple(a for a in matrix.arguments if not isinstance(a, Matrix))
+    kinds = tuple((a.shape, a.member) for a in matrix.of)
+    work = _function(matrix.operation, matrix.shape, parameters, kinds) if matrix.operation in _RULES else None
+    return None if work is None else (work, matrix.operation in SIZED)
 
 
 @cache
-def _function(operation: Operation, result: tuple, others: tuple, kinds: Kinds) -> Callable | None:
-    """The same for all operations alike. Tuples are turned into arrays, and back."""
-    work = _RULES[operation](others, kinds)
+def _function(operation: Operation, result: tuple, parameters: tuple, kinds: Kinds) -> Callable | None:
+    """One function for all equal operations; it converts tuples to arrays, and its result back."""
+    work = _RULES[operation](parameters, kinds)
     small = {f"a{k}": shape for k, (shape, member) in enumerate(kinds) if not member and _is_tuple(shape)}
     if work is None or not small and not (operation.reduces and _is_tuple(result)):
         return work
     size = ["size"] * (operation in SIZED)
     arguments = [f"a{k}" for k in range(len(kinds))]
-    given = [f"as_array_{name}({name})" if name in small else name for name in arguments]
-    call = f"work({', '.join(given + size)})"
-    names: dict[str, Any] = {f"as_array_{k}": _as_array(one) for k, one in small.items()}
+    converted = [f"as_array_{name}({name})" if name in small else name for name in arguments]
+    call = f"work({', '.join(converted + size)})"
+    names: dict[str, Any] = {f"as_array_{k}": _as_array(shape) for k, shape in small.items()}
     if operation.reduces and _is_tuple(result):
         as_tuple = entrywise("as_tuple", "a", result, lambda *at: f"a[{', '.join(map(str, at))}]")
         call, names = f"as_tuple({call})", names | {"as_tuple": as_tuple}
@@ -166,8 +168,8 @@ def _is_tuple(shape: tuple[int, ...]) -> bool:
 @cache
 def _as_array(shape: tuple[int, ...]) -> Callable:
     lines = [f"out = np.empty({shape})"]
-    for place in np.ndindex(*shape):
-        lines.append(f"out[{', '.join(map(str, place))}] = a" + "".join(f"[{i}]" for i in place))
+    for index in np.ndindex(*shape):
+        lines.append(f"out[{', '.join(map(str, index))}] = a" + "".join(f"[{i}]" for i in index))
     return written_out("as_array", "a", *lines, "out", np=np)
 
 
@@ -201,9 +203,9 @@ def writer(shape: tuple[int, ...]) -> Callable:
 
 
 def _by_entries(kinds: Kinds, text: str) -> Callable | None:
-    """A function of values, some of them of members, whose entries have a source of those of a0, a1.
+    """A function of a0, a1, entry by entry as `text` says; the members' values are arrays (n, columns).
 
-    None if members have matrices, or numbers that registers hold: more is done with these at once.
+    None if members have matrices, or vectors small enough for registers: then a loop over the members is faster.
     """
     longest = max(range(len(kinds)), key=lambda k: (prod(kinds[k][0]), kinds[k][1]))
     if not is_array(*kinds[longest][0]) or any(member and len(shape) > 1 for shape, member in kinds):
@@ -278,10 +280,10 @@ def _centred(a, size):
 
 @not_inlined
 def _called_total(a, size):
-    found = 0.0
+    total = 0.0
     for j in range(size):
-        found += a[0, j]
-    return found
+        total += a[0, j]
+    return total
 
 
 @not_inlined
@@ -293,7 +295,7 @@ def _weighted_sums(a, w, size):
     return out
 
 
-def _weighted_mean(others: tuple, kinds: Kinds) -> Callable:
+def _weighted_mean(parameters: tuple, kinds: Kinds) -> Callable:
     (shape, _), _ = kinds
     return written_out("mean", "a, w, size", f"sums(a, w, size).reshape({shape})", sums=_weighted_sums)
 
@@ -316,12 +318,12 @@ def _effective_size(w, size):
 
 @not_inlined
 def _spread_share(w, size):
-    rest = others = 0.0
+    rest = minor_total = 0.0
     for j in range(size):
         other = w[0, j] if w[0, j] <= 0.5 else 0.0
-        others += other
+        minor_total += other
         rest += other * (1.0 - other)
-    return rest + others * (1.0 - others)
+    return rest + minor_total * (1.0 - minor_total)
 
 
 @not_inlined
@@ -329,11 +331,11 @@ def _weighted_square(d, w, size):
     return arrays.weighted_square_of_rows(d[:, :size].copy(), w, 0)
 
 
-def _on_branch(others: tuple, kinds: Kinds) -> Callable:
+def _on_branch(parameters: tuple, kinds: Kinds) -> Callable:
     n = kinds[0][0][0]
     if len(kinds) == 1:
         return written_out(
-            "on_branch", "a, size", "out = a.copy()", "align(out, size)", "out", align=row_aligner(0, *others)
+            "on_branch", "a, size", "out = a.copy()", "align(out, size)", "out", align=row_aligner(0, *parameters)
         )
     lines = (
         f"out = np.empty(({n} + 1, a.shape[1]))",
@@ -341,38 +343,38 @@ def _on_branch(others: tuple, kinds: Kinds) -> Callable:
         "align(out, size)",
         f"out[:{n}]",
     )
-    return written_out("on_branch", "a, w, size", *lines, np=np, align=row_aligner(0, *others, n))
+    return written_out("on_branch", "a, w, size", *lines, np=np, align=row_aligner(0, *parameters, n))
 
 
-def _product(others: tuple, kinds: Kinds) -> Callable | None:
+def _product(parameters: tuple, kinds: Kinds) -> Callable | None:
     (matrix, first), (shape, _) = kinds
     return None if first or len(shape) > 1 or not is_array(*matrix) else arrays.sparse_product
 
 
-def _multiple(others: tuple, kinds: Kinds) -> Callable | None:
-    return _by_entries(kinds, f"{others[0]!r} * {{a0}}" if others else "{a1} * {a0}")
+def _multiple(parameters: tuple, kinds: Kinds) -> Callable | None:
+    return _by_entries(kinds, f"{parameters[0]!r} * {{a0}}" if parameters else "{a1} * {a0}")
 
 
 _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
-    matrices.add: lambda others, kinds: _by_entries(kinds, "{a0} + {a1}"),
-    matrices.subtract: lambda others, kinds: _by_entries(kinds, "{a0} - {a1}"),
+    matrices.add: lambda parameters, kinds: _by_entries(kinds, "{a0} + {a1}"),
+    matrices.subtract: lambda parameters, kinds: _by_entries(kinds, "{a0} - {a1}"),
     matrices.scale: _multiple,
     matrices.multiply: _product,
-    scalars.entries_product: lambda others, kinds: _by_entries(kinds, "{a0} * {a1}"),
-    samples.total: lambda others, kinds: _called_total,
+    scalars.entries_product: lambda parameters, kinds: _by_entries(kinds, "{a0} * {a1}"),
+    samples.total: lambda parameters, kinds: _called_total,
     samples.weighted_mean: _weighted_mean,
-    samples.largest: lambda others, kinds: _largest,
-    samples.effective_size: lambda others, kinds: _effective_size,
-    samples.spread_share: lambda others, kinds: _spread_share,
-    samples.weighted_square: lambda others, kinds: _weighted_square,
-    mean: lambda others, kinds: _called_means,
-    variances: lambda others, kinds: _variances,
-    centred: lambda others, kinds: _centred,
+    samples.largest: lambda parameters, kinds: _largest,
+    samples.effective_size: lambda parameters, kinds: _effective_size,
+    samples.spread_share: lambda parameters, kinds: _spread_share,
+    samples.weighted_square: lambda parameters, kinds: _weighted_square,
+    mean: lambda parameters, kinds: _called_means,
+    variances: lambda parameters, kinds: _variances,
+    centred: lambda parameters, kinds: _centred,
     on_one_branch: _on_branch,
-    cross_covariance: lambda others, kinds: _covariance,
-    scatter: lambda others, kinds: _square,
+    cross_covariance: lambda parameters, kinds: _covariance,
+    scatter: lambda parameters, kinds: _square,
 }
-SIZED = {  # operations that ask how many members there are
+SIZED = {  # operations whose functions take the number of members
     *(
         samples.total,
         samples.weighted_mean,

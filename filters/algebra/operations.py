@@ -1,4 +1,4 @@
-"""What pages say beside + - @ * / ** and .T: symmetry, angles, missing channels, quotients, Joseph's form.
+"""Operations of pages besides + - @ * / ** and .T: symmetry, angles, missing channels, quotients, Joseph's form.
 
 Each is a function of arrays, an operation on Matrices, and a derivative along a parameter, such as
 
@@ -19,9 +19,9 @@ from thruster_env.graphs.graphs import where
 
 
 def sym(a):
-    """The symmetric part of a matrix that is symmetric but for rounding; of a Matrix its lower half is worked out.
+    """The symmetric part of a matrix that is symmetric but for rounding; a Matrix computes only its lower half.
 
-    A P A', with a symmetric P, is made of P A', which gains need, too.
+    A P A', with a symmetric P, is computed from P A', because gains need P A', too.
     """
     if not isinstance(a, Matrix):
         return 0.5 * (a + a.T)
@@ -43,33 +43,33 @@ def mirrored(a):
     return a[np.maximum.outer(at, at), np.minimum.outer(at, at)]
 
 
-@operation(lambda a, *others: (a[0], a[0]), lambda *arguments: True)
+@operation(lambda a, *shapes: (a[0], a[0]), lambda *arguments: True)
 def congruence(a, p, pa):
-    """The matrix A P A', of a symmetric P, and of P A'."""
+    """The matrix A P A' of a symmetric P, from A and P A'."""
     return mirrored.compute(a @ pa)
 
 
 @operation(same, lambda a: True)
 def with_transposed(a):
-    """A matrix and its transpose together."""
+    """The sum A + A'."""
     return a + a.T
 
 
 @operation(lambda shape: (shape[0], shape[0]), lambda like: True)
 def eye(like):
-    """The identity matrix of as many rows as a matrix or vector has."""
+    """The identity matrix with as many rows as `like`."""
     return np.eye(len(like))
 
 
 def wrap(x, angles):
-    """A vector whose components that are angles (flags) lie in (-pi, pi]."""
+    """A vector with its angles (flags) wrapped to (-pi, pi]."""
     return on_one_branch(x, tuple(angles)) if any(angles) else x
 
 
 @operation(same)
 def on_one_branch(x, angles):
-    """The same, if some are."""
-    return np.array([wrapped(one) if angle else one for one, angle in zip(x, angles, strict=True)])
+    """`wrap`, if there are angles."""
+    return np.array([wrapped(entry) if angle else entry for entry, angle in zip(x, angles, strict=True)])
 
 
 # Missing channels: those that are NaN in z
@@ -78,23 +78,23 @@ def on_one_branch(x, angles):
 @operation(same)
 def present(z):
     """Which channels of z are measured."""
-    return np.array([one == one for one in z])
+    return np.array([entry == entry for entry in z])
 
 
 def _masked(keep, a, shape):
     return np.array([where(keep(*at), a[at], 0.0) for at in np.ndindex(*shape)], dtype=a.dtype).reshape(shape)
 
 
-@operation(lambda seen, shape: shape)
-def only(seen, a):
-    """A vector, or rows of a matrix, with zeros for channels that are missing."""
-    return _masked(lambda i, *_: seen[i], a, a.shape)
+@operation(lambda measured, shape: shape)
+def only(measured, a):
+    """A vector, or rows of a matrix, with zeros for missing channels."""
+    return _masked(lambda i, *_: measured[i], a, a.shape)
 
 
-@operation(lambda seen, shape: shape, lambda seen, r: r.symmetric)
-def uncorrelated(seen, r):
-    """The covariance r without its correlations to channels that are missing."""
-    return _masked(lambda i, j: True if i == j else seen[i] & seen[j], r, r.shape)
+@operation(lambda measured, shape: shape, lambda measured, r: r.symmetric)
+def uncorrelated(measured, r):
+    """The covariance r without its correlations to missing channels."""
+    return _masked(lambda i, j: True if i == j else measured[i] & measured[j], r, r.shape)
 
 
 # Quotients
@@ -121,7 +121,7 @@ def pivoted(s, counts, otherwise):
 
 
 def divide(c, s):
-    """The matrix C S^-1, or the vector S^-1 c, for a covariance S, of which no inverse is formed."""
+    """The matrix C S^-1, or the vector S^-1 c, for a covariance S; its inverse is not formed."""
     return quotient(c, factor(s))
 
 
@@ -135,7 +135,7 @@ def forward(c, lower):
 
 @operation(same)
 def quotient(c, of):
-    """The same, of the factor of S. A vector may be a column, as it is beside an ensemble of NumPy's arrays."""
+    """`divide`, from the factor of S. A vector may be a column, as in ensembles of NumPy's arrays."""
     lower, d = of
     x = forward(c.ravel() if c.shape == (len(d), 1) else c, lower)
     for i in reversed(range(len(d))):
@@ -143,11 +143,11 @@ def quotient(c, of):
     return x.reshape(c.shape)
 
 
-@operation(same, lambda of, seen: True)
-def inverse(of, seen):
-    """S^-1, of its factor, with zeros for channels that are missing."""
-    found = quotient.compute(np.array(np.eye(len(seen)), dtype=of[1].dtype), of)
-    return _masked(lambda i, j: seen[i] if i == j else True, found, found.shape)
+@operation(same, lambda of, measured: True)
+def inverse(of, measured):
+    """S^-1 from the factor of S, with zeros for missing channels."""
+    result = quotient.compute(np.array(np.eye(len(measured)), dtype=of[1].dtype), of)
+    return _masked(lambda i, j: measured[i] if i == j else True, result, result.shape)
 
 
 def joseph(p, k, h, r):
@@ -163,7 +163,7 @@ def joseph(p, k, h, r):
 
 @operation(same, lambda *arguments: True)
 def of_best_gain(value, p, c, s, k):
-    """Joseph's form where K = P H' S^-1, which then is P - C S^-1 C' with C = P H'.
+    """Joseph's form if K = P H' S^-1: then it is P - C S^-1 C' with C = P H'.
 
     So its derivative is dP - N - N', N = (dC - 1/2 K dS) K', and no dK is formed.
     """
@@ -193,7 +193,7 @@ def _of_congruence(result, arguments, slopes):
 @eye.derivative
 @present.derivative
 def of_constant(result, arguments, slopes):
-    """Of what depends on nothing that moves."""
+    """The slope None of a constant."""
     return None
 
 
@@ -205,7 +205,7 @@ def _of_masked(result, arguments, slopes):
 
 @factor.derivative
 def _of_factor(result, arguments, slopes):
-    return slopes[0]  # that of S, from which the derivatives of what is made of the factor follow
+    return slopes[0]  # the slope of S, which the derivatives of quotients and densities use
 
 
 @quotient.derivative
@@ -222,7 +222,7 @@ def _of_product(result, arguments, slopes):
 
 
 def _times(slope, b):
-    """A slope times what stands behind it: (dC - K dS) (S^-1 v) for a gain's, so that no dK is formed."""
+    """A slope times b. The slope of a gain times v is (dC - K dS) (S^-1 v), so that no dK is formed."""
     if slope.operation is quotient and len(b.shape) == 1:
         change, of = slope.arguments
         return change @ quotient(b, of)

@@ -1,4 +1,4 @@
-"""What pages of sigma-point filters say: the root of a covariance, and points as the columns of a matrix.
+"""Operations of sigma-point filters: the root of a covariance, and points as the columns of a matrix.
 
 With L L' = P, the unit vectors U = [0, I, -I] and a vector 1 of ones, the points x, x + g L_i, x - g L_i are the
 columns of x 1' + g L U.
@@ -15,18 +15,18 @@ import numpy as np
 
 from filters.algebra.matrices import Operation, operation, plus, same, through
 from filters.algebra.operations import of_constant, with_transposed
-from thruster_env.core import matrices as made
+from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.angles import row_brancher, wrapped
 from thruster_env.core.matrices import RESOLUTION
 from thruster_env.core.sources import Source, entrywise, written_out
 from thruster_env.graphs.graphs import arctan2, where
 
-UNKNOWN = 1e-9  # a pivot that is zero and moves by more, relative to its entry, has a root without derivative
+UNKNOWN = 1e-9  # largest slope of a zero pivot, relative to the entry of dP, at which the root has a derivative
 
 
 @operation(same)
 def root(p):
-    """The lower triangular L with L L' = p, which may be singular: a column whose pivot is rounding is zero."""
+    """The lower triangular L with L L' = p; of a singular p it has zero columns, where pivots are rounding."""
     lower = np.full(p.shape, 0.0, dtype=p.dtype)
     for j in range(len(p)):
         d = p[j, j] - sum(lower[j, k] * lower[j, k] for k in range(j))
@@ -42,7 +42,7 @@ def root(p):
 def root_slope(lower, dp):
     """The slope of the root L of P: L Phi(L^-1 dP L'^-1), where Phi is the lower triangle with half the diagonal.
 
-    It is worked out column by column, as the root is; of a singular P it is NaN if the slope dP leaves its range.
+    It is computed column by column, like the root; of a singular P it is NaN if dP leaves the range of P.
     """
     slope = np.full(dp.shape, 0.0, dtype=np.result_type(lower, dp))
     for j in range(len(dp)):
@@ -59,14 +59,14 @@ def root_slope(lower, dp):
 
 @operation(lambda x: (x[0], 2 * x[0] + 1))
 def units(x):
-    """The columns [0, I, -I], of as many rows as a vector x has."""
-    one = np.eye(len(x))
-    return np.concatenate([np.zeros((len(x), 1)), one, -one], axis=1)
+    """The columns [0, I, -I], with as many rows as the vector x."""
+    identity = np.eye(len(x))
+    return np.concatenate([np.zeros((len(x), 1)), identity, -identity], axis=1)
 
 
 @operation(lambda a: a[1:])
 def ones(a):
-    """A vector of ones, as many as a matrix has columns."""
+    """A vector of ones, one for each column of a matrix."""
     return np.ones(a.shape[1])
 
 
@@ -89,23 +89,23 @@ def first(a):
 
 
 @operation(lambda a: (a[0], a[1] - 1))
-def others(a):
+def without_first(a):
     """The columns of a matrix without the first."""
     return a[:, 1:]
 
 
 @operation(lambda u, nodes: nodes)
 def hats(u, nodes):
-    """Weights (s,) of increasing nodes at which something is known, for what is linear between them at u (1,)."""
-    found = []
+    """Weights (s,) of values at increasing nodes, for linear interpolation at u (1,)."""
+    weights = []
     for s in range(len(nodes)):
         weight = 1.0
         if s > 0:
             weight = least(weight, (u[0] - nodes[s - 1]) / (nodes[s] - nodes[s - 1]))
         if s < len(nodes) - 1:
             weight = least(weight, (nodes[s + 1] - u[0]) / (nodes[s + 1] - nodes[s]))
-        found.append(where(0.0 < weight, weight, 0.0))
-    return np.array(found)
+        weights.append(where(0.0 < weight, weight, 0.0))
+    return np.array(weights)
 
 
 def least(a, b):
@@ -114,19 +114,19 @@ def least(a, b):
 
 
 def on_circle(y, angles):
-    """Columns whose rows that are angles (flags) lie within half a turn of their circular mean."""
+    """Columns with the rows of angles (flags) within half a turn of their circular mean."""
     return on_one_side(y, tuple(angles)) if any(angles) else y
 
 
 @operation(same)
 def on_one_side(y, angles):
-    """The same, if some are."""
+    """`on_circle`, if there are angles."""
 
-    def moved(row):
+    def aligned(row):
         middle = arctan2(np.sin(row).sum(), np.cos(row).sum())
         return middle + wrapped(row - middle)
 
-    return np.array([moved(row) if angle else row for row, angle in zip(y, angles, strict=True)])
+    return np.array([aligned(row) if angle else row for row, angle in zip(y, angles, strict=True)])
 
 
 # Derivatives; slopes of None are zero
@@ -155,7 +155,7 @@ ones.derivative(of_constant)
 
 
 @first.derivative
-@others.derivative
+@without_first.derivative
 @on_one_side.derivative
 def _of_part(result, arguments, slopes):
     return through(lambda slope: slope if result.operation is on_one_side else result.operation(slope), slopes[0])
@@ -196,33 +196,37 @@ def _outer(result: tuple, a: tuple, b: tuple) -> Callable:
 
 
 def _columns(result: tuple, a: tuple) -> Callable:
-    return entrywise("others", "a", result, lambda i, j: f"a[{i}][{j + 1}]", a=a)
+    return entrywise("without_first", "a", result, lambda i, j: f"a[{i}][{j + 1}]", a=a)
 
 
 def _on_one_side(result: tuple, angles: tuple[bool, ...], of: tuple) -> Callable:
-    turn, back, align = made.transposer(*of), made.transposer(*of[::-1]), row_brancher(of[1], angles)
+    turn, back, align = (
+        matrix_functions.transposer(*of),
+        matrix_functions.transposer(*of[::-1]),
+        row_brancher(of[1], angles),
+    )
     return written_out("on_one_side", "y", "back(align(turn(y)))", turn=turn, back=back, align=align)
 
 
 def _hats(result: tuple, u: tuple, nodes: tuple) -> Callable:
     source = Source("hats", "u, x", result=result, x=nodes)
-    found = source.local("w", *result)
+    weights = source.local("w", *result)
     for s in range(*result):
         sides = [f"(u[0] - x[{s - 1}]) / (x[{s}] - x[{s - 1}])"] * (s > 0)
         sides += [f"(x[{s + 1}] - u[0]) / (x[{s + 1}] - x[{s}])"] * (s < result[0] - 1)
-        source.line(f"{found[s]} = max(0.0, min(1.0, {', '.join(sides)}))")
-    return source.function(source.whole(found))
+        source.line(f"{weights[s]} = max(0.0, min(1.0, {', '.join(sides)}))")
+    return source.function(source.whole(weights))
 
 
 FUNCTIONS: dict[Operation, Callable] = {
-    root: lambda result, of: made.semidefinite_factor(*result[:1]),
+    root: lambda result, of: matrix_functions.semidefinite_factor(*result[:1]),
     root_slope: _root_slope,
     units: _units,
     ones: lambda result, of: entrywise("ones", "a", result, lambda i: "1.0"),
     outer: _outer,
-    square: lambda result, of: made.square(*of),
+    square: lambda result, of: matrix_functions.square(*of),
     first: lambda result, of: entrywise("first", "a", result, lambda i: f"a[{i}][0]", a=of),
-    others: _columns,
+    without_first: _columns,
     on_one_side: _on_one_side,
     hats: _hats,
 }

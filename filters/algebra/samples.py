@@ -2,7 +2,7 @@
 
     d log N(v; 0, S) = -w' dv + 1/2 tr((w w' - S^-1) dS),  w = S^-1 v
 
-Channels that are missing have v = 0 and no correlations in S; they count for nothing.
+Missing channels have v = 0 and no correlations in S, so they do not contribute.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ from filters.algebra.scalars import logarithm
 from thruster_env.core.streams import LOWEST, parts
 from thruster_env.graphs.graphs import Number, largest_of_members, over_members, where
 
-# What pages of particle filters say of weighted samples: weights, sums over them, covariances.
-
 
 @operation(same)
 def weights(logarithms):
-    """e^l, where l is at least -46: e^-46 is nothing beside 1, and takes the place of no number, too."""
+    """e^l of l, at least -46: e^-46 is negligible beside 1. NaN becomes e^-46, too."""
     if not isinstance(logarithms, Number):
         return np.exp(np.where(logarithms > LOWEST, logarithms, LOWEST))
     series, power = parts(where(logarithms > LOWEST, logarithms, LOWEST))
@@ -31,34 +29,34 @@ def weights(logarithms):
 
 @operation(same, reduces=True)
 def total(a):
-    """The sum of a number that each member has."""
+    """The sum over the members of a number."""
     return over_members(a) if isinstance(a, Number) else a.sum()
 
 
 @operation(lambda a, w: a, lambda a, w: a.symmetric, reduces=True)
 def weighted_mean(a, w):
-    """The sum of w a over the members, of vectors or matrices."""
+    """The sum of w a over the members, for vectors or matrices a."""
     if a.dtype != object:
         return (a * w).sum(axis=-1, keepdims=True)
-    return np.array([over_members(one * w) for one in a.ravel()], dtype=object).reshape(a.shape)
+    return np.array([over_members(entry * w) for entry in a.ravel()], dtype=object).reshape(a.shape)
 
 
 @operation(same, reduces=True)
 def largest(a):
-    """The largest of the numbers that the members have, of which NaN is none; NaN if none is above -inf."""
+    """The largest of the members' numbers, without NaN; NaN if none is above -inf."""
     most = largest_of_members(a) if isinstance(a, Number) else np.fmax.reduce(a, initial=-math.inf)
     return where(most > -math.inf, most, math.nan)
 
 
 def normalised(logarithms):
-    """Weights that sum to one, of their logarithms but for a constant, and the logarithm of the sum of all e^l.
+    """Weights that sum to one, proportional to e^l, and the logarithm of the sum of all e^l.
 
     The latter is NaN if no l is above -inf.
     """
     top = largest(logarithms)
     scaled = weights(logarithms - top)
-    some = total(scaled)
-    return scaled / some, top + logarithm(some)
+    scale = total(scaled)
+    return scaled / scale, top + logarithm(scale)
 
 
 @operation(same, reduces=True)
@@ -73,18 +71,18 @@ def weighted_square(d, w):
     if d.dtype != object:
         return (d * w) @ d.T
     scaled = w * d
-    return mirrored.compute(np.array([[over_members(one * other) for other in d] for one in scaled]))
+    return mirrored.compute(np.array([[over_members(first * other) for other in d] for first in scaled]))
 
 
 @operation(same, reduces=True)
 def spread_share(w):
     """1 less the sum of the squares of weights that sum to one, as the sum of w (1 - w).
 
-    For a weight near 1 the others tell 1 - w without cancellation. Where one weight is all, it is what they say.
+    For a weight above 1/2, 1 - w is the sum of the others, which avoids cancellation.
     """
-    others = where(w > 0.5, 0.0, w) if isinstance(w, Number) else np.where(w > 0.5, 0.0, w)
-    rest = total.compute(others)
-    return total.compute(others * (1.0 - others)) + rest * (1.0 - rest)
+    minor = where(w > 0.5, 0.0, w) if isinstance(w, Number) else np.where(w > 0.5, 0.0, w)
+    rest = total.compute(minor)
+    return total.compute(minor * (1.0 - minor)) + rest * (1.0 - rest)
 
 
 def weighted_covariance(x, w):
@@ -101,17 +99,17 @@ def weighted_covariance(x, w):
 LEVEL = 0.5 * math.log(2.0 * math.pi)
 
 
-def log_density(v, s, seen):
-    """The number log N(v; 0, S) over the channels that are seen."""
-    return density(v, factor(s), seen)
+def log_density(v, s, measured):
+    """The number log N(v; 0, S) over the measured channels."""
+    return density(v, factor(s), measured)
 
 
 @operation(lambda *shapes: ())
-def density(v, of, seen):
-    """The same, of the factor of S."""
+def density(v, of, measured):
+    """`log_density`, from the factor of S."""
     lower, d = of
     y = forward(np.ravel(v), lower)
-    logs = (where(seen[i], 0.5 * np.log(d[i]) + LEVEL, 0.0) for i in range(len(d)))
+    logs = (where(measured[i], 0.5 * np.log(d[i]) + LEVEL, 0.0) for i in range(len(d)))
     return -sum(0.5 * y[i] * y[i] / d[i] for i in range(len(d))) - sum(logs)
 
 
@@ -122,20 +120,20 @@ def dot(a, b):
 
 
 @operation(lambda *shapes: ())
-def stretch(w, other, e, ds):
+def half_trace(w, other, e, ds):
     """1/2 tr((w other' - e) dS), the slope of a log density along a covariance."""
     return 0.5 * ((w[:, None] * other[None, :] - e) * ds).sum()
 
 
 @density.derivative
 def _of_density(result, arguments, slopes):
-    v, of, seen = arguments
-    return density_slope(quotient(v, of), quotient(v, of), inverse(of, seen), *slopes[:2])
+    v, of, measured = arguments
+    return density_slope(quotient(v, of), quotient(v, of), inverse(of, measured), *slopes[:2])
 
 
 def density_slope(w, weighted, e, dv, ds):
-    """-w' dv + 1/2 tr((w w' - e) dS), of w or of that times a weight."""
-    by_cov = through(lambda slope: stretch(w, weighted, e, slope), ds)
+    """-w' dv + 1/2 tr((w w' - e) dS), where the second w, `weighted`, may be w times a weight."""
+    by_cov = through(lambda slope: half_trace(w, weighted, e, slope), ds)
     return minus(by_cov, through(lambda slope: dot(weighted, slope), dv))
 
 
@@ -143,24 +141,30 @@ def density_slope(w, weighted, e, dv, ds):
 
 
 @operation(lambda *shapes: ())
-def heavier(q, seen, tail):
+def heavier(q, measured, tail):
     """The difference log t(v) - log N(v; 0, S) for q = v' S^-1 v over d channels; see `tail_of`."""
-    inverse, d = tail[0], sum(where(one, 1.0, 0.0) for one in seen)
-    level = sum(where(d == k, tail[1 + k], 0.0) for k in range(len(seen) + 1))
-    some = where(inverse > 0.0, inverse, 0.25)
-    larger = level + 0.5 * q - 0.5 * (1.0 / some + d) * np.log(1.0 + some * q / (1.0 - 2.0 * some))
+    inverse, d = tail[0], sum(where(channel, 1.0, 0.0) for channel in measured)
+    level = sum(where(d == k, tail[1 + k], 0.0) for k in range(len(measured) + 1))
+    safe_inverse = where(inverse > 0.0, inverse, 0.25)
+    larger = (
+        level
+        + 0.5 * q
+        - 0.5 * (1.0 / safe_inverse + d) * np.log(1.0 + safe_inverse * q / (1.0 - 2.0 * safe_inverse))
+    )
     return where(inverse > 0.0, larger, 0.0)
 
 
 @operation(lambda *shapes: ())
-def outlier_weight(q, seen, tail):
-    """(nu + d)/(nu - 2 + q), times which what depends on v changes for log t; 1 for the normal density."""
-    inverse, d = tail[0], sum(where(one, 1.0, 0.0) for one in seen)
+def outlier_weight(q, measured, tail):
+    """(nu + d)/(nu - 2 + q), the factor of the slope of log t to that of log N by v; 1 for the normal density."""
+    inverse, d = tail[0], sum(where(channel, 1.0, 0.0) for channel in measured)
     return (1.0 + inverse * d) / (1.0 - 2.0 * inverse + inverse * q)
 
 
 def tail_of(degrees: float, channels: int) -> list[float]:
-    """What densities need of nu degrees of freedom: 1/nu, and a level for each number d of channels; or zeros.
+    """The argument `tail` for nu degrees of freedom: 1/nu, and the level for each number d of channels.
+
+    All are zero for the normal density, nu = inf.
 
     log t = log N + q/2 + level - (nu + d)/2 log(1 + q/(nu - 2)),
     level = d/2 log(2/(nu - 2)) + log G((nu + d)/2) - log G(nu/2)

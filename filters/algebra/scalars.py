@@ -1,10 +1,9 @@
-"""What pages say of numbers: reciprocals, conditions and choices, traces, how many channels are seen.
+"""Operations on numbers: conditions and choices, traces, the count of measured channels; and slopes of graphs.
 
-A choice works out both sides. So a page that divides guards its divisor, not its quotient.
+A choice computes both sides. So a page that divides guards its divisor, not its quotient.
 
-The slopes are Matrices of the same graph. So what they share with the values, and with one another, is there
-once: a gain, a quotient S^-1 v, the product P H'. A slope of None is zero, and what would be made of it is left
-out.
+Slopes are Matrices of the same graph as values. So operations that they share, such as a gain, a quotient S^-1 v
+or the product P H', are evaluated once. A slope of None is zero.
 """
 
 from __future__ import annotations
@@ -30,28 +29,28 @@ from filters.algebra.matrices import (
 from thruster_env.graphs.graphs import where
 
 
-def _by_entries(function, *given):
-    """What a function of numbers makes of the entries of arrays."""
+def _by_entries(function, *arrays):
+    """A function of numbers, applied to the entries of arrays."""
     with np.errstate(invalid="ignore"):
-        found = np.frompyfunc(function, len(given), 1)(*given)
-    return np.array(found.tolist()) if np.ndim(found) else found
+        result = np.frompyfunc(function, len(arrays), 1)(*arrays)
+    return np.array(result.tolist()) if np.ndim(result) else result
 
 
 @operation(same)
 def exceeds(a, value):
-    """Whether a number, or each entry, is larger than a number that is known now."""
+    """Whether a number, or each entry, is larger than the float `value`."""
     return _by_entries(operator.gt, a, value)
 
 
 @operation(lambda a: ())
 def is_number(a):
-    """Whether a number is one, and not NaN."""
+    """Whether a number is not NaN."""
     return a == a
 
 
 @operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
 def choose(condition, a, b):
-    """`a` if the condition holds, else `b`, of numbers or of matrices; the condition may be one of each entry."""
+    """`a` if the condition holds, else `b`: numbers or matrices; the condition may differ between entries."""
     return _by_entries(where, condition, a, b)
 
 
@@ -62,14 +61,14 @@ def trace(a):
 
 
 @operation(lambda shape: ())
-def count(seen):
-    """How many channels are seen."""
-    return sum(where(one, 1.0, 0.0) for one in seen)
+def count(measured):
+    """The number of measured channels."""
+    return sum(where(channel, 1.0, 0.0) for channel in measured)
 
 
 @operation(same)
 def exponential(v):
-    """Exp of a number, or of each entry of a vector."""
+    """e^v of a number, or of each entry of a vector."""
     return np.exp(v)
 
 
@@ -81,30 +80,30 @@ def logarithm(a):
 
 @operation(same)
 def at_most(v, value):
-    """Entries of a vector, none of which is larger than a number that is known now."""
-    return np.array([where(one > value, value, one) for one in v])
+    """The smaller of each entry of a vector and the float `value`."""
+    return np.array([where(entry > value, value, entry) for entry in v])
 
 
 @operation(same)
 def at_least(a, value):
-    """A number, or entries, none of which is smaller than a number that is known now; this in place of NaN."""
-    return _by_entries(lambda one: where(one > value, one, value), a)
+    """The larger of a number, or of each entry, and the float `value`; `value` for NaN."""
+    return _by_entries(lambda entry: where(entry > value, entry, value), a)
 
 
 @operation(lambda v, value: v)
 def below(v, value):
-    """1 for entries of a vector that are not larger than a number that is known now, else 0."""
-    return np.array([where(one > value, 0.0, 1.0) for one in v])
+    """1 for entries of a vector that are not larger than the float `value`, else 0."""
+    return np.array([where(entry > value, 0.0, 1.0) for entry in v])
 
 
 @operation(lambda v: (v[0], v[0]), lambda v: True)
 def diagonal(v):
-    """The diagonal matrix of a vector."""
+    """The diagonal matrix with the entries of a vector."""
     return np.diag(np.ravel(v))
 
 
 def constant(value: float, like):
-    """A number that is known, beside a number `like` that may not be, or a vector of it."""
+    """A number, or a vector of equal numbers, with the shape and the kind of `like`."""
     return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else np.full(np.shape(like), value)[()]
 
 
@@ -180,19 +179,16 @@ def _of_choice(result, arguments, slopes):
 @is_number.derivative
 @count.derivative
 def _of_decision(result, arguments, slopes):
-    """Of what is constant but for jumps."""
+    """The slope None of results that are constant but for jumps."""
     return None
 
 
-# Derivatives of matrices along one parameter: beside each stands its slope, by the rules of their operations.
-
-
 def slopes_of(wanted: Sequence[Matrix], moves: Mapping[Matrix, Matrix]) -> list[Matrix | None]:
-    """Slopes of matrices in the direction in which those that are given move; None of what does not move."""
+    """Slopes of matrices along one parameter, from those of given matrices, `moves`; None for zero."""
     slopes: dict[Matrix, Matrix | None] = dict(moves)
-    for one in in_order(wanted):
-        if one not in slopes:
-            of = [slopes[a] if isinstance(a, Matrix) else None for a in one.arguments]
+    for matrix in in_order(wanted):
+        if matrix not in slopes:
+            of = [slopes[a] if isinstance(a, Matrix) else None for a in matrix.arguments]
             moving = any(slope is not None for slope in of)
-            slopes[one] = one.operation.slope(one, one.arguments, of) if moving else None
-    return [slopes[one] for one in wanted]
+            slopes[matrix] = matrix.operation.slope(matrix, matrix.arguments, of) if moving else None
+    return [slopes[matrix] for matrix in wanted]

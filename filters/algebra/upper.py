@@ -1,4 +1,4 @@
-"""What the UD form of a filter says: factors U, D of P = U D U', in one matrix with D on its diagonal."""
+"""Operations of the UD form of a filter: factors U, D of P = U D U', in one matrix with D on its diagonal."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from thruster_env.graphs.graphs import where
 @operation(same)
 def unit_upper(ud):
     """U."""
-    found = np.array(ud)
+    u = np.array(ud)
     for i in range(len(ud)):
-        found[i, i], found[i, :i] = 1.0, 0.0
-    return found
+        u[i, i], u[i, :i] = 1.0, 0.0
+    return u
 
 
 @operation(same)
@@ -36,34 +36,34 @@ def factors(w):
 
 @operation(lambda w, ud: ud)
 def weighted_factors(w, ud):
-    """The factors of W diag(D, I) W', of as many ones as W has further columns."""
+    """The factors of W diag(D, I) W', where I has as many rows as W has further columns."""
     n = len(ud)
     return _orthogonal(w, [ud[i, i] for i in range(n)] + [1.0] * (w.shape[1] - n))
 
 
 def _orthogonal(w: np.ndarray, weights: list) -> np.ndarray:
     n, rows = len(w), [row for row in np.array(w)]
-    found = np.full((n, n), 0.0, dtype=w.dtype)
+    ud = np.full((n, n), 0.0, dtype=w.dtype)
     for j in reversed(range(n)):
         weighted = rows[j] * np.array(weights)
         d = weighted @ rows[j]
         vanishes = d <= 0.0
-        found[j, j], reciprocal = where(vanishes, 0.0, d), where(vanishes, 0.0, 1.0 / where(vanishes, 1.0, d))
+        ud[j, j], reciprocal = where(vanishes, 0.0, d), where(vanishes, 0.0, 1.0 / where(vanishes, 1.0, d))
         for i in range(j):
-            found[i, j] = (weighted @ rows[i]) * reciprocal
-            rows[i] = rows[i] - found[i, j] * rows[j]
-    return found
+            ud[i, j] = (weighted @ rows[i]) * reciprocal
+            rows[i] = rows[i] - ud[i, j] * rows[j]
+    return ud
 
 
 @operation(lambda ud, h: ud)
 def measured_factors(ud, h):
-    """The factors after the channels h (m, n), each with noise of variance one."""
+    """The factors after an update by channels h (m, n), each with noise of variance one."""
     return _measured(ud, h)[0]
 
 
 @operation(lambda ud, h: h[::-1])
 def measured_gain(ud, h):
-    """The gain of these channels, (n, m)."""
+    """The gain (n, m) of `measured_factors`."""
     return _measured(ud, h)[1]
 
 
@@ -83,7 +83,7 @@ def _measured(ud: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 k[i] = k[i] + was * g
             k[j], before = g, total
         k = k / before
-        known = h[c] @ gain  # what the channels before say of this one
+        known = h[c] @ gain  # prediction of this channel by the earlier ones
         gain = gain - k[:, None] * known[None, :]
         gain[:, c] = gain[:, c] + k
     return ud, gain
@@ -126,7 +126,7 @@ def called_weighted_factors(w, ud):
         for k in range(columns):
             d += rows[j, k] * weights[k] * rows[j, k]
         if d <= 0.0:
-            continue  # a row that vanishes is along no other
+            continue  # a row that vanishes has no component along others
         out[j, j] = d
         for i in range(j):
             total = 0.0
@@ -146,21 +146,21 @@ def called_factors(w):
 
 @not_inlined
 def measured(ud, h):
-    """The factors after channels h (m, n), each with noise of variance one, and the gain (n, m)."""
-    (m, n), found, k = h.shape, ud.copy(), np.zeros(len(ud))
+    """`measured_factors` and `measured_gain`."""
+    (m, n), updated, k = h.shape, ud.copy(), np.zeros(len(ud))
     gain = np.zeros((n, m))
     for c in range(m):
         before = 1.0
         for j in range(n):
             f = h[c, j]
             for i in range(j):
-                f += found[i, j] * h[c, i]
-            g = found[j, j] * f
+                f += updated[i, j] * h[c, i]
+            g = updated[j, j] * f
             total = before + f * g
-            found[j, j] *= before / total
+            updated[j, j] *= before / total
             for i in range(j):
-                was = found[i, j]
-                found[i, j] = was - k[i] * f / before
+                was = updated[i, j]
+                updated[i, j] = was - k[i] * f / before
                 k[i] += was * g
             k[j], before = g, total
         for j in range(n):
@@ -173,19 +173,19 @@ def measured(ud, h):
                 gain[j, d] -= k[j] * known
         for j in range(n):
             gain[j, c] = k[j]
-    return found, gain
+    return updated, gain
 
 
 def _of_arrays(function: Callable, part: str = "") -> Callable:
-    """What makes functions of matrices, tuples or arrays as their sizes say, from one of arrays."""
+    """Return `make(result, *shapes)`: a function of arrays as one of matrices, tuples or arrays by their sizes."""
 
     def make(result: tuple, *shapes: tuple) -> Callable:
         named = dict(zip("ab", shapes, strict=False))
         source = Source(function.__name__, ", ".join(named), result=result, work=LONGEST_TEXT + 1, **named)
-        found = source.local("found", *result)
-        source.line(f"found = work({', '.join(source.array_of(name) for name in named)}){part}")
+        out = source.local("out", *result)
+        source.line(f"out = work({', '.join(source.array_of(name) for name in named)}){part}")
         names: dict[str, Any] = {"work": function}
-        return source.function(source.whole(found), **names)
+        return source.function(source.whole(out), **names)
 
     return make
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import prod
 
-from filters.algebra.matrices import Matrix, given
+from filters.algebra.matrices import Matrix, input_matrix
 from filters.algebra.points import root
 from filters.pages.equations import PagedModel
 from filters.pages.kernels import as_tuple
@@ -36,8 +36,8 @@ class Memory(NumbersMemory):
         tail = places.constants + shape.constants
         self.tail, self.predicted_tail = tail, tail + m + 2
         own = self.predicted_tail + m + 2
-        x = given(Place("rows", 0), (n,))
-        super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, like=x), own)
+        x = input_matrix(Place("rows", 0), (n,))
+        super().__init__(shape, page, x, input_matrix(Place("rows", n), (n, n), symmetric=True, like=x), own)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
         flying = (x, self.P) if page.represent is None else as_tuple(page.represent(model, x, self.P))

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.algebra.blocks import forward_quotient
-from filters.algebra.matrices import given
+from filters.algebra.matrices import input_matrix
 from filters.algebra.members import mean
 from filters.algebra.operations import only, present, uncorrelated, wrap
 from filters.algebra.points import root
@@ -129,7 +129,7 @@ def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage
     seen, n, m = present(memory.z), memory.shape.n, memory.shape.m
     y, M = expect(model, memory.x, memory.z), root(uncorrelated(seen, model.R))
     v = only(seen, wrap(memory.z - mean(y), model.measurement_angles))
-    rows = given(Place("table", n), (m,), member=True, like=memory.x)
+    rows = input_matrix(Place("table", n), (m,), member=True, like=memory.x)
     place = memory.read("rows", scratch_place(page, memory.shape), m)
     return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, place))}
 

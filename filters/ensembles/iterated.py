@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 from typing import ClassVar, NamedTuple
 
 from filters.algebra.geometric import geometric_mean
-from filters.algebra.matrices import given
+from filters.algebra.matrices import input_matrix
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import divide, only, present, wrap
 from filters.engine.belief import Kernels, memory_places, own_place
@@ -78,7 +78,10 @@ def window_stages(length: int) -> Callable:
     def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
         m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
         row = memory_places(memory.shape.n, m)
-        Y, B = (given(Place("table", at), (m,), member=True, like=memory.x) for at in (places.slopes, places.pull))
+        Y, B = (
+            input_matrix(Place("table", at), (m,), member=True, like=memory.x)
+            for at in (places.slopes, places.pull)
+        )
         v = memory.read("rows", places.innovation, m)
         S = memory.read("rows", places.innovation_cov, m, m, symmetric=True)
         first, _, first_v, first_S, R, level = compare(model, memory.x, z)
@@ -86,7 +89,7 @@ def window_stages(length: int) -> Callable:
         later_S = covariance(later, later) + R
         told = row.innovation, row.innovation_cov, row.log_likelihood
         plain = stages_of(page, memory, model)
-        noise = given(Place("table", places.moved), (memory.shape.n,), member=True, like=memory.x)
+        noise = input_matrix(Place("table", places.moved), (memory.shape.n,), member=True, like=memory.x)
         return {
             **{name: plain[name] for name in ("start", "advance", "summarise")},
             "draw": stored((model.Q_root @ memory.w,), (noise,)),

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from filters.algebra.matrices import given
+from filters.algebra.matrices import input_matrix
 from filters.algebra.samples import dot
 from filters.embedded import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels, memory_places, own_place, restart_if_lost
@@ -140,7 +140,7 @@ def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: 
     """
     first, stride, count = parts
     ratios, foreseen, shares, mixed = (logs + k * count for k in (1, 2, 3, 4))
-    p, mu = given(Place("numbers", 0), (count,)), given(Place("rows", ratios), (count,))
+    p, mu = input_matrix(Place("numbers", 0), (count,)), input_matrix(Place("rows", ratios), (count,))
     (share,) = works_of(stored(mixing(p, mu), (Place("rows", shares), Place("given", 0))))
 
     @inlined

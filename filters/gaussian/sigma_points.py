@@ -11,7 +11,7 @@ import numpy as np
 from filters.algebra.blocks import hstack, part, triangle, vstack, zeros
 from filters.algebra.matrices import operation
 from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import first, on_circle, ones, others, outer, root, square, units
+from filters.algebra.points import first, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.samples import log_density
 from filters.baselines import place_of
 from filters.gaussian.forms import initial_root, root_result
@@ -32,7 +32,7 @@ def unscented_points(model, x, L):
 
 def unscented_moments(model, Y, angles):
     """Mean and shift of values at the points, and their deviations."""
-    D = wrap(others(Y) - outer(first(Y), ones(others(Y))), angles)
+    D = wrap(without_first(Y) - outer(first(Y), ones(without_first(Y))), angles)
     s = (D @ ones(D)) * model.own.weight
     return first(Y) + s, s, D
 
@@ -73,7 +73,7 @@ def update_unscented_root(model, x, P, z):
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
     s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - y, model.measurement_angles))
-    of_x = (L * model.own.spread) @ others(units(x)) * model.own.weight_root
+    of_x = (L * model.own.spread) @ without_first(units(x)) * model.own.weight_root
     both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
     return root_result(model, x, triangle(both), v, seen)
 
@@ -104,7 +104,7 @@ def add_process_noise_unscented(model, X):
 def update_unscented(model, x, P, z):
     """The measurement z; channels that are NaN are missing."""
     g, w = model.own.spread, model.own.weight
-    L, U, seen = root(P), others(units(x)), present(z)
+    L, U, seen = root(P), without_first(units(x)), present(z)
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
     s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - y, model.measurement_angles))
@@ -195,7 +195,7 @@ def represent_cubature(model, x, P):
 
 def cubature_points(model, x, L):
     """The points around the mean."""
-    return outer(x, ones(others(units(x)))) + (L * model.own.spread) @ others(units(x))
+    return outer(x, ones(without_first(units(x)))) + (L * model.own.spread) @ without_first(units(x))
 
 
 def cubature_moments(model, Y, angles):
@@ -213,7 +213,7 @@ def add_process_noise_cubature(model, X):
 
 def update_cubature(model, x, P, z):
     """The measurement z; channels that are NaN are missing."""
-    (g, w), L, U, seen = model.own, root(P), others(units(x)), present(z)
+    (g, w), L, U, seen = model.own, root(P), without_first(units(x)), present(z)
     y, D = cubature_moments(model, model.h(cubature_points(model, x, L)), model.measurement_angles)
     D, R = only(seen, D), uncorrelated(seen, model.R)
     v = only(seen, wrap(z - y, model.measurement_angles))

@@ -7,7 +7,7 @@ from functools import lru_cache
 from math import prod
 from typing import NamedTuple
 
-from filters.algebra.matrices import Matrix, given, in_order
+from filters.algebra.matrices import Matrix, in_order, input_matrix
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import quotient, wrap
 from filters.engine.belief import Kernels, memory_places, own_place
@@ -38,12 +38,14 @@ class MembersMemory(NumbersMemory):
     def __init__(self, shape: Shape, page: Page):
         """Take the sizes."""
         row = memory_places(shape.n, shape.m)
-        x = given(Place("table", 0), (shape.n,), member=True)
-        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
+        x = input_matrix(Place("table", 0), (shape.n,), member=True)
+        p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
-        self.w, self.e = (given(Place("draws", 0), (size,), member=True, like=x) for size in (shape.n, shape.m))
+        self.w, self.e = (
+            input_matrix(Place("draws", 0), (size,), member=True, like=x) for size in (shape.n, shape.m)
+        )
         self.mean = self.read("rows", row.mean, shape.n)
 
 

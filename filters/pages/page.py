@@ -22,7 +22,7 @@ from functools import cache
 from math import prod
 from typing import Any, NamedTuple
 
-from filters.algebra.matrices import Matrix, given
+from filters.algebra.matrices import Matrix, input_matrix
 from filters.engine.belief import memory_places, own_place
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Shape, number_places
@@ -116,7 +116,7 @@ class NumbersMemory:
 
     def read(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
         """A matrix stored in an array from the offset `first` on."""
-        return given(Place(array, first), shape, symmetric=symmetric, like=self.x)
+        return input_matrix(Place(array, first), shape, symmetric=symmetric, like=self.x)
 
     def keep(self, started: Mapping[str, Any]) -> Mapping[str, Matrix]:
         """Lay out the extras of a filter in its row, and return them as matrices read from there."""
@@ -141,8 +141,8 @@ class RowMemory(NumbersMemory):
     def __init__(self, shape: Shape, page: Page):
         """Take the sizes. Extras and other representations of the belief are laid out once they are known."""
         row = memory_places(shape.n, shape.m)
-        x = given(Place("rows", row.mean), (shape.n,))
-        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
+        x = input_matrix(Place("rows", row.mean), (shape.n,))
+        p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)

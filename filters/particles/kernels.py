@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from math import prod
 
-from filters.algebra.matrices import Matrix, given
+from filters.algebra.matrices import Matrix, input_matrix
 from filters.algebra.members import on_branch
 from filters.algebra.operations import wrap
 from filters.algebra.samples import effective_size, normalised, weighted_covariance, weighted_mean, weights
@@ -48,14 +48,16 @@ class Layout:
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
         """Give each its place."""
         n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
-        self.x, self.logarithm = memory.x, given(Place("table", n), (), member=True, like=memory.x)
+        self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.kept = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
         self.start = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
         for name, one in self.start[-1].items():
             if name in page.per_particle:
                 place = Place("table", rows)
-                self.kept[name] = given(place, one.shape, symmetric=one.symmetric, member=True, like=memory.x)
+                self.kept[name] = input_matrix(
+                    place, one.shape, symmetric=one.symmetric, member=True, like=memory.x
+                )
                 rows += prod(one.shape)
             else:
                 self.kept[name] = memory.another(one, symmetric=one.symmetric)

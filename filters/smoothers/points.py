@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from filters.algebra.blocks import careful
 from filters.algebra.operations import quotient, sym
-from filters.algebra.points import others, root, square, units
+from filters.algebra.points import root, square, units, without_first
 from filters.filter import Filter
 from filters.gaussian import sigma_points as cubature
 from filters.gaussian import sigma_points as unscented
@@ -24,7 +24,7 @@ from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation
 
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
-    g, w, L, U = model.own.spread, model.own.weight, root(P), others(units(x))
+    g, w, L, U = model.own.spread, model.own.weight, root(P), without_first(units(x))
     mean, s, D = unscented_moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(scatter(model, D, s) + model.Q))
@@ -34,7 +34,7 @@ def link_unscented(model, x, P, X):
 
 def link_cubature(model, x, P, X):
     """The link of a cubature filter."""
-    (g, w), L, U = model.own, root(P), others(units(x))
+    (g, w), L, U = model.own, root(P), without_first(units(x))
     mean, D = cubature.cubature_moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(square(D) * w + model.Q))

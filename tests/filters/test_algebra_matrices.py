@@ -7,9 +7,9 @@ from scipy.stats import multivariate_normal, multivariate_t
 from filters.algebra import operations
 from filters.algebra import samples as densities
 from filters.algebra.calls import calls_of
-from filters.algebra.matrices import Matrix, evaluate, given, in_order
+from filters.algebra.matrices import Matrix, evaluate, in_order, input_matrix
 from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import first, on_circle, ones, others, outer, root, square, units
+from filters.algebra.points import first, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.samples import heavier, log_density, outlier_weight, tail_of
 from filters.algebra.scalars import at_least, choose, exceeds, slopes_of
 from thruster_env.graphs.programs import Place
@@ -60,7 +60,7 @@ FORMULAS = {
     "root": lambda g: root(g["P"]),
     "points": lambda g: g["H"] @ (outer(g["x"], ones(units(g["x"]))) + (root(g["P"]) * 0.7) @ units(g["x"])),
     "scatter": lambda g: (
-        square(others(g["F"])) + outer(first(g["F"]), first(g["F"])) + outer(g["x"], g["F"] @ g["x"])
+        square(without_first(g["F"])) + outer(first(g["F"]), first(g["F"])) + outer(g["x"], g["F"] @ g["x"])
     ),
     "circle": lambda g: on_circle(g["F"], (True, False) + (True,) * (len(g["x"]) - 2)),
     "entries": lambda g: abs(g["x"]) * g["x"] ** 3.0 / (1.0 + g["x"] ** 2.0) - 0.3 + at_least(g["x"], 0.0) ** 4.0,
@@ -71,8 +71,8 @@ ENTRIES = ("P", "R", "H", "F", "x", "v", "z")
 
 
 def as_matrices(values):
-    first = given("P", values["P"].shape, symmetric=True)
-    others = {k: given(k, a.shape, symmetric=k == "R", like=first) for k, a in values.items() if k != "P"}
+    first = input_matrix("P", values["P"].shape, symmetric=True)
+    others = {k: input_matrix(k, a.shape, symmetric=k == "R", like=first) for k, a in values.items() if k != "P"}
     return {"P": first, **others}
 
 
@@ -94,7 +94,7 @@ def test_slopes_are_those_of_central_differences(name, moving):
     directions = {k: a + a.T if k in "PR" else a for k, a in directions.items()}
     matrices = as_matrices(values)
     moves = {
-        matrices[k]: given(f"d{k}", a.shape, symmetric=k in "PR", like=matrices["P"])
+        matrices[k]: input_matrix(f"d{k}", a.shape, symmetric=k in "PR", like=matrices["P"])
         for k, a in directions.items()
     }
     slope = slopes_of([FORMULAS[name](matrices)], moves)[0]
@@ -112,7 +112,7 @@ def test_slopes_are_those_of_central_differences(name, moving):
 
 def test_of_the_best_gain_no_derivative_is_formed():
     matrices = as_matrices(values_of_sizes(N, M))
-    moves = {matrices["P"]: given("dP", (N, N), symmetric=True, like=matrices["P"])}
+    moves = {matrices["P"]: input_matrix("dP", (N, N), symmetric=True, like=matrices["P"])}
     divided = lambda wanted: [one for one in in_order(wanted) if one.operation is operations.quotient]  # noqa: E731
     slopes = slopes_of([posterior(matrices), FORMULAS["corrected"](matrices)], moves)
     assert {one.shape for one in divided(slopes)} == {(N, M), (M,)}
@@ -126,7 +126,7 @@ def test_calls_of_functions_are_the_formula(name, sizes):
     first, place = None, 0
     matrices, numbers = {}, []
     for key, value in values.items():
-        matrices[key] = given(Place("numbers", place), value.shape, symmetric=key in "PR", like=first)
+        matrices[key] = input_matrix(Place("numbers", place), value.shape, symmetric=key in "PR", like=first)
         first, place = first or matrices[key], place + value.size
         numbers.append(value.ravel())
     wanted = FORMULAS[name](matrices)
@@ -169,4 +169,4 @@ def test_a_covariance_that_is_none_has_no_density():
     seen = np.array([True, True])
     assert np.isnan(log_density(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), seen))
     with pytest.raises(TypeError, match="no derivative"):
-        slopes_of([densities.dot(x := given("x", (2,)), x)], {x: given("dx", (2,), like=x)})
+        slopes_of([densities.dot(x := input_matrix("x", (2,)), x)], {x: input_matrix("dx", (2,), like=x)})

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_triangular
 
 from filters.algebra.calls import calls_of
-from filters.algebra.matrices import given
+from filters.algebra.matrices import input_matrix
 from filters.algebra.points import on_circle, root, root_slope
 from thruster_env.core.angles import on_one_branch
 from thruster_env.graphs.programs import Place
@@ -21,8 +21,8 @@ def symmetric(size):
 def called(lower, slope):
     """The slope of a root by functions that are made for its size."""
     size = len(lower)
-    of = given(Place("numbers", 0), lower.shape)
-    moves = given(Place("move", 0), lower.shape, symmetric=True, like=of)
+    of = input_matrix(Place("numbers", 0), lower.shape)
+    moves = input_matrix(Place("move", 0), lower.shape, symmetric=True, like=of)
     rows, numbers, move = np.zeros(size**2), lower.ravel(), slope.ravel()
     known = {of: of.operation, moves: moves.operation}
     calls_of([(Place("rows", 0), root_slope(of, moves))], known, {})(rows, np.zeros(1), numbers, move)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from filters.algebra.matrices import given
+from filters.algebra.matrices import input_matrix
 from filters.algebra.samples import (
     effective_size,
     normalised,
@@ -69,8 +69,8 @@ def in_memory(page, x, log_w, make):
     n, size = x.shape
     table = np.full((n + 2, 16), 9.0)
     table[n], table[:n, :size], table[n, :size] = log_w[0], x, log_w
-    states = given(Place("table", 0), (n,), member=True)
-    results = page(states, given(Place("table", n), (), member=True, like=states))
+    states = input_matrix(Place("table", 0), (n,), member=True)
+    results = page(states, input_matrix(Place("table", n), (), member=True, like=states))
     places = [Place("table", n + 1) if one.member else Place("rows", 20 * k) for k, one in enumerate(results)]
     rows, nothing = np.zeros(20 * len(results)), np.zeros(1)
     make(Stage(dict(zip(places, results, strict=True)), {}))(rows, nothing, nothing, table, nothing, size)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.algebra.matrices import entries_product, given
+from filters.algebra.matrices import entries_product, input_matrix
 from filters.algebra.members import covariance, mean, variances
 from filters.pages.kernels import Stage, as_programs
 from thruster_env.core.compiled import compiled, interpreted
@@ -25,8 +25,8 @@ def spread(x, y):
 
 
 def stage_of(page):
-    x = given(Place("table", 0), (N,), member=True)
-    y = given(Place("table", N), (N,), member=True, like=x)
+    x = input_matrix(Place("table", 0), (N,), member=True)
+    y = input_matrix(Place("table", N), (N,), member=True, like=x)
     places = Place("table", 0), Place("table", N), Place("rows", 0)
     return as_programs(Stage(dict(zip(places, page(x, y), strict=True)), {}), 0, 10_000).values
 
