@@ -11,7 +11,7 @@ from thruster_env.core.checks import as_floats, at_least, correlations, covarian
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.core.derivatives import step_of, stretch
 from thruster_env.core.matrices import multiplier, quadratic_form
-from thruster_env.core.progress import told
+from thruster_env.core.progress import with_progress
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
 from thruster_env.core.streams import GROUP
 from thruster_env.core.threads import cores, spread
@@ -102,7 +102,7 @@ def posterior_variances(
     most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
     variances = np.empty((count, steps + 1, model.n))
     parts = [slice(first, min(first + most, count)) for first in range(0, count, most)]
-    for part in told("posterior bound", parts, [len(inputs[part]) for part in parts]):
+    for part in with_progress("posterior bound", parts, [len(inputs[part]) for part in parts]):
         variances[part] = np.einsum("bkii->bki", _posterior_bound(model, inputs[part], keys[part]))
     return wrapped_variances(variances, model.shape.state_angles)
 
@@ -145,7 +145,7 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
     # Some truths at a time, in the same order: Ctrl-C is heard in between.
     size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
     parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, keys.shape[1], size)]
-    for batch in told("truths", parts, [part.shape[1] for part in parts]):
+    for batch in with_progress("truths", parts, [part.shape[1] for part in parts]):
         spread(partial(add, batch, done, *fixed), count)
         done += batch.shape[1]
     spread_of_f /= done

@@ -9,7 +9,7 @@ from filters.estimators.estimator import is_estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import short_repr
-from thruster_env.core.modules import is_code, object_named, said
+from thruster_env.core.modules import error_line, is_code, object_named
 from thruster_env.model.state_space import StateSpaceModel
 
 TRAINED = ".safetensors"  # the end of the name of a trained estimator's file
@@ -85,7 +85,7 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
         found = make(model=model, **numbers) if is_filter_class(make) else make(model, **numbers)
     except Exception as error:
         wanted = ", ".join(["a model", *numbers])
-        raise ValueError(f"{what} must be made of {wanted}, but raised {said(error)}") from error
+        raise ValueError(f"{what} must be made of {wanted}, but raised {error_line(error)}") from error
     if not isinstance(found, Filter) and not is_estimator(found):
         raise ValueError(
             f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, "

@@ -14,7 +14,7 @@ from filters.estimators.session import EstimatorSession, seed_of
 from filters.filter import Filter
 from thruster_env.core.checks import short_repr
 from thruster_env.core.global_generators import GlobalGenerators, seeded_copy
-from thruster_env.core.modules import said
+from thruster_env.core.modules import error_line
 from thruster_env.core.streams import GLOBAL_GENERATORS, derived_seed
 
 DIFFERENCE = 1e-6  # of two runs of a key, as part of the largest number: threads leave less
@@ -104,7 +104,7 @@ class ForeignFilter(Filter):
                 returned = _copied(self.estimator, seed).run(*given)
         except Exception as error:
             raise ValueError(
-                f"the estimator {self.name!r} must not raise, but its run raised {said(error)}"
+                f"the estimator {self.name!r} must not raise, but its run raised {error_line(error)}"
             ) from error
         checks = Checks(self.name, self.model.n, self.model.m, self.has_covariance)
         found = checks.output(returned, "run", z.shape[:2])

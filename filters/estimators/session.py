@@ -10,7 +10,7 @@ from filters.engine.belief import checked_key, vector_like
 from filters.estimators.checked import Checks, absent, without_missing
 from filters.estimators.estimator import steps_alone
 from thruster_env.core.global_generators import GlobalGenerators, seeded_copy
-from thruster_env.core.modules import said
+from thruster_env.core.modules import error_line
 from thruster_env.core.streams import GLOBAL_GENERATORS, derived_seed
 from thruster_env.model.continuous import same_dt
 
@@ -93,7 +93,7 @@ class EstimatorSession:
                 returned = getattr(self._estimator, method)(first, given)
         except Exception as error:
             raise ValueError(
-                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {said(error)} "
+                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {error_line(error)} "
                 f"at {where}"
             ) from error
         output = self._checks.output(returned, where)

@@ -55,13 +55,13 @@ def places_of(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
     return tuple(first + i for i, angle in enumerate(angles) if angle)
 
 
-def at_angle(index: int | Index, angles: Sequence[bool], there: str, elsewhere: str) -> str:
+def at_angle(index: int | Index, angles: Sequence[bool], if_angle: str, elsewhere: str) -> str:
     """Source of `there` for components that are angles, else of `elsewhere`; in loops decided at run time."""
     if not isinstance(index, Index):
-        return there if is_angle(index, angles) else elsewhere
+        return if_angle if is_angle(index, angles) else elsewhere
     if all(angles):
-        return there if angles else elsewhere
-    return f"({there} if {index} in {places_of(angles)} else {elsewhere})" if any(angles) else elsewhere
+        return if_angle if angles else elsewhere
+    return f"({if_angle} if {index} in {places_of(angles)} else {elsewhere})" if any(angles) else elsewhere
 
 
 def short_way(expression: str, index: int | Index, angles: Sequence[bool]) -> str:
@@ -100,7 +100,7 @@ def with_breaks(x: np.ndarray, *lines: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 @lru_cache(maxsize=64)
-def kept(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callable:
+def with_wrapped_angles(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callable:
     """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""
     if not any(angles):
         return function

@@ -53,18 +53,19 @@ def _unmasked(value):
             return value.filled(math.nan)
         return np.ma.asarray(value, dtype=np.float64).filled(np.nan) if value.dtype.kind in "biuf" else None
     if isinstance(value, (list, tuple)) and any(
-        isinstance(one, (list, tuple, np.ma.MaskedArray)) for one in value
+        isinstance(entry, (list, tuple, np.ma.MaskedArray)) for entry in value
     ):
-        return [_unmasked(one) for one in value]
+        return [_unmasked(entry) for entry in value]
     return value
 
 
 def _with_missing_as_nan(array: np.ndarray) -> np.ndarray:
     """An array of objects whose entries None and pandas.NA are NaN; TypeError if some are text, or it is None."""
     entries = [
-        math.nan if one is None or type(one).__name__ == "NAType" else one for one in array.ravel().tolist()
+        math.nan if entry is None or type(entry).__name__ == "NAType" else entry
+        for entry in array.ravel().tolist()
     ]
-    if not array.ndim or any(isinstance(one, (str, bytes)) for one in entries):
+    if not array.ndim or any(isinstance(entry, (str, bytes)) for entry in entries):
         raise TypeError
     return np.array(entries, dtype=object).reshape(array.shape)
 
@@ -146,25 +147,25 @@ def one_of(name: str, value, choices: Iterable[str], listed: str | None = None) 
     """
     known = tuple(choices)
     if not isinstance(value, str) or value not in known:
-        near, told = meant(value, known), ", ".join(known)
+        near, choices_text = meant(value, known), ", ".join(known)
         if listed is not None and near and len(known) > MANY:
-            told = f"{', '.join(known[:FEW])} and {len(known) - FEW} more ({listed} lists all)"
-        raise ValueError(f"{name} must be one of {told}, but got {short_repr(value)}{near}")
+            choices_text = f"{', '.join(known[:FEW])} and {len(known) - FEW} more ({listed} lists all)"
+        raise ValueError(f"{name} must be one of {choices_text}, but got {short_repr(value)}{near}")
     return value
 
 
 def listed(names: Iterable[str]) -> str:
     """Names for a message, with commas between; of many the first, and how many there are more."""
-    told = [one if len(one) <= LONG else f"{one[: LONG - 3]}..." for one in names]
-    if len(told) <= MOST_LISTED:
-        return ", ".join(told)
-    return f"{', '.join(told[:MANY])} and {len(told) - MANY} more"
+    shortened = [name if len(name) <= LONG else f"{name[: LONG - 3]}..." for name in names]
+    if len(shortened) <= MOST_LISTED:
+        return ", ".join(shortened)
+    return f"{', '.join(shortened[:MANY])} and {len(shortened) - MANY} more"
 
 
 def any_case(value, choices: Iterable[str]):
     """The choice that differs from a value in its case at most; the value itself where there is none."""
     if isinstance(value, str):
-        return next((one for one in choices if one.casefold() == value.casefold()), value)
+        return next((choice for choice in choices if choice.casefold() == value.casefold()), value)
     return value
 
 
@@ -172,7 +173,7 @@ def meant(value, choices: Iterable[str]) -> str:
     """The end of a message on an unknown name: "; did you mean 'ekf'?", empty if no choice is near."""
     if not isinstance(value, str):
         return ""
-    plain = {one.casefold(): one for one in choices}
+    plain = {choice.casefold(): choice for choice in choices}
     near = get_close_matches(value.casefold(), plain, n=1)
     return f"; did you mean {plain[near[0]]!r}?" if near else ""
 
@@ -235,8 +236,8 @@ def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> 
     that is not, or where correlations are beyond float64. Covariances are divided by `variances` (..., d) in place
     of their own where those are larger.
     """
-    own = np.diagonal(covs, axis1=-2, axis2=-1)
-    units = np.sqrt(np.maximum(own, 0.0 if variances is None else variances))
+    diagonal = np.diagonal(covs, axis1=-2, axis2=-1)
+    units = np.sqrt(np.maximum(diagonal, 0.0 if variances is None else variances))
     known = units > 0.0
     divisors = np.where(known, units, 1.0)
     with np.errstate(over="ignore"):
@@ -246,7 +247,9 @@ def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> 
     turned = np.swapaxes(scaled, -1, -2)
     least = np.linalg.eigvalsh(0.5 * (scaled + turned))[..., 0]
     alone = ~(known[..., None] & known[..., None, :]) & (covs != 0.0)
-    impossible = beyond | alone.any(axis=(-1, -2)) | ((own < 0.0).any(axis=-1) if variances is None else False)
+    impossible = (
+        beyond | alone.any(axis=(-1, -2)) | ((diagonal < 0.0).any(axis=-1) if variances is None else False)
+    )
     return np.where(impossible, -np.inf, least), np.abs(scaled - turned).max(axis=(-1, -2))
 
 
@@ -297,23 +300,25 @@ def takes_arguments_of(
     changed = {} if defaults is None else defaults
 
     def decorate(function: Function) -> Function:
-        own = inspect.signature(function).parameters.values()
-        positional = [parameter for parameter in own if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
-        taken = [
+        own_parameters = inspect.signature(function).parameters.values()
+        positional = [
+            parameter for parameter in own_parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD
+        ]
+        keyword_parameters = [
             parameter.replace(kind=parameter.KEYWORD_ONLY, default=changed.get(parameter.name, parameter.default))
             for definition in definitions
             for parameter in inspect.signature(definition).parameters.values()
             if parameter.name not in leaving_out
         ]
         if [parameter.name for parameter in positional] == ["self"]:
-            taken[0] = taken[0].replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        by_name = [parameter for parameter in own if parameter.kind is parameter.KEYWORD_ONLY]
-        signature = inspect.Signature([*positional, *taken, *by_name])
+            keyword_parameters[0] = keyword_parameters[0].replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        by_name = [parameter for parameter in own_parameters if parameter.kind is parameter.KEYWORD_ONLY]
+        signature = inspect.Signature([*positional, *keyword_parameters, *by_name])
 
         @wraps(function)
-        def call(*given, **named):
+        def call(*positional_values, **named):
             try:
-                bound = signature.bind(*given, **named)
+                bound = signature.bind(*positional_values, **named)
             except TypeError as error:
                 raise TypeError(f"{function.__qualname__}() {error}") from None
             bound.apply_defaults()
@@ -326,7 +331,7 @@ def takes_arguments_of(
     return decorate
 
 
-def arguments_of(definition: Function, given: Mapping[str, Any]) -> dict[str, Any]:
+def arguments_of(definition: Function, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments by name that a function accepts."""
     known = inspect.signature(definition).parameters
-    return {name: value for name, value in given.items() if name in known}
+    return {name: value for name, value in arguments.items() if name in known}

@@ -77,11 +77,11 @@ class Stores:
         """The code for a signature, or None."""
         for store in self._readable:
             try:
-                found = store.load_overload(signature, target)
+                code = store.load_overload(signature, target)
             except Exception:  # another user's, or damaged in whatever way: as if it were not there
                 continue
-            if found is not None:
-                return found
+            if code is not None:
+                return code
         return None
 
     def save_overload(self, signature, code) -> None:
@@ -135,9 +135,9 @@ def private_folder() -> str | None:
         try:
             folder.mkdir(mode=0o700)
         except FileExistsError:
-            found = folder.lstat()
-            own = not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o077)
-            if not (stat.S_ISDIR(found.st_mode) and own):
+            status = folder.lstat()
+            is_private = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o077)
+            if not (stat.S_ISDIR(status.st_mode) and is_private):
                 folder = Path(tempfile.mkdtemp(prefix="thruster-env-"))  # lasts as long as the process
                 atexit.register(shutil.rmtree, folder, ignore_errors=True)
         return str(folder)
@@ -152,7 +152,7 @@ def _is_installed(function) -> bool:
 
 def _elsewhere(function):
     """The cache of a function where the user says, or in the user's folder; RuntimeError if neither takes it."""
-    return _cache_by(function, [one for one in _locators() if not one.__name__.startswith("InTree")])
+    return _cache_by(function, [locator for locator in _locators() if not locator.__name__.startswith("InTree")])
 
 
 def _locators() -> list:
@@ -188,14 +188,14 @@ def _in_folder(function, folder: str):
 
 def _readable(function) -> list:
     """All caches of a function that are there, whether or not they can be written."""
-    found = []
+    caches = []
     for locator in _locators():
         reading = type(locator.__name__, (locator,), {"ensure_cache_path": _must_be_there})
         try:
-            found.append(_cache_by(function, [reading]))
+            caches.append(_cache_by(function, [reading]))
         except (RuntimeError, OSError, ImportError):  # not in such a place
             continue
-    return found
+    return caches
 
 
 def _must_be_there(locator) -> None:
@@ -242,7 +242,7 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
             _called.add(function)
         _waiting.append(weakref.ref(function))
         if len(_waiting) > MOST_WAITING:  # nothing may ever be compiled
-            _waiting[:] = [one for one in _waiting if one() is not None]
+            _waiting[:] = [reference for reference in _waiting if reference() is not None]
     return function
 
 
@@ -334,12 +334,12 @@ def _values_in(function: Callable) -> list:
 
 def _with_callees(functions: Iterable[Callable]) -> Iterator[Callable]:
     """Functions and all plain functions that they call, each once."""
-    seen: set[Callable] = set()
+    visited: set[Callable] = set()
     waiting = list(functions)
     while waiting:
         function = waiting.pop()
-        if function not in seen:
-            seen.add(function)
+        if function not in visited:
+            visited.add(function)
             yield function
             waiting += _callees(function)
 
@@ -402,8 +402,11 @@ def rounds(code: types.CodeType) -> bool:
     signs = {"%", "//", "%=", "//="}
     return (
         not JUMPS.isdisjoint(code.co_names)
-        or any(one.opname == "BINARY_OP" and one.argrepr in signs for one in dis.get_instructions(code))
-        or any(rounds(one) for one in code.co_consts if isinstance(one, types.CodeType))
+        or any(
+            instruction.opname == "BINARY_OP" and instruction.argrepr in signs
+            for instruction in dis.get_instructions(code)
+        )
+        or any(rounds(constant) for constant in code.co_consts if isinstance(constant, types.CodeType))
     )
 
 
@@ -511,7 +514,7 @@ class CompiledOrPython:
 
     def _call_first(self, *arguments):
         if not self._proven:
-            reasons = [_only_python[one] for one in _with_callees([self._python]) if one in _only_python]
+            reasons = [_only_python[called] for called in _with_callees([self._python]) if called in _only_python]
             if reasons:
                 warnings.warn(f"the model runs as Python, slowly, because {reasons[0]}", stacklevel=3)
                 self._run, self._proven = self._python, True
@@ -531,13 +534,13 @@ def _refusal(function: Callable, error: Exception) -> str:
     text, ours = str(error), []
     if isinstance(error, (OSError, MemoryError)):
         return f"the model runs as Python, slowly, because machine code of it could not be made: {text}"
-    for one in _with_callees([function]):
-        where = text.find(hex(id(one)))
-        if (one.__module__ or "").partition(".")[0] in OURS:
-            ours.append((where, one))
-            if any(name in text for name in _objects_called(one)):
+    for called in _with_callees([function]):
+        where = text.find(hex(id(called)))
+        if (called.__module__ or "").partition(".")[0] in OURS:
+            ours.append((where, called))
+            if any(name in text for name in _objects_called(called)):
                 break
-        elif where >= 0 or getattr(getattr(one, "__code__", None), "co_filename", text) in text:
+        elif where >= 0 or getattr(getattr(called, "__code__", None), "co_filename", text) in text:
             break
     else:
         _, broken = max(ours, key=lambda pair: pair[0], default=(0, function))  # the innermost comes last
@@ -550,8 +553,8 @@ def _refusal(function: Callable, error: Exception) -> str:
 
 def _objects_called(function: Callable) -> list[str]:
     """How numba calls the types of a function's callables that are no functions: a user's objects."""
-    kinds = {type(one) for one in _values_in(function) if callable(one)} - {types.FunctionType}
-    return [f"{one.__module__}.{one.__qualname__}" for one in kinds]
+    kinds = {type(callee) for callee in _values_in(function) if callable(callee)} - {types.FunctionType}
+    return [f"{kind.__module__}.{kind.__qualname__}" for kind in kinds]
 
 
 def _described(function: Callable) -> str:

@@ -69,9 +69,9 @@ def _sides(name: str, rows: int, call: str, width: str, h: str) -> list[str]:
     """
     lines = [f"{width} = 2.0 * {h}"]
     for word, side in (("if", "above"), ("elif", "below")):
-        one = name.format(side)
-        finite = f"np.isfinite({one}).all()" if is_array(rows) else _all_finite(one, rows)
-        lines += [f"{word} not ({finite}):", f"    {one}, {width} = {call}, {h}"]
+        value_name = name.format(side)
+        finite = f"np.isfinite({value_name}).all()" if is_array(rows) else _all_finite(value_name, rows)
+        lines += [f"{word} not ({finite}):", f"    {value_name}, {width} = {call}, {h}"]
     return lines
 
 
@@ -116,9 +116,9 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
         lines.append(f"y{j} = function({point}, {arguments})")
     source = matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])")
     names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step}
-    made = written_out("jacobian", f"x, {arguments}", *lines, source, **names)
-    _EXACT.add(made)
-    return made
+    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, source, **names)
+    _EXACT.add(jacobian_)
+    return jacobian_
 
 
 def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
@@ -135,9 +135,9 @@ def _complex_step_in_loops(function: Callable, rows: int, columns: int, argument
         *(f"    {line}" for line in body),
     )
     names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step, "np": np}
-    made = written_out("jacobian", f"x, {arguments}", *lines, "out", _loops=True, **names)
-    _EXACT.add(made)
-    return made
+    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, "out", _loops=True, **names)
+    _EXACT.add(jacobian_)
+    return jacobian_
 
 
 def by_complex_step(function: Callable) -> bool:

@@ -19,11 +19,11 @@ def direct(function: Callable, *arguments) -> Callable:
             one that was not, or that runs as Python, is returned as it is.
         arguments: those of the calls to come, or others of their types.
     """
-    found = function.direct if isinstance(function, CompiledOrPython) else function
-    overloads = getattr(found, "overloads", None)
+    compiled = function.direct if isinstance(function, CompiledOrPython) else function
+    overloads = getattr(compiled, "overloads", None)
     if not overloads:
-        return found
+        return compiled
     from numba import typeof
 
-    overload = overloads.get(tuple(typeof(one) for one in arguments))
-    return found if overload is None else overload.entry_point
+    overload = overloads.get(tuple(typeof(argument) for argument in arguments))
+    return compiled if overload is None else overload.entry_point

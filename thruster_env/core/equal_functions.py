@@ -127,8 +127,8 @@ def _copy_of(value: Any) -> Any:
     elif isinstance(value, types.FunctionType):
         scope = {name: part for name in names_read(value.__code__) if (part := value.__globals__.get(name))}
         parts = {name: first_equal(part) for name, part in scope.items() if isinstance(part, types.FunctionType)}
-        others = {name: part for name, part in parts.items() if part is not scope[name]}
-        names = {**value.__globals__, **others} if others else value.__globals__
+        replaced = {name: part for name, part in parts.items() if part is not scope[name]}
+        names = {**value.__globals__, **replaced} if replaced else value.__globals__
         result = types.FunctionType(value.__code__, names, value.__name__, value.__defaults__, value.__closure__)
         result.__kwdefaults__, result.__qualname__ = value.__kwdefaults__, value.__qualname__
         result.__module__ = value.__module__
@@ -254,22 +254,22 @@ class _Keys:
         if type(value) in COLLECTIONS:
             self.has_parts = True
             parts = value if isinstance(value, list) else sorted(value, key=repr)
-            held = [value[key] for key in parts] if hasattr(value, "keys") else []
+            contents = [value[key] for key in parts] if hasattr(value, "keys") else []
             missing = getattr(value, "default_factory", None)
-            return type(value), *self._of_all((*parts, *held, missing))
+            return type(value), *self._of_all((*parts, *contents, missing))
         if isinstance(value, range | slice):
             return type(value), *self._of_all((value.start, value.stop, value.step))
         return self._of_object(value)
 
     def _of_all(self, values: Iterable) -> tuple:
-        return tuple([self.of(one) for one in values])
+        return tuple([self.of(value) for value in values])
 
     def _of_function(self, function: types.FunctionType) -> Hashable:
         cells = [_content(cell) for cell in function.__closure__ or ()]
         self._names |= dict.fromkeys(_names_of(function.__code__))
         names = [name for name in _names_of(function.__code__) if name in function.__globals__]
         read = [function.__globals__[name] for name in names]
-        modules = [one for one in (*cells, *read) if isinstance(one, types.ModuleType)]
+        modules = [content for content in (*cells, *read) if isinstance(content, types.ModuleType)]
         return (
             "function",
             *(function.__module__, function.__qualname__),
@@ -281,38 +281,40 @@ class _Keys:
             *self._of_all(read),
             *self._of_all(vars(function)),
             *self._of_all(vars(function).values()),
-            *(self._of_attributes(one, function.__code__) for one in modules),
+            *(self._of_attributes(module, function.__code__) for module in modules),
         )
 
     def _of_attributes(self, module: types.ModuleType, code: types.CodeType) -> Hashable:
         """What the code may read of a module: of one that is installed numbers, texts, tuples and arrays alone."""
-        held = vars(module)
+        attributes = vars(module)
         by_user = not (getattr(module, "__file__", None) or "").startswith(INSTALLED) and (
             module.__name__.partition(".")[0] not in {*OURS, *sys.builtin_module_names}
         )
-        names = [name for name in _names_of(code) if name in held and (by_user or is_plain(held[name]))]
-        return tuple((name, self.of(held[name])) for name in names)
+        names = [
+            name for name in _names_of(code) if name in attributes and (by_user or is_plain(attributes[name]))
+        ]
+        return tuple((name, self.of(attributes[name])) for name in names)
 
     def of_members(self) -> Hashable:
         """Members of the users' classes among the values: those that the code reads, and operators."""
-        found: dict[tuple[type, str], Hashable] = {}
+        members: dict[tuple[type, str], Hashable] = {}
         count = -1
-        while count < len(found):  # a member may read others
-            count = len(found)
+        while count < len(members):  # a member may read others
+            count = len(members)
             for kind in list(self._classes):
                 for base in kind.__mro__:
                     for name, member in vars(base).items() if base is not object and _is_of_a_user(base) else ():
                         plain = isinstance(member, types.FunctionType) and name not in OF_EVERY_CLASS
                         operator = plain and name.startswith("__")
-                        known = (kind, name) in found or name in getattr(base, "_fields", ())
+                        known = (kind, name) in members or name in getattr(base, "_fields", ())
                         if (operator or name in self._names) and not known:
-                            found[kind, name] = None  # of derived classes the member of the first counts
-                            found[kind, name] = self.of(getattr(member, "__func__", member))
-        return tuple((name, member) for (_, name), member in found.items())
+                            members[kind, name] = None  # of derived classes the member of the first counts
+                            members[kind, name] = self.of(getattr(member, "__func__", member))
+        return tuple((name, member) for (_, name), member in members.items())
 
     def _of_code(self, code: types.CodeType) -> Hashable:
-        others, parts = _changes_of(code)
-        self.changes_others |= others
+        changes_others, parts = _changes_of(code)
+        self.changes_others |= changes_others
         self.changes_parts |= parts
         sizes = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
         names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
@@ -340,8 +342,8 @@ class _Keys:
             return kind, self.of(wrapped), repr(getattr(value, "targetoptions", None))
         if isinstance(value, types.SimpleNamespace) or is_of_a_user(kind):
             self.has_parts = True
-            held = attributes_of(value)
-            return self.of(kind), *self._of_all(held), *self._of_all(held.values())
+            attributes = attributes_of(value)
+            return self.of(kind), *self._of_all(attributes), *self._of_all(attributes.values())
         return _Same(value)
 
 
@@ -358,8 +360,8 @@ def attributes_of(value: Any) -> dict[str, Any]:
     """What an object holds, in its dictionary and its slots."""
     kinds = [vars(base) for base in type(value).__mro__ if "__slots__" in vars(base)]
     slots = [name for kind in kinds for name in kind if isinstance(kind[name], types.MemberDescriptorType)]
-    held = {name: getattr(value, name) for name in slots if hasattr(value, name)}
-    return {**getattr(value, "__dict__", {}), **held}
+    slot_values = {name: getattr(value, name) for name in slots if hasattr(value, name)}
+    return {**getattr(value, "__dict__", {}), **slot_values}
 
 
 @functools.lru_cache(maxsize=4096)
@@ -367,11 +369,12 @@ def _changes_of(code: types.CodeType) -> tuple[bool, bool]:
     """Whether code sets variables of others, and whether it may change parts of what it holds."""
     steps = list(dis.get_instructions(code))
     free = {"STORE_DEREF", "DELETE_DEREF"}
-    others = any(
-        one.opname in CHANGES_OTHERS or (one.opname in free and one.argval in code.co_freevars) for one in steps
+    changes_others = any(
+        step.opname in CHANGES_OTHERS or (step.opname in free and step.argval in code.co_freevars)
+        for step in steps
     )
-    parts = any(one.opname in CHANGES_PARTS for one in steps) or not CHANGING.isdisjoint(code.co_names)
-    return others, parts
+    parts = any(step.opname in CHANGES_PARTS for step in steps) or not CHANGING.isdisjoint(code.co_names)
+    return changes_others, parts
 
 
 _names_of = functools.lru_cache(maxsize=4096)(names_read)
@@ -384,11 +387,11 @@ def _content_of(value: Any) -> bytes:
     known = _hashes.get(id(value))
     if value.nbytes > SELDOM and known is not None and known[0]() is value:
         return known[1]
-    found = hashlib.sha256(value.tobytes()).digest()
+    digest = hashlib.sha256(value.tobytes()).digest()
     if value.nbytes > SELDOM:
-        place = id(value)
-        _hashes[place] = weakref.ref(value, lambda _: _hashes.pop(place, None)), found
-    return found
+        key = id(value)
+        _hashes[key] = weakref.ref(value, lambda _: _hashes.pop(key, None)), digest
+    return digest
 
 
 def _content(cell: types.CellType) -> Any:
@@ -407,14 +410,14 @@ LARGEST_CAPTURED = 64  # entries of an array that are numbers of their own
 
 def captured_numbers(function: Any) -> list[float]:
     """The floats that a function holds, always in the same order; those of its module and its code are not."""
-    found: list[float] = []
+    numbers: list[float] = []
 
     def note(value: float) -> float:
-        found.append(float(value))
+        numbers.append(float(value))
         return value
 
     _Copy(note).of(function)
-    return found
+    return numbers
 
 
 def with_numbers(function: Any, numbers: Sequence[Any]) -> Any:
@@ -423,13 +426,13 @@ def with_numbers(function: Any, numbers: Sequence[Any]) -> Any:
     return _Copy(lambda _: next(following)).of(function)
 
 
-def differ_in_numbers_alone(one: Any, other: Any) -> bool:
+def differ_in_numbers_alone(first: Any, other: Any) -> bool:
     """Whether two functions would be equal (`first_equal`) if they held the same floats."""
-    numbers = captured_numbers(one)
+    numbers = captured_numbers(first)
     if len(numbers) != len(captured_numbers(other)):
         return False
     following = iter(numbers)
-    return first_equal(_Copy(lambda _: next(following), remembered=True).of(other)) == first_equal(one)
+    return first_equal(_Copy(lambda _: next(following), remembered=True).of(other)) == first_equal(first)
 
 
 class _Copy:
@@ -460,7 +463,7 @@ class _Copy:
         if isinstance(value, types.MethodType):
             return types.MethodType(self.of(value.__func__), self.of(value.__self__))
         if isinstance(value, functools.partial):
-            keywords = {name: self.of(one) for name, one in value.keywords.items()}
+            keywords = {name: self.of(argument) for name, argument in value.keywords.items()}
             return functools.partial(self.of(value.func), *map(self.of, value.args), **keywords)
         if isinstance(value, tuple):
             parts = list(map(self.of, value))
@@ -468,12 +471,12 @@ class _Copy:
         if type(value) is list:
             return list(map(self.of, value))
         if type(value) in MAPPINGS:
-            held = {key: self.of(one) for key, one in value.items()}
+            entries = {key: self.of(entry) for key, entry in value.items()}
             kind = type(value)
-            return kind(value.default_factory, held) if kind is collections.defaultdict else kind(held)
+            return kind(value.default_factory, entries) if kind is collections.defaultdict else kind(entries)
         if type(value) is np.ndarray and value.dtype == np.float64 and value.size <= LARGEST_CAPTURED:
-            numbers = [self._other(one) for one in value.ravel().tolist()]
-            plain = all(isinstance(one, float) for one in numbers)
+            numbers = [self._other(number) for number in value.ravel().tolist()]
+            plain = all(isinstance(number, float) for number in numbers)
             return np.array(numbers, dtype=np.float64 if plain else object).reshape(value.shape)
         if isinstance(value, types.SimpleNamespace) or (not isinstance(value, type) and is_of_a_user(type(value))):
             return self._of_object(value)
@@ -488,16 +491,16 @@ class _Copy:
         copy.__qualname__, copy.__module__ = function.__qualname__, function.__module__
         copy.__kwdefaults__ = self.of(function.__kwdefaults__)
         vars(copy).update(vars(function))
-        for cell, given in zip(cells, function.__closure__ or (), strict=True):
-            cell.cell_contents = self.of(given.cell_contents)
+        for cell, original in zip(cells, function.__closure__ or (), strict=True):
+            cell.cell_contents = self.of(original.cell_contents)
         return copy
 
     def _of_object(self, value: Any) -> Any:
         base = types.SimpleNamespace if isinstance(value, types.SimpleNamespace) else object
         copy = base.__new__(type(value))
         self._copies[id(value)] = value, copy
-        for name, one in attributes_of(value).items():
-            object.__setattr__(copy, name, self.of(one))
+        for name, attribute in attributes_of(value).items():
+            object.__setattr__(copy, name, self.of(attribute))
         return copy
 
 
@@ -525,7 +528,7 @@ def makes_functions(maker: Callable) -> Callable:
             entries = dict(enumerate(result)) if isinstance(result, tuple) else {None: result}
         for key, function in entries.items():
             nested = "<locals>" in getattr(function, "__qualname__", "")  # others are found by their names
-            if made_here(function) or (nested and all(function is not one for one in arguments)):
+            if made_here(function) or (nested and all(function is not argument for argument in arguments)):
                 remember(function, Made(make, tuple(map(original_of, arguments)), key))
         if isinstance(result, dict):
             return {key: first_equal(function) for key, function in result.items()}

@@ -20,8 +20,8 @@ def check_target(path: str | Path) -> None:
     """Raise ValueError if a file could not be written there, before long work is done for it."""
     path = Path(path)
     try:
-        found = _found(path)
-        if found is not None and not _is_replaced(found):
+        status = _found(path)
+        if status is not None and not _is_replaced(status):
             return
         target = _target(path)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -33,9 +33,9 @@ def check_target(path: str | Path) -> None:
 
 def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
     """Raise ValueError if a file to be written is one of those that are read, links followed."""
-    for one in read:
+    for source in read:
         try:
-            same = os.path.samefile(path, one)
+            same = os.path.samefile(path, source)
         except OSError:  # one of them is not there
             continue
         if same:
@@ -63,12 +63,12 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     content = content.encode() if isinstance(content, str) else content
     path = Path(path)
     try:
-        found = _found(path)
-        if found is None or _is_replaced(found):
-            _replace(_target(path), content, found)
+        status = _found(path)
+        if status is None or _is_replaced(status):
+            _replace(_target(path), content, status)
         else:
-            with open(path, "ab") as there:
-                there.write(content)
+            with open(path, "ab") as existing:
+                existing.write(content)
     except OSError as error:
         raise _refusal(path, error) from None
 
@@ -76,24 +76,24 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 def _found(path: Path) -> os.stat_result | None:
     """What is at a path, links followed, if anything; OSError if it is nothing that can be written."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except FileNotFoundError:
         return None
-    if stat.S_ISDIR(found.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(None, "it is a folder")
     if not os.access(path, os.W_OK):  # a rename would replace it even so
         raise PermissionError(None, "it is read-only")
-    return found
+    return status
 
 
-def _is_replaced(found: os.stat_result) -> bool:
+def _is_replaced(status: os.stat_result) -> bool:
     """Whether what is there is a regular file, and not where this process's own output goes."""
-    return stat.S_ISREG(found.st_mode) and not any(_is_open_as(stream, found) for stream in STREAMS)
+    return stat.S_ISREG(status.st_mode) and not any(_is_open_as(stream, status) for stream in STREAMS)
 
 
-def _is_open_as(descriptor: int, found: os.stat_result) -> bool:
+def _is_open_as(descriptor: int, status: os.stat_result) -> bool:
     try:
-        return os.path.samestat(os.fstat(descriptor), found)
+        return os.path.samestat(os.fstat(descriptor), status)
     except OSError:  # closed
         return False
 
@@ -149,7 +149,7 @@ def as_toml(tables: Mapping[str, Mapping], about: str = "") -> str:
     for name, table in tables.items():
         if table:
             lines += [""] if lines else []
-            lines += [f"[{name}]", *(f"{_key(one)} = {_text(value)}" for one, value in table.items())]
+            lines += [f"[{name}]", *(f"{_key(key)} = {_text(value)}" for key, value in table.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -61,8 +61,8 @@ class GlobalGenerators:
 
 
 def _torch() -> Any:
-    found: Any = sys.modules.get("torch")
-    return found if hasattr(found, "default_generator") else None
+    torch: Any = sys.modules.get("torch")
+    return torch if hasattr(torch, "default_generator") else None
 
 
 def _states() -> tuple:
@@ -79,16 +79,16 @@ def _set(states: tuple) -> None:
         torch.set_rng_state(torchs)
 
 
-def seeded_copy(given: Any, seed: int) -> Any:
+def seeded_copy(original: Any, seed: int) -> Any:
     """A deep copy of an object; generators of Python and NumPy that it holds get seeds of their own."""
     memo: dict = {}
-    found = copy.deepcopy(given, memo)
-    held = (one for one in memo.values() if isinstance(one, HELD))
-    for number, one in enumerate({id(one): one for one in held}.values()):
-        own = derived_seed(seed, HELD_GENERATORS, number)
-        if isinstance(one, np.random.Generator):
-            kind: Any = type(one.bit_generator)
-            one.bit_generator.state = kind(own).state
+    duplicate = copy.deepcopy(original, memo)
+    generators = (part for part in memo.values() if isinstance(part, HELD))
+    for number, generator in enumerate({id(generator): generator for generator in generators}.values()):
+        generator_seed = derived_seed(seed, HELD_GENERATORS, number)
+        if isinstance(generator, np.random.Generator):
+            kind: Any = type(generator.bit_generator)
+            generator.bit_generator.state = kind(generator_seed).state
         else:
-            one.seed(own)
-    return found
+            generator.seed(generator_seed)
+    return duplicate

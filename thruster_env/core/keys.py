@@ -74,13 +74,13 @@ def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
     if mask is None:
         return None
     try:
-        given = np.asarray(mask)
+        chosen = np.asarray(mask)
     except ValueError:  # rows of different lengths
-        given = np.empty(0)
-    if given.shape != (count,) or given.dtype != np.bool_ or not given.any():
+        chosen = np.empty(0)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
         raise ValueError(
             f"reset_mask must be {count} booleans, at least one of them true, but got {short_repr(mask)}"
         )
-    if not keys.seeded and not given.all():
+    if not keys.seeded and not chosen.all():
         raise ValueError(f"reset_mask must have all copies at the first reset, but got {short_repr(mask)}")
-    return given.copy()
+    return chosen.copy()

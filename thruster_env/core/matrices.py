@@ -105,13 +105,13 @@ def product_of_rows(a, b):
 def add_product(out, a, b):
     """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
     rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
-    whole = inner - inner % 4
+    in_fours = inner - inner % 4
     for i in range(rows):
-        for k in range(0, whole, 4):
+        for k in range(0, in_fours, 4):
             x_0, x_1, x_2, x_3 = a[i, k], a[i, k + 1], a[i, k + 2], a[i, k + 3]
             for j in range(columns):
                 out[i, j] += x_0 * b[k, j] + x_1 * b[k + 1, j] + x_2 * b[k + 2, j] + x_3 * b[k + 3, j]
-        for k in range(whole, inner):
+        for k in range(in_fours, inner):
             x_0 = a[i, k]
             for j in range(columns):
                 out[i, j] += x_0 * b[k, j]
@@ -398,8 +398,8 @@ def triangular_root(rows: int, columns: int) -> Callable:
     L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
     Gram-Schmidt orthogonalization".
     """
-    given = rows, columns
-    source = Source("triangle", "a", result=(rows, rows), a=given, work=rows * rows * columns // 2)
+    shape = rows, columns
+    source = Source("triangle", "a", result=(rows, rows), a=shape, work=rows * rows * columns // 2)
     b, root = source.local("b", rows, columns), source.local("l", rows, rows)
     for i in source.range(rows):
         for j in source.range(columns):

@@ -40,9 +40,9 @@ def object_named(name: str, what: str):
     """
     module_name, _, path = name.partition(":")
     try:
-        found = _executed(module_name, name, what)
+        result = _executed(module_name, name, what)
         for part in path.split("."):
-            found = getattr(found, part)
+            result = getattr(result, part)
     except RuleBroken:
         raise
     except (ImportError, AttributeError, ValueError) as error:
@@ -51,8 +51,10 @@ def object_named(name: str, what: str):
         ) from None
     except Exception as error:
         article = "an" if what[0] in "aeiou" else "a"
-        raise ValueError(f"{article} {what}'s module must import, but {name!r} raised {said(error)}") from error
-    return found
+        raise ValueError(
+            f"{article} {what}'s module must import, but {name!r} raised {error_line(error)}"
+        ) from error
+    return result
 
 
 def _executed(module_name: str, name: str, what: str) -> ModuleType:
@@ -66,11 +68,11 @@ def _executed(module_name: str, name: str, what: str) -> ModuleType:
 
 
 class RuleBroken(ValueError):
-    """What a module of the user's raised while it ran."""
+    """An error that a user's module raised while it ran."""
 
 
-def said(error: BaseException) -> str:
-    """What somebody else's code raised, on one line."""
+def error_line(error: BaseException) -> str:
+    """The kind and message of an error of a user's code, on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
@@ -194,14 +196,14 @@ def remove_leftovers(site: Path, checkout: Path) -> list[Path]:
         site: folder where pip installs packages.
         checkout: folder of the sources.
     """
-    found = []
+    removed = []
     for source in sorted(checkout.glob("*/__init__.py")):
         folder = site / source.parent.name
-        files = [one for one in folder.rglob("*") if one.is_file()] if folder.is_dir() else []
-        if folder.is_dir() and all(one.parent.name == "__pycache__" for one in files):
+        files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+        if folder.is_dir() and all(file.parent.name == "__pycache__" for file in files):
             shutil.rmtree(folder)
-            found.append(folder)
-    return found
+            removed.append(folder)
+    return removed
 
 
 if __name__ == "__main__":

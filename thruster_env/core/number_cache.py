@@ -36,15 +36,15 @@ def cached_numbers(
     key = hashlib.sha256(follows_from + (made_by() if folder else "Python").encode()).hexdigest()
     if key not in _known:
         file = None if folder is None else Path(folder) / f"{name}-{key[:32]}.json"
-        found = None if file is None else _read(file, count)
-        if found is None:
-            found = tuple(np.asarray(compute(), dtype=np.float64).tolist())
-            if not np.isfinite(found).all():
-                return np.array(found)
+        numbers = None if file is None else _read(file, count)
+        if numbers is None:
+            numbers = tuple(np.asarray(compute(), dtype=np.float64).tolist())
+            if not np.isfinite(numbers).all():
+                return np.array(numbers)
             if file is not None:
                 with contextlib.suppress(ValueError):  # nothing can be written there
-                    write_whole(file, json.dumps(found))
-        _known[key] = found
+                    write_whole(file, json.dumps(numbers))
+        _known[key] = numbers
     return np.array(_known[key])
 
 

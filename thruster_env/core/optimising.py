@@ -151,7 +151,7 @@ def _emit_outermost(library: Any, codegen: Any, compiling, which: Which) -> None
     @wraps(set_environment)
     def set_what_is_there(self, name, environment):
         waiting[name] = environment
-        for there in [name for name in waiting if self._engine.get_global_value_address(name)]:
-            set_environment(self, there, waiting.pop(there))
+        for present in [name for name in waiting if self._engine.get_global_value_address(name)]:
+            set_environment(self, present, waiting.pop(present))
 
     library._finalize_final_module, codegen.set_env = emit_outermost, set_what_is_there

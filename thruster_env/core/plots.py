@@ -69,10 +69,10 @@ def thinned(x: np.ndarray, y: np.ndarray, keep: np.ufunc | None = None) -> tuple
     if keep is not None:
         return np.array([x[part].mean() for part in parts]), np.array([keep.reduce(y[part]) for part in parts])
     low, high = np.where(np.isfinite(y), y, np.inf), np.where(np.isfinite(y), y, -np.inf)
-    ends = [part[place] for part in parts for place in (low[part].argmin(), high[part].argmax())]
+    ends = [part[index] for part in parts for index in (low[part].argmin(), high[part].argmax())]
     gaps = [part[np.isnan(y[part])][:1] for part in parts]
-    places = np.unique(np.concatenate([ends, *gaps])).astype(np.int64)
-    return x[places], y[places]
+    indices = np.unique(np.concatenate([ends, *gaps])).astype(np.int64)
+    return x[indices], y[indices]
 
 
 def save_figure(figure, path: str | Path) -> Path:

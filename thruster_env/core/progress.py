@@ -30,7 +30,7 @@ def tell(text: str) -> None:
         listener(text)
 
 
-def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
+def with_progress(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
     """Go through the parts of a computation, and report before each how much is done.
 
     Progress inside a part is appended to that of the part: "N = 40: 3 of 12, runs: 20 of 100".

@@ -53,10 +53,10 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
     text = f"def {name}({arguments}):\n{body}"
     file = _name_in_tracebacks(name, text)
     exec(compile(text, file, "exec"), names)
-    made = inlined(names[name], into_callers=not _loops)
+    function = inlined(names[name], into_callers=not _loops)
     _shown[file] += 1
-    weakref.finalize(made, _forget, file).atexit = False
-    return made
+    weakref.finalize(function, _forget, file).atexit = False
+    return function
 
 
 def _forget(file: str) -> None:
@@ -78,8 +78,8 @@ def _name_in_tracebacks(name: str, text: str) -> str:
         frame = frame.f_back
     code, values = frame.f_code, frame.f_locals
     sizes = (values.get(argument) for argument in code.co_varnames[: code.co_argcount])
-    shown = ", ".join(str(size) for size in sizes if type(size) is int)
-    maker, digest = f"{frame.f_globals.get('__name__')}.{code.co_name}({shown})", zlib.crc32(text.encode())
+    size_list = ", ".join(str(size) for size in sizes if type(size) is int)
+    maker, digest = f"{frame.f_globals.get('__name__')}.{code.co_name}({size_list})", zlib.crc32(text.encode())
     file = f"<{name}, written out by {maker}, {digest:08x}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     return file
@@ -131,12 +131,12 @@ class Local:
     def __init__(self, name: str, shape: tuple[int, ...], loops: bool):
         self.name, self.shape, self._loops = name, shape, loops
 
-    def __getitem__(self, place) -> str:
+    def __getitem__(self, index) -> str:
         """Source of the number at a place i or (i, j)."""
-        places = place if isinstance(place, tuple) else (place,)
+        indices = index if isinstance(index, tuple) else (index,)
         if self._loops:
-            return f"{self.name}[{', '.join(map(str, places))}]"
-        return self.name + "_".join(map(str, places))
+            return f"{self.name}[{', '.join(map(str, indices))}]"
+        return self.name + "_".join(map(str, indices))
 
 
 class Source:
@@ -159,7 +159,7 @@ class Source:
         Raises:
             ValueError: if a shape is of no argument.
         """
-        if unknown := set(shapes) - {one.strip() for one in arguments.split(",")}:
+        if unknown := set(shapes) - {argument.strip() for argument in arguments.split(",")}:
             raise ValueError(f"{name}({arguments}) has no argument {', '.join(sorted(unknown))}")
         self._name, self._arguments, self._result = name, arguments, result
         self.loops = work > LONGEST_TEXT or any(is_array(*shape) for shape in (result, *shapes.values()) if shape)
@@ -178,9 +178,9 @@ class Source:
         if not is_array(*shape):
             name = f"{argument}_"
             self._lines.append(f"{name} = np.empty({shape})")
-            for place in np.ndindex(*shape):
-                at = "".join(f"[{i}]" for i in place)
-                self._lines.append(f"{name}[{', '.join(map(str, place))}] = {argument}{at}")
+            for index in np.ndindex(*shape):
+                at = "".join(f"[{i}]" for i in index)
+                self._lines.append(f"{name}[{', '.join(map(str, index))}] = {argument}{at}")
             self._renamed[argument] = name
         if len(shape) == 2:
             self._matrices.add(name)
@@ -234,32 +234,32 @@ class Source:
         yield
         self._depth -= 1
 
-    def totals(self, size: str, places, term: Callable, each: Iterable[str] = ()) -> Local:
-        """Sums of terms over members j < size, one for each place.
+    def totals(self, size: str, entries, term: Callable, each: Iterable[str] = ()) -> Local:
+        """Sums of terms over members j < size, one for each entry.
 
         Args:
             size: source of the number of members.
-            places: number of places i, or pairs (i, j) of them.
+            entries: number of entries i, or their indices (i, j).
             term: term(i) or term(i, j) is the source of a term.
             each: lines that come first for each member, where the function is written out.
         """
         if self.loops:
-            out = self.local("s", places)
-            for i in self.range(places):
+            out = self.local("s", entries)
+            for i in self.range(entries):
                 self.line("total = 0.0")
                 self.line(f"for j in range({size}):")
                 self.line(f"    total += {term(i)}")
                 self.line(f"{out[i]} = total")
             return out
-        places = [(i,) for i in range(places)] if isinstance(places, int) else places
-        out = Local("s", tuple(max(place) + 1 for place in zip(*places, strict=True)), False)
-        for place in places:
-            self.line(f"{out[place]} = 0.0")
+        entries = [(i,) for i in range(entries)] if isinstance(entries, int) else entries
+        out = Local("s", tuple(max(entry) + 1 for entry in zip(*entries, strict=True)), False)
+        for entry in entries:
+            self.line(f"{out[entry]} = 0.0")
         for _ in self.inside(f"for j in range({size}):"):
             for text in each:
                 self.line(text)
-            for place in places:
-                self.line(f"{out[place]} += {term(*place)}")
+            for entry in entries:
+                self.line(f"{out[entry]} += {term(*entry)}")
         return out
 
     def array_of(self, argument: str) -> str:
@@ -446,9 +446,9 @@ def scaled_sum(count: int) -> Callable:
 
 
 @cache
-def vector_part(count: int, whole: int, first: int = 0) -> Callable:
+def vector_part(count: int, size: int, first: int = 0) -> Callable:
     """Return `part(x)`: the `count` components from the first on, of a vector of `whole`."""
-    source = Source("part", "x", result=(count,), x=(whole,))
+    source = Source("part", "x", result=(count,), x=(size,))
     return source.function(source.vector(count, lambda i: f"x[{i + first}]"))
 
 
@@ -481,22 +481,22 @@ def assembled(name: str, arguments: str, shape: tuple[int, int], parts: dict) ->
             for i, j in np.ndindex(*size)
         }
         return source.function(matrix_of(*shape, lambda i, j: entries.get((i, j), "0.0")))
-    whole = source.local("whole", *shape)
+    matrix = source.local("whole", *shape)
     for part, (size, top, left) in parts.items():
         for i in source.range(size[0]):
             for j in source.range(size[1]):
-                source.line(f"{whole[i + top, j + left]} = {part}[{i}][{j}]")
-    return source.function(source.whole(whole))
+                source.line(f"{matrix[i + top, j + left]} = {part}[{i}][{j}]")
+    return source.function(source.whole(matrix))
 
 
 @cache
 def zeros_of(*shape: int) -> Callable:
     """Return `zeros()`: a vector (count,) or matrix (rows, columns) of zeros."""
-    return entrywise("zeros", "", shape, lambda *place: "0.0")
+    return entrywise("zeros", "", shape, lambda *index: "0.0")
 
 
 @cache
-def part_of(rows: int, columns: int, whole: tuple[int, int], top: int = 0, left: int = 0) -> Callable:
+def part_of(rows: int, columns: int, shape: tuple[int, int], top: int = 0, left: int = 0) -> Callable:
     """Return `part(a)`: the `rows` and `columns` of a matrix of the shape `whole` that begin at (top, left)."""
-    source = Source("part", "a", result=(rows, columns), a=whole)
+    source = Source("part", "a", result=(rows, columns), a=shape)
     return source.function(source.matrix(rows, columns, lambda i, j: f"a[{i + top}][{j + left}]"))

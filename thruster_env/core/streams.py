@@ -315,16 +315,16 @@ def fill_normals(out, count, step, stream, key_0, key_1):
     if out.dtype != np.float64:  # numbers that count what is done to them
         return _fill_in_loop(out, count, step, stream, key_0, key_1)
     blocks = (count + GROUP - 1) // GROUP * (GROUP // 4)
-    together = max(AT_ONCE // max(blocks, 1), 1)
-    rows = _normals_of_steps(blocks, step // together, together, stream, key_0, key_1)
-    out[: 4 * blocks] = rows[int(step % together)]
+    steps_at_once = max(AT_ONCE // max(blocks, 1), 1)
+    rows = _normals_of_steps(blocks, step // steps_at_once, steps_at_once, stream, key_0, key_1)
+    out[: 4 * blocks] = rows[int(step % steps_at_once)]
 
 
 @lru_cache(maxsize=32)
-def _normals_of_steps(blocks, begin, together, stream, key_0, key_1):
+def _normals_of_steps(blocks, begin, count, stream, key_0, key_1):
     """Rows of normals, (together, 4 blocks), of the steps from begin * together on."""
-    steps = begin * together + np.arange(together)[:, None]
-    return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(together, -1)
+    steps = begin * count + np.arange(count)[:, None]
+    return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(count, -1)
 
 
 def _fill_in_loop(out, count, step, stream, key_0, key_1):

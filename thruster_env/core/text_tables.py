@@ -81,7 +81,7 @@ def verbatim(text: str, most: int | None = None) -> str:
     """Text of a user's for a figure: dollars begin no formula, and the middle of a long one is left out."""
     if most is not None and len(text) > most:
         text = f"{text[: most // 2]}...{text[-(most // 2) :]}"
-    return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
+    return "".join(character if character.isprintable() else "?" for character in text).replace("$", r"\$")
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:
@@ -149,9 +149,9 @@ def table(
     for index, column in enumerate(columns):
         justify: JustifyMethod = "left" if index == 0 or words else "right"
         out.add_column(Text(showable(column, console.encoding), overflow="fold"), justify=justify, overflow="fold")
-    for place, row in enumerate(rows):  # Text: units in brackets are no markup
+    for row_number, row in enumerate(rows):  # Text: units in brackets are no markup
         cells = [cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
-        out.add_row(*cells, style=BEST if place in best else None)
+        out.add_row(*cells, style=BEST if row_number in best else None)
     _keep_words_whole(out)
     return out
 
@@ -164,11 +164,11 @@ def _keep_words_whole(out: Table) -> None:
     """
     columns = [[column.header, *column.cells] for column in out.columns]
     longest = [max((_longest_word(str(cell)) for cell in cells), default=1) for cells in columns]
-    taken = 2 * len(longest)  # by padding, frame and gaps
-    if sum(longest) + taken > console.width:
-        out.padding, taken = 0, len(longest) + 1
+    margins = 2 * len(longest)  # by padding, frame and gaps
+    if sum(longest) + margins > console.width:
+        out.padding, margins = 0, len(longest) + 1
     lines = [max((len(line) for cell in cells for line in str(cell).split("\n")), default=1) for cells in columns]
-    spare = console.width - sum(longest) - taken
+    spare = console.width - sum(longest) - margins
     if spare < 0:
         return
     lacking = [line - word for line, word in zip(lines, longest, strict=True)]

@@ -99,29 +99,29 @@ SPINS = 64  # at a number between two moments in which another thread may have t
 SPIN_ROUNDS = 1000  # such moments in a wait for the next call, of about half a microsecond each
 
 
-def new_flags(places: int) -> np.ndarray:
+def new_flags(count: int) -> np.ndarray:
     """Zeros, a line for each of some places."""
-    return np.zeros(LINE * places, np.int64)
+    return np.zeros(LINE * count, np.int64)
 
 
 @overloaded
-def read(flags, place):
+def read(flags, index):
     """Read one flag (acquire): whatever its writer wrote before is then visible."""
-    return flags[place]
+    return flags[index]
 
 
 @overloaded
-def post(flags, place, value):
+def post(flags, index, value):
     """Write one flag (release): whoever reads it sees all that was written before."""
-    flags[place] = value
+    flags[index] = value
 
 
 @overloaded
-def take(marks, place, mark):
+def take(marks, index, mark):
     """Mark a part if it is open (compare and swap); return whether it was open."""
-    was_open = marks[place] == OPEN
+    was_open = marks[index] == OPEN
     if was_open:
-        marks[place] = mark
+        marks[index] = mark
     return was_open
 
 
@@ -131,10 +131,10 @@ def yield_core():
 
 
 @inlined
-def wait_for(marks, place):
+def wait_for(marks, index):
     """Wait until a part that another thread has taken is done."""
     spins = 0
-    while read(marks, place) != DONE:
+    while read(marks, index) != DONE:
         spins += 1
         if spins % SPINS == 0:
             yield_core()
@@ -159,7 +159,7 @@ def teach_numba() -> None:
     intrinsic: Callable = extending.intrinsic  # numba passes the context, of which its annotations do not know
 
     @intrinsic
-    def load(context, flags, place):
+    def load(context, flags, index):
         def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             return builder.load_atomic(builder.gep(array.data, [arguments[1]]), "acquire", 8)
@@ -167,7 +167,7 @@ def teach_numba() -> None:
         return types.int64(flags, types.intp), generate
 
     @intrinsic
-    def store(context, flags, place, value):
+    def store(context, flags, index, value):
         def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             builder.store_atomic(arguments[2], builder.gep(array.data, [arguments[1]]), "release", 8)
@@ -176,7 +176,7 @@ def teach_numba() -> None:
         return types.void(flags, types.intp, types.int64), generate
 
     @intrinsic
-    def exchange(context, marks, place, mark):
+    def exchange(context, marks, index, mark):
         def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             where, before = builder.gep(array.data, [arguments[1]]), context.get_constant(types.int64, OPEN)
@@ -187,16 +187,16 @@ def teach_numba() -> None:
     sched_yield = types.ExternalFunction("sched_yield", types.int32())
 
     @overload(read)
-    def read_compiled(flags, place):
-        return lambda flags, place: load(flags, place)
+    def read_compiled(flags, index):
+        return lambda flags, index: load(flags, index)
 
     @overload(post)
-    def post_compiled(flags, place, value):
-        return lambda flags, place, value: store(flags, place, value)
+    def post_compiled(flags, index, value):
+        return lambda flags, index, value: store(flags, index, value)
 
     @overload(take)
-    def take_compiled(marks, place, mark):
-        return lambda marks, place, mark: exchange(marks, place, mark)
+    def take_compiled(marks, index, mark):
+        return lambda marks, index, mark: exchange(marks, index, mark)
 
     @overload(yield_core)
     def yield_core_compiled():
@@ -263,20 +263,20 @@ def in_parts(work: Callable) -> CompiledOrPython:
     inlined(work)
     fingerprint = function_fingerprint(work, within=work.__module__)
 
-    def part(flags, marks, place, helpers, call, rounds, count, arguments):
+    def part(flags, marks, thread, helpers, call, rounds, count, arguments):
         fingerprint  # noqa: B018 - part of the cache's key
-        if place == CALLER and helpers > 0:
+        if thread == CALLER and helpers > 0:
             post(flags, CALL, call)
         # The caller does its own part, then each that no helper has taken; a helper does its own if it is open.
-        last, mark = (helpers, DONE) if place == CALLER else (place, TAKEN)
-        for p in range(place, last + 1):
+        last, mark = (helpers, DONE) if thread == CALLER else (thread, TAKEN)
+        for p in range(thread, last + 1):
             if p == CALLER or take(marks, LINE * p, mark):
                 if count > 0:
                     work(p * count // (helpers + 1), (p + 1) * count // (helpers + 1), *arguments)
                 post(marks, LINE * p, DONE)
-            elif place == CALLER:
+            elif thread == CALLER:
                 wait_for(marks, LINE * p)
-        if place != CALLER:
+        if thread != CALLER:
             spin_for_call(flags, call, rounds)
 
     return CompiledOrPython(part)
@@ -306,8 +306,8 @@ class WorkerThreads:
         self._flags, self._nothing = new_flags(1), new_flags(1)
         self._calls = itertools.count(1)
         self._jobs: list[SimpleQueue] = [SimpleQueue() for _ in range(helpers)]
-        for place, jobs in enumerate(self._jobs, 1):
-            name, arguments = f"numerics-worker-{place}", (place, jobs)
+        for thread, jobs in enumerate(self._jobs, 1):
+            name, arguments = f"numerics-worker-{thread}", (thread, jobs)
             threading.Thread(target=self._help, args=arguments, name=name, daemon=True).start()
 
     def run(self, part: CompiledOrPython, count: int, *arguments, alone: bool = False) -> None:
@@ -327,9 +327,9 @@ class WorkerThreads:
         marks = new_flags(helpers + 1)
         errors: list[BaseException] = []
         try:
-            for place, jobs in enumerate(self._jobs, 1):
+            for thread, jobs in enumerate(self._jobs, 1):
                 if jobs.qsize() < BEHIND:  # else it would keep the arguments of calls that are over
-                    jobs.put((part, (flags, marks, place, helpers, call, rounds, count, arguments), errors))
+                    jobs.put((part, (flags, marks, thread, helpers, call, rounds, count, arguments), errors))
             part(flags, marks, CALLER, helpers, call, rounds, count, arguments)
         except BaseException:  # no helper may be at work when the caller goes on
             part(flags, marks, CALLER, helpers, call, rounds, 0, arguments)
@@ -337,12 +337,12 @@ class WorkerThreads:
         if errors:
             raise errors[0]
 
-    def _help(self, place: int, jobs: SimpleQueue) -> None:
+    def _help(self, thread: int, jobs: SimpleQueue) -> None:
         while True:
             part, arguments, errors = jobs.get()
             try:
                 part(*arguments)
             except BaseException as error:
                 errors.append(error)
-                arguments[1][LINE * place] = DONE
+                arguments[1][LINE * thread] = DONE
             del part, arguments, errors  # an env that is not stepped again can be freed

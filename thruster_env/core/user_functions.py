@@ -39,21 +39,21 @@ def values_read(function: Callable) -> list[tuple[str, Any]]:
     """Names and values of all numbers, texts, tuples and arrays that a plain function reads, sorted by name."""
     code, cells = function.__code__, function.__closure__ or ()
     names = names_read(code)
-    found = dict(zip(code.co_freevars, (cell.cell_contents for cell in cells), strict=True))
+    captured = dict(zip(code.co_freevars, (cell.cell_contents for cell in cells), strict=True))
     return sorted(
-        {**_values_in(found, code.co_freevars, ""), **_values_in(function.__globals__, names, "")}.items()
+        {**_values_in(captured, code.co_freevars, ""), **_values_in(function.__globals__, names, "")}.items()
     )
 
 
 def _values_in(scope: dict, names, prefix: str, above: tuple = ()) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in names:
         value = scope.get(name)
         if isinstance(value, types.ModuleType) and value not in above:
-            found |= _values_in(vars(value), names, f"{prefix}{name}.", (*above, value))
+            values |= _values_in(vars(value), names, f"{prefix}{name}.", (*above, value))
         elif value is not None and is_plain(value):
-            found[prefix + name] = value
-    return found
+            values[prefix + name] = value
+    return values
 
 
 def is_plain(value: Any) -> bool:
@@ -74,18 +74,21 @@ def _plain(value: Any) -> str:
 
 def names_read(code: types.CodeType) -> list[str]:
     """Names of globals and attributes in a function's code and in that of functions within it, sorted."""
-    return sorted({name for one in _codes(code) for name in one.co_names})
+    return sorted({name for part in _codes(code) for name in part.co_names})
 
 
 def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
     yield code
-    for one in code.co_consts:
-        if isinstance(one, types.CodeType):
-            yield from _codes(one)
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _codes(constant)
 
 
 def _byte_code(code: types.CodeType) -> str:
-    constants = [_byte_code(one) if isinstance(one, types.CodeType) else repr(one) for one in code.co_consts]
+    constants = [
+        _byte_code(constant) if isinstance(constant, types.CodeType) else repr(constant)
+        for constant in code.co_consts
+    ]
     return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
 
 
@@ -101,13 +104,13 @@ CATCHING = {"CHECK_EXC_MATCH", "CHECK_EG_MATCH"}  # instructions of `except Kind
 def functions_in(*values: Any) -> Iterator[types.FunctionType]:
     """A user's functions among some values, and all that these may call: by name, in closures, of objects."""
     waiting: list[tuple[Any, tuple[str, ...]]] = [(value, CALL) for value in values]  # with names read of it
-    seen: dict[int, Any] = {}  # the objects, too, so that no new one gets an id
+    visited: dict[int, Any] = {}  # the objects, too, so that no new one gets an id
     while waiting:
         value, names = waiting.pop()
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
-        if (id(value), names) in seen or _top(value) in LIBRARIES:
+        if (id(value), names) in visited or _top(value) in LIBRARIES:
             continue
-        seen[id(value), names] = value  # type: ignore[index]
+        visited[id(value), names] = value  # type: ignore[index]
         if isinstance(value, types.FunctionType):
             ours = _top(value) in OURS
             if not ours:
@@ -130,8 +133,8 @@ def functions_in(*values: Any) -> Iterator[types.FunctionType]:
         elif isinstance(value, property):
             waiting.append((value.fget, names))
         elif not isinstance(value, NO_FUNCTIONS):
-            held = (inspect.getattr_static(value, name, None) for name in names)
-            waiting += [(one, names) for one in held if one is not None]
+            attributes = (inspect.getattr_static(value, name, None) for name in names)
+            waiting += [(attribute, names) for attribute in attributes if attribute is not None]
 
 
 def _top(value: Any) -> str:
@@ -156,20 +159,25 @@ def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
     """Parts (first, end) of some code whose exceptions an `except` catches; what cleans up alone does not."""
     listed = dis.Bytecode(code)
     instructions = list(listed)
-    place = {one.offset: i for i, one in enumerate(instructions)}
+    index_at = {instruction.offset: i for i, instruction in enumerate(instructions)}
 
     def catches(target: int) -> bool:
-        for one, after in zip(instructions[place[target] :], instructions[place[target] + 1 :], strict=False):
-            if one.opname in CATCHING or (one.opname, after.opname) == ("PUSH_EXC_INFO", "POP_TOP"):
+        for instruction, after in zip(
+            instructions[index_at[target] :], instructions[index_at[target] + 1 :], strict=False
+        ):
+            if instruction.opname in CATCHING or (instruction.opname, after.opname) == (
+                "PUSH_EXC_INFO",
+                "POP_TOP",
+            ):
                 return True
-            if one.opname == "WITH_EXCEPT_START":
+            if instruction.opname == "WITH_EXCEPT_START":
                 return "suppress" in code.co_names  # of contextlib
-            if one.opname == "RERAISE":
+            if instruction.opname == "RERAISE":
                 return False
         return False
 
     entries = listed.exception_entries  # type: ignore[attr-defined]
-    return tuple((one.start, one.end) for one in entries if catches(one.target))
+    return tuple((entry.start, entry.end) for entry in entries if catches(entry.target))
 
 
 def catches_exceptions(code: types.CodeType) -> bool:
@@ -181,40 +189,41 @@ def _asks_for_truth(code: types.CodeType) -> bool:
     """Whether some code asks if a value `is True`, as `match x > 0: case True` does."""
     pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
     return any(
-        after.opname == "IS_OP" and one.opname == "LOAD_CONST" and type(one.argval) is bool for one, after in pairs
+        after.opname == "IS_OP" and before.opname == "LOAD_CONST" and type(before.argval) is bool
+        for before, after in pairs
     ) or any(map(_asks_for_truth, _codes_within(code)))
 
 
 def inverts(code: types.CodeType) -> bool:
     """Whether some code has a `~`, which means "not" to NumPy's truth values and machine code alone."""
-    names = (one.opname for one in dis.get_instructions(code))
+    names = (instruction.opname for instruction in dis.get_instructions(code))
     return "UNARY_INVERT" in names or any(map(inverts, _codes_within(code)))
 
 
 def takes_roots(code: types.CodeType) -> bool:
     """Whether some code has powers other than those of whole numbers, which Python's floats may have complex."""
     pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
-    powers = (type(one.argval) is not int for one, after in pairs if after.argrepr in ("**", "**="))
+    powers = (type(before.argval) is not int for before, after in pairs if after.argrepr in ("**", "**="))
     return any(powers) or "pow" in code.co_names or any(map(takes_roots, _codes_within(code)))
 
 
 def _codes_within(code: types.CodeType) -> list[types.CodeType]:
-    return [one for one in code.co_consts if isinstance(one, types.CodeType)]
+    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
 
 
 def needs_python(*functions: Any) -> str | None:
     """Why only Python can say what functions compute, as they catch exceptions; else None."""
-    for one in functions_in(*functions):
-        if catches_exceptions(one.__code__):
-            return f"{one.__name__} catches exceptions, and arithmetic raises some in Python alone"
+    for function in functions_in(*functions):
+        if catches_exceptions(function.__code__):
+            return f"{function.__name__} catches exceptions, and arithmetic raises some in Python alone"
     return None
 
 
 def needs_floats(*functions: Any) -> str | None:
     """Why functions need Python's floats or machine code, and cannot be traced or take tensors; else None."""
-    for one in functions_in(*functions):
-        if _asks_for_truth(one.__code__):
-            return f"{one.__name__} asks whether a comparison `is` True or False: == or an if would do"
+    for function in functions_in(*functions):
+        if _asks_for_truth(function.__code__):
+            return f"{function.__name__} asks whether a comparison `is` True or False: == or an if would do"
     return needs_python(*functions)
 
 
@@ -288,8 +297,8 @@ class Copies:
             copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
             copy.__kwdefaults__ = function.__kwdefaults__
             self._copies[id(function)] = copy
-            read = [one for one in names_read(function.__code__) if one in function.__globals__]
-            names |= {one: self.of(function.__globals__[one]) for one in read}
+            read = [name for name in names_read(function.__code__) if name in function.__globals__]
+            names |= {name: self.of(function.__globals__[name]) for name in read}
             for cell, old in zip(cells, function.__closure__ or (), strict=True):
                 cell.cell_contents = self.of(old.cell_contents)
         return self._copies[id(function)]
@@ -334,10 +343,10 @@ def remember(function: Callable, recipe: Made) -> None:
 def as_made(value: Any) -> Any:
     """What pickle can hold in place of a function that was written out; other values as they are."""
     try:
-        made = _MADE.get(value)
+        recipe = _MADE.get(value)
     except TypeError:  # nothing that a weak reference or a hash can be had of
         return value
-    return value if made is None else made._replace(arguments=tuple(map(as_made, made.arguments)))
+    return value if recipe is None else recipe._replace(arguments=tuple(map(as_made, recipe.arguments)))
 
 
 def as_function(value: Any) -> Any:

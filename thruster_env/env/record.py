@@ -13,7 +13,7 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats, short_repr
 from thruster_env.core.checks import seed as checked_seed
-from thruster_env.core.modules import object_named, said
+from thruster_env.core.modules import error_line, object_named
 from thruster_env.env.commands import some_numbers
 from thruster_env.env.copies import PlantCopies
 from thruster_env.env.model_env import with_noise
@@ -199,7 +199,8 @@ def _made(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
         raise
     except Exception as error:
         raise ValueError(
-            f"the model of a log must be made without arguments, but {short_repr(named)} raised {said(error)}"
+            f"the model of a log must be made without arguments, but {short_repr(named)} raised "
+            f"{error_line(error)}"
         ) from error
     if not isinstance(found, StateSpaceModel):
         raise ValueError(

@@ -63,12 +63,12 @@ def parted(header: str) -> tuple[str, str | None]:
     Units stand in brackets ("speed [rad/s]"), or at the end as `thruster simulate` writes them
     ("omega_m_rad_per_s", also "omega_m_rad_s"); these are of WORDS.
     """
-    if found := _BRACKETS.match(header):
-        return found["base"], found["unit"].strip() or None
-    found = _RATE.match(header)
-    if found and found["base"] and found["over"] in (WORDS if found["per"] else LENGTHS):
-        power = f"^{found['power']}" if found["power"] else ""
-        return found["base"], f"{found['over']}/{found['under']}{power}"
+    if match := _BRACKETS.match(header):
+        return match["base"], match["unit"].strip() or None
+    match = _RATE.match(header)
+    if match and match["base"] and match["over"] in (WORDS if match["per"] else LENGTHS):
+        power = f"^{match['power']}" if match["power"] else ""
+        return match["base"], f"{match['over']}/{match['under']}{power}"
     base, underscore, last = header.rpartition("_")
     if underscore and base and last in WORDS:
         return base, last
@@ -119,9 +119,9 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
     if known is not None:
         factor, divisor, zero = known
         return (values * factor + zero) / divisor if zero else values * (factor / divisor)
-    (given, _), (target, _) = simple(unit), simple(wanted)
-    for one, other, base in ((unit, wanted, target), (wanted, unit, given)):
-        if one.replace(" ", "") in TURNING and base == "rad/s" and "Hz" not in other:
+    (source, _), (target, _) = simple(unit), simple(wanted)
+    for first, other, base in ((unit, wanted, target), (wanted, unit, source)):
+        if first.replace(" ", "") in TURNING and base == "rad/s" and "Hz" not in other:
             rule = f"the unit of {where} must say whether it counts turns or radians (rpm, Hz, rad/min)"
             raise ValueError(f"{rule}, but {unit!r} is to be {wanted!r}")
     try:
@@ -133,8 +133,8 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         ) from None
     registry = pint.application_registry.get()
     try:
-        given, target = (WRITTEN.get(text, text) for text in (unit, wanted))
-        return np.asarray(registry.Quantity(values, given).to(target).magnitude, dtype=np.float64)
+        source, target = (WRITTEN.get(text, text) for text in (unit, wanted))
+        return np.asarray(registry.Quantity(values, source).to(target).magnitude, dtype=np.float64)
     except pint.DimensionalityError:
         rule = f"the unit of {where} must be one that converts to {wanted or 'a pure number'}"
         raise ValueError(f"{rule}, but got {unit!r} (name another in brackets: {_example(wanted)})") from None
@@ -155,8 +155,8 @@ def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
         return factor, of_wanted, zero - of_zero
     if sum(simple(end)[0] == "m/s^2" for end in ends) == 1:
         ends = [GRAMS.get(end, end) for end in ends]
-    (given, factor), (target, of_wanted) = map(simple, ends)
-    return (factor, of_wanted, 0.0) if given == target else None
+    (source, factor), (target, of_wanted) = map(simple, ends)
+    return (factor, of_wanted, 0.0) if source == target else None
 
 
 def _example(wanted: str) -> str:
@@ -192,9 +192,9 @@ class Column(NamedTuple):
 def quantities_of(model: StateSpaceModel) -> list[Wanted]:
     """All quantities of a model that a log may hold: inputs and measurements, then the references."""
     states = [*model.states]
-    outputs = [one.quantity._replace(symbol=symbol) for symbol, one in model.outputs.items()]
+    outputs = [output.quantity._replace(symbol=symbol) for symbol, output in model.outputs.items()]
     kinds = (INPUT, model.input_quantities), (MEASUREMENT, model.measurements), (STATE, states), (OUTPUT, outputs)
-    return [Wanted(kind, quantity) for kind, some in kinds for quantity in some]
+    return [Wanted(kind, quantity) for kind, quantities in kinds for quantity in quantities]
 
 
 def plain(name: str) -> str:
@@ -204,11 +204,11 @@ def plain(name: str) -> str:
 
 def find_wanted(name: str, wanted: Sequence[Wanted]) -> Wanted | None:
     """The quantity of a symbol or name, inputs before measurements before references; or "kind:symbol"."""
-    for one in wanted:
-        symbol = one.quantity.symbol
-        if name in (symbol, one.key) or plain(name).lower() == plain(one.quantity.name).lower():
-            return one
-    return next((one for one in wanted if plain(name) == plain(one.quantity.symbol)), None)
+    for channel in wanted:
+        symbol = channel.quantity.symbol
+        if name in (symbol, channel.key) or plain(name).lower() == plain(channel.quantity.name).lower():
+            return channel
+    return next((channel for channel in wanted if plain(name) == plain(channel.quantity.symbol)), None)
 
 
 def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what: str, file: str) -> Column:
@@ -222,9 +222,9 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
         bare = same[0] if len(same) == 1 else bare
     if bare not in headers:
         near = get_close_matches(text, headers, n=3) if len(headers) > FEW else []
-        told = f"; near it are {', '.join(near)}" if near else ""
+        near_text = f"; near it are {', '.join(near)}" if near else ""
         rule = f"the column for {what} must be one of {listed(headers)}"
-        raise ValueError(f"{rule}, but got {short_repr(text)} ({file}){told}")
+        raise ValueError(f"{rule}, but got {short_repr(text)} ({file}){near_text}")
     return Column(bare, unit or _unit(bare, units))
 
 
@@ -236,21 +236,21 @@ def _unit(header: str, units: Mapping[str, str]) -> str | None:
 def find_columns(
     wanted: Sequence[Wanted],
     headers: Sequence[str],
-    given: Mapping[str, str],
+    named: Mapping[str, str],
     units: Mapping[str, str],
     file: str,
     needs_time: bool = False,
 ) -> dict[str, Column]:
     """Find the column of each quantity that the file has, and of "time", by key.
 
-    Quantities that are not given are found by headers: a header without its unit is the quantity's name or symbol.
+    Other quantities are found by headers: a header without its unit is the quantity's name or symbol.
     A header that is a symbol as it stands, such as "V_s", has no unit. Inputs and measurements come before states
     and outputs, names before symbols; a column is used once.
 
     Args:
         wanted: from `quantities_of`.
         headers: of the file's columns.
-        given: columns by quantity: "thrust" or "output:T", and "time", to "loadcell_N" or "loadcell[N]".
+        named: columns by quantity: "thrust" or "output:T", and "time", to "loadcell_N" or "loadcell[N]".
         units: by header, where the header gives none or another one.
         file: for messages.
         needs_time: whether a missing column of times is named with other missing ones.
@@ -258,79 +258,84 @@ def find_columns(
     Raises:
         ValueError: for a quantity that the model has not, a column that the file has not, or one given twice.
     """
-    found: dict[str, Column] = {}
-    for name, text in given.items():
-        one = None if name == TIME else find_wanted(name, wanted)
-        if one is None and name != TIME:
+    columns: dict[str, Column] = {}
+    for name, text in named.items():
+        channel = None if name == TIME else find_wanted(name, wanted)
+        if channel is None and name != TIME:
             known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
             raise ValueError(
                 f"columns must be given for some of {known}, but got {short_repr(name)}={text} ({file})"
             )
         if not isinstance(text, str):
             raise ValueError(f"the column for {name} must be a header, but got {short_repr(text)} ({file})")
-        key = TIME if one is None else one.key
-        if key in found:
+        key = TIME if channel is None else channel.key
+        if key in columns:
             raise ValueError(
-                f"a column must be given once for {name}, but got {found[key].header} and {text} ({file})"
+                f"a column must be given once for {name}, but got {columns[key].header} and {text} ({file})"
             )
-        found[key] = column_of(text, headers, units, name, file)
+        columns[key] = column_of(text, headers, units, name, file)
     known_headers = set(headers)
     for header in units:
         if header not in known_headers:
             raise ValueError(f"units must be of columns {listed(headers)}, but got {short_repr(header)} ({file})")
-    _by_headers(found, wanted, headers, units)
-    _check_found(found, wanted, headers, needs_time, file)
-    return found
+    _by_headers(columns, wanted, headers, units)
+    _check_found(columns, wanted, headers, needs_time, file)
+    return columns
 
 
 def _check_found(
-    found: Mapping[str, Column], wanted: Sequence[Wanted], headers: Sequence[str], needs_time: bool, file: str
+    columns: Mapping[str, Column], wanted: Sequence[Wanted], headers: Sequence[str], needs_time: bool, file: str
 ) -> None:
     """Raise ValueError, naming all that is missing, unless inputs, measurements and times are there."""
-    missing = [one for one in wanted if one.kind in (INPUT, MEASUREMENT) and one.key not in found]
+    missing = [
+        channel for channel in wanted if channel.kind in (INPUT, MEASUREMENT) and channel.key not in columns
+    ]
     if not missing:
         return
-    said = [
-        f"the {one.kind} {one.quantity.label} (use --column {one.quantity.symbol}=HEADER, or call it "
-        f"{plain(one.quantity.name)})"
-        for one in missing
+    texts = [
+        f"the {channel.kind} {channel.quantity.label} (use --column {channel.quantity.symbol}=HEADER, or call it "
+        f"{plain(channel.quantity.name)})"
+        for channel in missing
     ]
-    if needs_time and TIME not in found:
-        said.append("times (use --column time=HEADER, or --dt)")
+    if needs_time and TIME not in columns:
+        texts.append("times (use --column time=HEADER, or --dt)")
     python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
     raise ValueError(
-        f"a log must have a column for {' and for '.join(said)}, but {file} has {listed(headers)}; {python}"
+        f"a log must have a column for {' and for '.join(texts)}, but {file} has {listed(headers)}; {python}"
     )
 
 
-def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
+def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
     """Add the columns whose headers tell what they are."""
-    used = {column.header for column in found.values()}
+    used = {column.header for column in columns.values()}
     left = [header for header in headers if header not in used]
     bare = {header: parted(header) for header in left}
-    whole: dict[str, list[str]] = {}
+    by_header: dict[str, list[str]] = {}
     bases: dict[str, list[str]] = {}
     for header in left:
-        whole.setdefault(plain(header), []).append(header)
+        by_header.setdefault(plain(header), []).append(header)
         base = plain(bare[header][0])
         for name in dict.fromkeys((base, base.lower())):
             bases.setdefault(name, []).append(header)
 
     def take(key: str, fitting: Sequence[str], without_unit: bool = True) -> None:
-        header = None if key in found else next((one for one in fitting if one in bare), None)
+        header = None if key in columns else next((name for name in fitting if name in bare), None)
         if header is not None:
-            found[key] = Column(header, _unit(header, units) if without_unit or header in units else None)
+            columns[key] = Column(header, _unit(header, units) if without_unit or header in units else None)
             del bare[header]
 
     times = [header for header in left if bare[header][0] in TIME_NAMES]
     take(TIME, times or [header for header in left if bare[header][0].lower() in DATE_NAMES])
     for kinds in ((INPUT, MEASUREMENT), (STATE, OUTPUT)):
-        some = [one for one in wanted if one.kind in kinds]
-        for one in some:
-            name = plain(one.quantity.name).lower()
-            take(one.key, [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name])
-        for one in some:  # the whole header: what stands behind the line of "V_s" is no unit
-            take(one.key, whole.get(plain(one.quantity.symbol), []), without_unit=False)
-        for one in some:
-            symbol = plain(one.quantity.symbol)
-            take(one.key, [header for header in bases.get(symbol, []) if plain(parted(header)[0]) == symbol])
+        remaining = [channel for channel in wanted if channel.kind in kinds]
+        for channel in remaining:
+            name = plain(channel.quantity.name).lower()
+            take(
+                channel.key,
+                [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name],
+            )
+        for channel in remaining:  # the whole header: what stands behind the line of "V_s" is no unit
+            take(channel.key, by_header.get(plain(channel.quantity.symbol), []), without_unit=False)
+        for channel in remaining:
+            symbol = plain(channel.quantity.symbol)
+            take(channel.key, [header for header in bases.get(symbol, []) if plain(parted(header)[0]) == symbol])

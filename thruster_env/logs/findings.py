@@ -92,26 +92,26 @@ class Finding:
 
 def found_in(log: Log) -> tuple[Finding, ...]:
     """All findings in a log, of its rows first, then channel by channel."""
-    found = [*_of_rows(log)]
-    for place, one in enumerate(log.measured):
-        found += _of_channel(log, place, f"measurement:{one.symbol}")
-    return tuple(found)
+    findings = [*_of_rows(log)]
+    for channel, quantity in enumerate(log.measured):
+        findings += _of_channel(log, channel, f"measurement:{quantity.symbol}")
+    return tuple(findings)
 
 
 def sentences(findings: Sequence[Finding]) -> list[str]:
     """The findings in words; of many of one kind and channel how many there are, and the longest."""
-    said: list[str] = []
+    texts: list[str] = []
     groups: dict[tuple[str, str], list[Finding]] = {}
-    for one in findings:
-        groups.setdefault((one.kind, one.channel), []).append(one)
-    for some in groups.values():
-        if len(some) <= LISTED:
-            said += [f"{one.sentence}." for one in some]
+    for finding in findings:
+        groups.setdefault((finding.kind, finding.channel), []).append(finding)
+    for group in groups.values():
+        if len(group) <= LISTED:
+            texts += [f"{finding.sentence}." for finding in group]
             continue
-        longest = max(some, key=lambda one: one.count)
-        more = f" (the longest of {len(some)}, {sum(one.count for one in some)} rows in all)"
-        said.append(f"{longest.sentence}{more}.")
-    return said
+        longest = max(group, key=lambda finding: finding.count)
+        more = f" (the longest of {len(group)}, {sum(finding.count for finding in group)} rows in all)"
+        texts.append(f"{longest.sentence}{more}.")
+    return texts
 
 
 def remarks_on(logs: Sequence[Log]) -> list[str]:
@@ -119,87 +119,90 @@ def remarks_on(logs: Sequence[Log]) -> list[str]:
 
     Each begins with the name of its log; what several logs have in common is one sentence, on the longest.
     """
-    whole = {log.name: log for log in (log.whole or log for log in logs)}
+    uncut = {log.name: log for log in (log.whole or log for log in logs)}
     groups: dict[tuple[str, str], dict[str, list[Finding]]] = {}
-    for name, log in whole.items():
-        for one in log.findings:
-            groups.setdefault((one.kind, one.channel), {}).setdefault(name, []).append(one)
-    said: list[str] = []
+    for name, log in uncut.items():
+        for finding in log.findings:
+            groups.setdefault((finding.kind, finding.channel), {}).setdefault(name, []).append(finding)
+    texts: list[str] = []
     for of_logs in groups.values():
-        name, some = max(of_logs.items(), key=lambda item: max(one.count for one in item[1]))
+        name, findings = max(of_logs.items(), key=lambda item: max(finding.count for finding in item[1]))
         if len(of_logs) == 1:
-            said += [f"{name}: {one}" for one in sentences(some)]
+            texts += [f"{name}: {text}" for text in sentences(findings)]
             continue
-        longest = max(some, key=lambda one: one.count)
-        places = sum(map(len, of_logs.values()))
-        rows = sum(one.count for found in of_logs.values() for one in found)
-        more = f"the longest of {places} in {len(of_logs)} logs, {rows} rows in all"
-        said.append(f"{name}: {longest.sentence} ({more}).")
-    return said
+        longest = max(findings, key=lambda finding: finding.count)
+        count = sum(map(len, of_logs.values()))
+        rows = sum(finding.count for group in of_logs.values() for finding in group)
+        more = f"the longest of {count} in {len(of_logs)} logs, {rows} rows in all"
+        texts.append(f"{name}: {longest.sentence} ({more}).")
+    return texts
 
 
 def has_outliers(logs: Sequence[Log]) -> bool:
     """Whether there are outliers in any of some logs."""
-    return any(one.kind == OUTLIER for log in logs for one in (log.whole or log).findings)
+    return any(finding.kind == OUTLIER for log in logs for finding in (log.whole or log).findings)
 
 
 def _of_rows(log: Log) -> list[Finding]:
-    told, last = log.recording, log.steps
-    found = [Finding(DAMAGED, "", 0, last, 1, said) for said in told.damage]
-    found += [Finding(one.kind, one.channel, 0, last, last + 1, one.sentence) for one in told.remarks]
-    for first, count in told.gaps:
-        said = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
-        found.append(Finding(GAP, "", first, first + count - 1, count, said))
-    if told.missing:
-        places = f"{told.holes} place{'' if told.holes == 1 else 's'}"
-        are = "row is" if told.missing == 1 else "rows are"
-        said = f"{told.missing} of {last + 1} {are} missing, in {places}; the input is held there"
-        found.append(Finding(MISSING, "", 0, last, told.missing, said))
-    if told.doubled:
-        rows = "row has" if told.doubled == 1 else "rows have"
-        said = f"{told.doubled} {rows} the time of the row before; of two samples of a channel the last is used"
-        found.append(Finding(DOUBLED, "", 0, last, told.doubled, said))
-    if told.moved:
-        said = f"{told.moved} samples were moved to the grid of {log.dt:g} s, by up to {told.farthest:.3g} s"
-        found.append(Finding(MOVED, "", 0, last, told.moved, said))
-    for channel, count in told.dropped:
+    recording, last = log.recording, log.steps
+    findings = [Finding(DAMAGED, "", 0, last, 1, text) for text in recording.damage]
+    findings += [
+        Finding(remark.kind, remark.channel, 0, last, last + 1, remark.sentence) for remark in recording.remarks
+    ]
+    for first, count in recording.gaps:
+        text = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
+        findings.append(Finding(GAP, "", first, first + count - 1, count, text))
+    if recording.missing:
+        holes = f"{recording.holes} place{'' if recording.holes == 1 else 's'}"
+        are = "row is" if recording.missing == 1 else "rows are"
+        text = f"{recording.missing} of {last + 1} {are} missing, in {holes}; the input is held there"
+        findings.append(Finding(MISSING, "", 0, last, recording.missing, text))
+    if recording.doubled:
+        rows = "row has" if recording.doubled == 1 else "rows have"
+        text = (
+            f"{recording.doubled} {rows} the time of the row before; of two samples of a channel the last is used"
+        )
+        findings.append(Finding(DOUBLED, "", 0, last, recording.doubled, text))
+    if recording.moved:
+        farthest = f"by up to {recording.farthest:.3g} s"
+        text = f"{recording.moved} samples were moved to the grid of {log.dt:g} s, {farthest}"
+        findings.append(Finding(MOVED, "", 0, last, recording.moved, text))
+    for channel, count in recording.dropped:
         what = f"{count} samples of {_name(channel)}" if count > 1 else f"1 sample of {_name(channel)}"
-        said = f"{what} {('are' if count > 1 else 'is')} not used: another one is nearer to the same grid time"
-        found.append(Finding(DROPPED, channel, 0, last, count, said))
-    return found
+        text = f"{what} {('are' if count > 1 else 'is')} not used: another one is nearer to the same grid time"
+        findings.append(Finding(DROPPED, channel, 0, last, count, text))
+    return findings
 
 
-def _of_channel(log: Log, place: int, channel: str) -> list[Finding]:
-    values = log.measurements[:, place]
+def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
+    values = log.measurements[:, column]
     rows = np.flatnonzero(~np.isnan(values))
     if len(rows) < SHORTEST:
         return []
-    values, quantity = values[rows], log.measured[place]
+    values, quantity = values[rows], log.measured[column]
     runs = _runs_of_equals(values)
-    found, ends = _saturated(log, channel, rows, values, runs)
+    findings, ends = _saturated(log, channel, rows, values, runs)
     for first, count in _stuck(log, rows, values, runs):
         if values[first] in ends:  # said already
             continue
         low, high = int(rows[first]), int(rows[first + count - 1])
-        said = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
-        found.append(Finding(STUCK, channel, low, high, count, said))
+        text = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
+        findings.append(Finding(STUCK, channel, low, high, count, text))
     spikes = _spikes(rows, values, quantity.angle)
     if len(spikes):
         first, last = int(rows[spikes[0]]), int(rows[spikes[-1]])
-        one = len(spikes) == 1
-        said = (
-            f"{_name(channel)} has {'an outlier' if one else f'{len(spikes)} outliers'}{_where(log, first, last)}"
-        )
-        found.append(Finding(OUTLIER, channel, first, last, len(spikes), said))
-    return found
+        spikes_text = "an outlier" if len(spikes) == 1 else f"{len(spikes)} outliers"
+        text = f"{_name(channel)} has {spikes_text}{_where(log, first, last)}"
+        findings.append(Finding(OUTLIER, channel, first, last, len(spikes), text))
+    return findings
 
 
 def outliers(log: Log, channel: str) -> np.ndarray:
     """Rows of the outliers of a measured channel."""
-    place = [f"measurement:{one.symbol}" for one in log.measured].index(channel)
-    values = log.measurements[:, place]
+    column = [f"measurement:{quantity.symbol}" for quantity in log.measured].index(channel)
+    values = log.measurements[:, column]
     rows = np.flatnonzero(~np.isnan(values))
-    return rows[_spikes(rows, values[rows], log.measured[place].angle)]
+    return rows[_spikes(rows, values[rows], log.measured[column].angle)]
 
 
 def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
@@ -221,12 +224,12 @@ def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: in
     share = (equal + 1) / (pairs + 2)
     here = np.flatnonzero(values[:-1] == values[first])
     here = here[(here < first) | (here >= first + count - 1)]
-    there = (int((values[here + 1] == values[first]).sum()) + share) / (len(here) + 1)
-    return len(values) * max(share, there) ** (count - 1) >= LEVEL
+    share_there = (int((values[here + 1] == values[first]).sum()) + share) / (len(here) + 1)
+    return len(values) * max(share, share_there) ** (count - 1) >= LEVEL
 
 
 def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    equal, pairs, found = int((np.diff(values) == 0).sum()), len(values) - 1, []
+    equal, pairs, stretches = int((np.diff(values) == 0).sum()), len(values) - 1, []
     for first, count in sorted(runs, key=lambda run: -run[1]):
         equal, pairs = equal - (count - 1), pairs - (count - 1)  # each is held against those that are shorter
         if count < SHORTEST or _by_chance(values, first, count, equal, pairs):
@@ -235,8 +238,8 @@ def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int,
         at_rest = len(inputs) == 0 or bool((np.ptp(inputs, axis=0) == 0).all())
         quantised = equal + 1 > COMMON * (pairs + 2)
         if not (at_rest and (quantised or values[first] == 0.0)):
-            found.append((first, count))
-    return sorted(found)
+            stretches.append((first, count))
+    return sorted(stretches)
 
 
 def _saturated(
@@ -244,24 +247,24 @@ def _saturated(
 ) -> tuple[list[Finding], list[float]]:
     """Findings, and the values at which the channel ends."""
     levels, counts = np.unique(values, return_counts=True)
-    found: list[Finding] = []
+    findings: list[Finding] = []
     ends: list[float] = []
     if len(levels) < SHORTEST:
-        return found, ends
-    for place, beside in ((0, 1), (-1, -2)):
-        level, count = levels[place], int(counts[place])
+        return findings, ends
+    for level_index, next_index in ((0, 1), (-1, -2)):
+        level, count = levels[level_index], int(counts[level_index])
         stretches = [run for run in runs if values[run[0]] == level]
-        if level == 0.0 or len(stretches) < RUNS or count < max(SHORTEST, OFTENER * counts[beside]):
+        if level == 0.0 or len(stretches) < RUNS or count < max(SHORTEST, OFTENER * counts[next_index]):
             continue
         first, last = int(rows[stretches[0][0]]), int(rows[sum(stretches[-1]) - 1])
-        end = "smallest" if place == 0 else "largest"
-        said = (
+        end = "smallest" if level_index == 0 else "largest"
+        text = (
             f"{_name(channel)} is at its {end} value, {level:.6g}, in {count} samples{_where(log, first, last)}: "
             f"it seems to be saturated"
         )
-        found.append(Finding(SATURATED, channel, first, last, count, said))
+        findings.append(Finding(SATURATED, channel, first, last, count, text))
         ends.append(level)
-    return found, ends
+    return findings, ends
 
 
 def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
@@ -273,13 +276,13 @@ def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
     noise = max(NORMAL * float(np.median(abs(steps))), float(np.median(sizes))) / np.sqrt(2.0)
     before, after = steps[:-1], -steps[1:]  # of a sample, above its neighbours
     height = np.where(before * after > 0, np.minimum(abs(before), abs(after)), 0.0)
-    beside = np.maximum(np.append(0.0, abs(steps[:-2])), np.append(abs(steps[2:]), 0.0))
+    neighbouring = np.maximum(np.append(0.0, abs(steps[:-2])), np.append(abs(steps[2:]), 0.0))
     across = abs(steps[:-1] + steps[1:])
     apart = np.diff(rows)
     near = np.maximum(apart[:-1], apart[1:]) <= np.median(apart)
-    places = np.flatnonzero(near & (height > SPIKE * noise) & (height > ALONE * np.maximum(beside, across)))
-    local = [np.median(abs(steps[max(k - AROUND, 0) : k + AROUND])) * NORMAL / np.sqrt(2.0) for k in places]
-    return places[height[places] > SPIKE * np.array(local)] + 1
+    spikes = np.flatnonzero(near & (height > SPIKE * noise) & (height > ALONE * np.maximum(neighbouring, across)))
+    local = [np.median(abs(steps[max(k - AROUND, 0) : k + AROUND])) * NORMAL / np.sqrt(2.0) for k in spikes]
+    return spikes[height[spikes] > SPIKE * np.array(local)] + 1
 
 
 def _where(log: Log, first: int, last: int) -> str:

@@ -71,28 +71,28 @@ def grid_of(stamps: np.ndarray, dt: float | None = None, clock: np.ndarray | Non
             stamps around them are. All rows by default.
     """
     if clock is not None and not clock.all():
-        since, own = stamps - stamps[0], grid_of(stamps[clock], dt)
-        times = since + np.interp(since, since[clock], own.times - since[clock])
-        times[clock] = own.times
-        return own._replace(times=np.maximum.accumulate(times), irregular=True)
-    since, place = np.unique(stamps - stamps[0], return_inverse=True)
+        since, clocked = stamps - stamps[0], grid_of(stamps[clock], dt)
+        times = since + np.interp(since, since[clock], clocked.times - since[clock])
+        times[clock] = clocked.times
+        return clocked._replace(times=np.maximum.accumulate(times), irregular=True)
+    since, inverse = np.unique(stamps - stamps[0], return_inverse=True)
     usual = _usual(since)
     pieces = _pieces(since, usual)
-    found, spread = _slope(since, pieces, usual)
+    period, spread = _slope(since, pieces, usual)
     if dt is None:
-        dt = _rounded(found, spread)
+        dt = _rounded(period, spread)
     longest = max(len(piece) for piece in pieces)
     times = since
     if (
-        abs(dt - found) * longest <= SAME_RATE * dt + SURE * spread * longest
+        abs(dt - period) * longest <= SAME_RATE * dt + SURE * spread * longest
     ):  # else a piece has no place of its own
         times = _shifted(since, pieces, dt)
     numbers = np.floor(times / dt + 0.5)
     regular = bool((abs(times - dt * numbers) <= TOLERANCE * dt).all() and (np.diff(numbers) > 0).all())
-    moved = abs(since - dt * numbers)[place]
+    shifts = abs(since - dt * numbers)[inverse]
     if regular:
-        return Grid(dt, int(numbers[-1]) + 1, (dt * numbers)[place], False, moved)
-    return Grid(dt, int(numbers[-1]) + 1, times[place], True, moved)
+        return Grid(dt, int(numbers[-1]) + 1, (dt * numbers)[inverse], False, shifts)
+    return Grid(dt, int(numbers[-1]) + 1, times[inverse], True, shifts)
 
 
 def _usual(since: np.ndarray) -> float:
@@ -123,28 +123,28 @@ def _slope(since: np.ndarray, pieces: list[np.ndarray], dt: float) -> tuple[floa
         squares += float(centred[-1][0] @ centred[-1][0])
     if squares == 0.0:
         return dt, 0.0
-    found = products / squares
-    errors = sum(float(((t - found * k) ** 2).sum()) for k, t in centred)
-    return found, float(np.sqrt(errors / max(len(since) - len(pieces) - 1, 1) / squares))
+    period = products / squares
+    errors = sum(float(((t - period * k) ** 2).sum()) for k, t in centred)
+    return period, float(np.sqrt(errors / max(len(since) - len(pieces) - 1, 1) / squares))
 
 
-def _rounded(found: float, spread: float) -> float:
+def _rounded(period: float, spread: float) -> float:
     """A sample time with no more digits than it is known to."""
     for digits in range(1, MOST_DIGITS):
-        short = float(f"{found:.{digits}g}")
-        if abs(short - found) <= SURE * spread + CLOSE * found:
+        short = float(f"{period:.{digits}g}")
+        if abs(short - period) <= SURE * spread + CLOSE * period:
             return short
-    return float(f"{found:.{MOST_DIGITS}g}")
+    return float(f"{period:.{MOST_DIGITS}g}")
 
 
 def _shifted(since: np.ndarray, pieces: list[np.ndarray], dt: float) -> np.ndarray:
     """Stamps of each piece, shifted by the same part of a step onto the grid; the first time is on row 0."""
     times = since.copy()
     for piece in pieces:
-        own = times[piece]
-        about = own[0] - dt * np.round(own[0] / dt)
-        off = own - about
-        times[piece] = own - about - float(np.median(off - dt * np.round(off / dt)))
+        piece_times = times[piece]
+        about = piece_times[0] - dt * np.round(piece_times[0] / dt)
+        off = piece_times - about
+        times[piece] = piece_times - about - float(np.median(off - dt * np.round(off / dt)))
     return times - dt * np.floor(times[0] / dt + 0.5)
 
 
@@ -166,19 +166,19 @@ def sampled(series: Series, dt: float, rows: int, offset: float = 0.0, angle: bo
     near = (high - low <= NEIGHBOURS) & (low <= grid) & (grid <= high)
     apart = np.where(high > low, high - low, 1.0)
     share = (grid - low) / apart
-    one, other = series.values[after - 1], series.values[after]
-    between = one + share * wrapped(other - one) if angle else (1.0 - share) * one + share * other
+    before, other = series.values[after - 1], series.values[after]
+    between = before + share * wrapped(other - before) if angle else (1.0 - share) * before + share * other
     return np.where(near, between, out)
 
 
-def held(series: Series, dt: float, steps: int, offset: float = 0.0, angle: bool = False) -> np.ndarray:
+def mean_held(series: Series, dt: float, steps: int, offset: float = 0.0, angle: bool = False) -> np.ndarray:
     """An input, maybe an angle, on the grid, (steps,): its mean over each step, held from sample to sample."""
     times, values = (series.times - offset) / dt, series.values
     starts = np.arange(steps + 1, dtype=np.float64)
     if _lies_on_grid(times):
-        place = np.searchsorted(np.round(times), starts[:-1], side="right") - 1
-        return values[np.maximum(place, 0)]
-    places = np.maximum(np.searchsorted(times, starts[:-1], side="right") - 1, 0)
+        sample = np.searchsorted(np.round(times), starts[:-1], side="right") - 1
+        return values[np.maximum(sample, 0)]
+    samples = np.maximum(np.searchsorted(times, starts[:-1], side="right") - 1, 0)
     if angle:
         values = np.unwrap(values)
     ends = np.append(times[1:], max(times[-1], steps) + 1.0)
@@ -186,7 +186,7 @@ def held(series: Series, dt: float, steps: int, offset: float = 0.0, angle: bool
     heights = np.append(values[0], values)
     integral = np.append(0.0, np.cumsum(heights * np.diff(knots)))
     means = np.diff(np.interp(starts, knots, integral))
-    return means - (values - series.values)[places] if angle else means
+    return means - (values - series.values)[samples] if angle else means
 
 
 def _lies_on_grid(times: np.ndarray) -> bool:
@@ -216,21 +216,21 @@ def at_own_stamps(
         start: the first stamp [s], as the file has it.
     """
     near = closeness(dt, resolution_of(abs(start) + end))
-    own = {key: one.times - offsets.get(key, 0.0) for key, one in series.items()}
-    stamps = np.sort(np.concatenate([np.zeros(1), *own.values()]))
+    shifted = {key: samples.times - offsets.get(key, 0.0) for key, samples in series.items()}
+    stamps = np.sort(np.concatenate([np.zeros(1), *shifted.values()]))
     stamps = stamps[(stamps >= -near) & (stamps <= end + near)]
     times = stamps[np.append(True, np.diff(stamps) > near)]
     times[0] = 0.0
     columns = {}
-    for key, one in series.items():
+    for key, samples in series.items():
         if key in inputs:
-            place = np.searchsorted(own[key], times[:-1] + near, side="right") - 1
-            columns[key] = one.values[np.maximum(place, 0)]
+            row = np.searchsorted(shifted[key], times[:-1] + near, side="right") - 1
+            columns[key] = samples.values[np.maximum(row, 0)]
             continue
-        within = (own[key] >= -near) & (own[key] <= end + near)
-        place = np.searchsorted(times, own[key][within] + near, side="right") - 1
+        within = (shifted[key] >= -near) & (shifted[key] <= end + near)
+        row = np.searchsorted(times, shifted[key][within] + near, side="right") - 1
         columns[key] = np.full(len(times), np.nan)
-        columns[key][place] = one.values[within]  # of two of one time the last
+        columns[key][row] = samples.values[within]  # of two of one time the last
     return times, columns
 
 
@@ -268,15 +268,15 @@ def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
     Raises:
         ValueError: if only some dates have a time zone.
     """
-    found = [None if cell == MISSING else date_of(cell) for cell in cells]
-    known = [one for one in found if one is not None]
+    dates = [None if cell == MISSING else date_of(cell) for cell in cells]
+    known = [date for date in dates if date is not None]
     if not known:
         return None
-    if len({one.tzinfo is None for one in known}) > 1:
+    if len({date.tzinfo is None for date in known}) > 1:
         raise ValueError("times must all have a time zone, or none, but got both")
-    known = [one if one.tzinfo is None else one.astimezone(UTC) for one in known]
-    seconds = iter([(one - known[0]) / timedelta(seconds=1) for one in known])
-    return np.array([np.nan if one is None else next(seconds) for one in found])
+    known = [date if date.tzinfo is None else date.astimezone(UTC) for date in known]
+    seconds = iter([(date - known[0]) / timedelta(seconds=1) for date in known])
+    return np.array([np.nan if date is None else next(seconds) for date in dates])
 
 
 def date_of(text: str) -> datetime | None:
@@ -301,8 +301,8 @@ def time_text(seconds: float, dt: float, least: int = 6) -> str:
 
 def follows(before: float, after: float) -> str:
     """Two times that are in the wrong order: "0.07 s follows 0.08 s"."""
-    some = [time_text(one, abs(after - before), 10) for one in (after, before)]
-    return f"{some[0]} s follows {some[1]} s"
+    texts = [time_text(time, abs(after - before), 10) for time in (after, before)]
+    return f"{texts[0]} s follows {texts[1]} s"
 
 
 def date_text(seconds: float) -> str:
@@ -348,11 +348,11 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
         is_date = SINCE_1970[0] <= middle <= SINCE_1970[1]
         if not is_whole or is_minutes or is_date or step < DOUBTED:
             return SECOND, ""
-        said = f"the sample time is {step:.4g} s; if it is {step:.4g} ms, use --column 'time={header}[ms]'"
-        return SECOND, f"times in {where} are taken as s: {said}"
+        assumption = f"the sample time is {step:.4g} s; if it is {step:.4g} ms, use --column 'time={header}[ms]'"
+        return SECOND, f"times in {where} are taken as s: {assumption}"
     low, high = SHORTEST_STEP, LONGEST_STEP
-    some = [(unit, ticks) for unit, ticks in TICKS.items() if not (is_stamp and unit == "ms")]
-    units = [unit for unit, ticks in some if is_whole and low * ticks <= step <= high * ticks]
+    possible = [(unit, ticks) for unit, ticks in TICKS.items() if not (is_stamp and unit == "ms")]
+    units = [unit for unit, ticks in possible if is_whole and low * ticks <= step <= high * ticks]
     as_seconds = f"{step:.4g} s" if step < MOST_SECONDS else f"{step / MOST_SECONDS:.3g} days"
     if len(units) != 1:
         rule = "times must be in seconds, or their column say its unit"
@@ -363,5 +363,7 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
 
 def in_seconds(stamps: np.ndarray, unit: str | None, header: str, where: str) -> tuple[np.ndarray, str]:
     """Stamps (rows,) of a column in a unit, None for what `unit_of` finds; and what that took, in words."""
-    unit, taken = (unit, "") if unit is not None else unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
-    return converted(stamps, unit, SECOND, where), taken
+    unit, assumption = (
+        (unit, "") if unit is not None else unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
+    )
+    return converted(stamps, unit, SECOND, where), assumption

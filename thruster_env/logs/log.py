@@ -13,7 +13,7 @@ from thruster_env.core.checks import as_floats, finite, positive, short_repr
 from thruster_env.core.stamps import resolution_of
 from thruster_env.logs.columns import INPUT, MEASUREMENT, STATE
 from thruster_env.logs.findings import STALE, Finding, Recording, Remark, found_in
-from thruster_env.logs.grid import CLOSE, Series, held, sampled, time_text
+from thruster_env.logs.grid import CLOSE, Series, mean_held, sampled, time_text
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -122,28 +122,28 @@ class Log:
     @cached_property
     def digest(self) -> str:
         """A short hash of all numbers, dt and units; not of the name."""
-        found = hashlib.sha256(f"{self.dt!r}".encode())
+        sha = hashlib.sha256(f"{self.dt!r}".encode())
         ones = [*self.input_quantities, *self.measured, *(self.referred[key] for key in sorted(self.references))]
-        found.update("\0".join(f"{one.symbol} {one.unit}" for one in ones).encode())
+        sha.update("\0".join(f"{quantity.symbol} {quantity.unit}" for quantity in ones).encode())
         for part in (self.inputs, self.measurements, *(self.references[key] for key in sorted(self.references))):
-            found.update(np.ascontiguousarray(part + 0.0).tobytes())
+            sha.update(np.ascontiguousarray(part + 0.0).tobytes())
         if self.stamps is not None:
-            found.update(self.stamps.tobytes())
-        return found.hexdigest()[:12]
+            sha.update(self.stamps.tobytes())
+        return sha.hexdigest()[:12]
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels."""
-        inputs = (f"{INPUT}:{one.symbol}" for one in self.input_quantities)
-        return (*inputs, *(f"{MEASUREMENT}:{one.symbol}" for one in self.measured), *self.references)
+        inputs = (f"{INPUT}:{quantity.symbol}" for quantity in self.input_quantities)
+        return (*inputs, *(f"{MEASUREMENT}:{quantity.symbol}" for quantity in self.measured), *self.references)
 
     def true_states(self, model: StateSpaceModel) -> np.ndarray | None:
         """The states of a model, (K + 1, n), NaN in rows without one; None where no row has all."""
-        found = [self.references.get(f"{STATE}:{one.symbol}") for one in model.states]
-        there = [one for one in found if one is not None]
-        if len(there) < len(found):
+        columns = [self.references.get(f"{STATE}:{state.symbol}") for state in model.states]
+        present = [column for column in columns if column is not None]
+        if len(present) < len(columns):
             return None
-        states = np.column_stack(there)
+        states = np.column_stack(present)
         known = ~np.isnan(states).any(axis=1)
         return np.where(known[:, None], states, np.nan) if known.any() else None
 
@@ -156,12 +156,12 @@ class Log:
         if channel in self.references:
             values = self.references[channel]
         else:
-            some, rows = (
+            quantities, rows = (
                 (self.input_quantities, self.inputs) if kind == INPUT else (self.measured, self.measurements)
             )
-            values = rows[:, [one.symbol for one in some].index(symbol)]
-        times, there = times[: len(values)], ~np.isnan(values)
-        return Series(times[there], values[there])
+            values = rows[:, [quantity.symbol for quantity in quantities].index(symbol)]
+        times, present = times[: len(values)], ~np.isnan(values)
+        return Series(times[present], values[present])
 
     def named(self, name: str) -> Log:
         """The same log under another name."""
@@ -194,17 +194,17 @@ def at_offset(log: Log, channel: str, seconds: float) -> Log:
     seconds, series = finite(f"the clock offset of {channel}", seconds), log.series(channel)
     changes: dict = {"offsets": {**log.offsets, channel: seconds}, "source": {**log.source, channel: series}}
     kind, _, symbol = channel.partition(":")
-    given = series, log.dt, log.steps + 1, seconds
+    arguments = series, log.dt, log.steps + 1, seconds
     if channel in log.references:
-        changes["references"] = {**log.references, channel: sampled(*given, log.referred[channel].angle)}
+        changes["references"] = {**log.references, channel: sampled(*arguments, log.referred[channel].angle)}
     elif kind == INPUT:
-        place = [one.symbol for one in log.input_quantities].index(symbol)
-        values = held(series, log.dt, log.steps, seconds, log.input_quantities[place].angle)
-        changes["inputs"] = _with_column(log.inputs, place, values)
+        column = [quantity.symbol for quantity in log.input_quantities].index(symbol)
+        values = mean_held(series, log.dt, log.steps, seconds, log.input_quantities[column].angle)
+        changes["inputs"] = _with_column(log.inputs, column, values)
     else:
-        place = [one.symbol for one in log.measured].index(symbol)
-        values = sampled(*given, log.measured[place].angle)
-        changes["measurements"] = _with_column(log.measurements, place, values)
+        column = [quantity.symbol for quantity in log.measured].index(symbol)
+        values = sampled(*arguments, log.measured[column].angle)
+        changes["measurements"] = _with_column(log.measurements, column, values)
     return replace(log, **changes)
 
 
@@ -215,21 +215,21 @@ def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
 
 
 def _piece(log: Log, first: int, rows: int) -> Log:
-    some, since, source = slice(first, first + rows), first * log.dt, {}
+    kept_rows, since, source = slice(first, first + rows), first * log.dt, {}
     for channel, series in log.source.items():
         times = series.times - since
-        own = times - log.offsets.get(channel, 0.0)
-        low = max(int(np.searchsorted(own, -0.5 * log.dt)) - 1, 0)  # what is held at the first row
-        high = int(np.searchsorted(own, (rows - 0.5) * log.dt))
+        shifted = times - log.offsets.get(channel, 0.0)
+        low = max(int(np.searchsorted(shifted, -0.5 * log.dt)) - 1, 0)  # what is held at the first row
+        high = int(np.searchsorted(shifted, (rows - 0.5) * log.dt))
         if channel.partition(":")[0] != INPUT:
-            low = int(np.searchsorted(own, -0.5 * log.dt))
+            low = int(np.searchsorted(shifted, -0.5 * log.dt))
         source[channel] = Series(times[low:high], series.values[low:high])
     return replace(
         log,
         name=f"{log.name}, rows {first} to {first + rows - 1}",
         inputs=log.inputs[first : first + rows - 1],
-        measurements=log.measurements[some],
-        references={key: values[some] for key, values in log.references.items()},
+        measurements=log.measurements[kept_rows],
+        references={key: values[kept_rows] for key, values in log.references.items()},
         start=log.start + since,
         source=source,
         recording=Recording(),
@@ -237,8 +237,8 @@ def _piece(log: Log, first: int, rows: int) -> Log:
     )
 
 
-def _checked_stamps(given: np.ndarray, steps: int, name: str) -> np.ndarray:
-    stamps = np.array(as_floats(given))
+def _checked_stamps(times: np.ndarray, steps: int, name: str) -> np.ndarray:
+    stamps = np.array(as_floats(times))
     if stamps.shape != (steps + 1,) or stamps[0] != 0.0 or not (np.diff(stamps) > 0.0).all():
         rule = f"{steps + 1} increasing times from 0 on"
         raise ValueError(f"stamps of log {name} must be {rule}, but got {short_repr(stamps)}")
@@ -246,9 +246,9 @@ def _checked_stamps(given: np.ndarray, steps: int, name: str) -> np.ndarray:
     return stamps
 
 
-def _with_column(rows: np.ndarray, place: int, values: np.ndarray) -> np.ndarray:
+def _with_column(rows: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
     rows = rows.copy()
-    rows[:, place] = values
+    rows[:, column] = values
     return rows
 
 
@@ -272,15 +272,15 @@ def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: flo
         start: time stamp of row 0 [s].
     """
     remarks = []
-    for key, one in inputs.items():
-        name, last = key.partition(":")[2], float(one.times[-1])
+    for key, samples in inputs.items():
+        name, last = key.partition(":")[2], float(samples.times[-1])
         if last <= CLOSE * dt:
-            said = f"{name} has no sample after the first row: it is held at {one.values[-1]:.6g} in all rows"
-            remarks.append(Remark(STALE, key, said))
-        elif end - last > max(LONG * end, LONGER * float(np.diff(one.times).max(initial=dt))):
+            text = f"{name} has no sample after the first row: it is held at {samples.values[-1]:.6g} in all rows"
+            remarks.append(Remark(STALE, key, text))
+        elif end - last > max(LONG * end, LONGER * float(np.diff(samples.times).max(initial=dt))):
             begun = time_text(start + last, dt)
-            said = f"{name} has no sample after {begun} s: it is held at {one.values[-1]:.6g} for the last "
-            remarks.append(Remark(STALE, key, f"{said}{end - last:.4g} s"))
+            text = f"{name} has no sample after {begun} s: it is held at {samples.values[-1]:.6g} for the last "
+            remarks.append(Remark(STALE, key, f"{text}{end - last:.4g} s"))
     return remarks
 
 
@@ -292,38 +292,38 @@ FEWEST = 4
 FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, of the hash of a window
 
 
-def shared_by(some: Sequence[Log], others: Sequence[Log]) -> tuple[Log, Log] | None:
+def shared_by(first: Sequence[Log], second: Sequence[Log]) -> tuple[Log, Log] | None:
     """The first pair of logs, one of each kind, with the same rows in a row; None where there is none.
 
     Rows with measurements are compared by inputs and measurements, independent of their times and the logs' names.
     Rows in which no measurement changes, as at rest, are ignored, except in identical logs.
     """
-    logs = [*some, *others]
-    whole = {log.digest: log for log in some}
-    for log in others:
-        if log.digest in whole:
-            return whole[log.digest], log
+    logs = [*first, *second]
+    by_digest = {log.digest: log for log in first}
+    for log in second:
+        if log.digest in by_digest:
+            return by_digest[log.digest], log
     rows = [_measured_rows(log) for log in logs]
-    width = max(FEWEST, min(WINDOW, *(len(one) // 2 for one in rows)))
+    width = max(FEWEST, min(WINDOW, *(len(log_rows) // 2 for log_rows in rows)))
     flat = np.ascontiguousarray(np.concatenate(rows)).view(f"V{8 * rows[0].shape[1]}")[:, 0]
     numbers = np.unique(flat, return_inverse=True)[1].astype(np.uint64)
-    pieces = np.split(numbers, np.cumsum([len(one) for one in rows])[:-1])
-    inputs = some[0].inputs.shape[1]
-    hashes = [_hashes(piece, one[:, inputs:], width) for piece, one in zip(pieces, rows, strict=True)]
-    seen: dict[int, Log] = {}
-    for log, found in zip(some, hashes, strict=False):
-        seen.update(dict.fromkeys(found.tolist(), log))
-    for log, found in zip(others, hashes[len(some) :], strict=True):
-        common = next((one for one in found.tolist() if one in seen), None)
+    pieces = np.split(numbers, np.cumsum([len(log_rows) for log_rows in rows])[:-1])
+    inputs = first[0].inputs.shape[1]
+    hashes = [_hashes(piece, log_rows[:, inputs:], width) for piece, log_rows in zip(pieces, rows, strict=True)]
+    log_of_hash: dict[int, Log] = {}
+    for log, log_hashes in zip(first, hashes, strict=False):
+        log_of_hash.update(dict.fromkeys(log_hashes.tolist(), log))
+    for log, log_hashes in zip(second, hashes[len(first) :], strict=True):
+        common = next((hash_ for hash_ in log_hashes.tolist() if hash_ in log_of_hash), None)
         if common is not None:
-            return seen[common], log
+            return log_of_hash[common], log
     return None
 
 
 def _measured_rows(log: Log) -> np.ndarray:
     """Inputs and measurements of the rows in which something is measured."""
-    there = ~np.isnan(log.measurements[:-1]).all(axis=1)
-    return np.column_stack((log.inputs, log.measurements[:-1]))[there] + 0.0
+    measured = ~np.isnan(log.measurements[:-1]).all(axis=1)
+    return np.column_stack((log.inputs, log.measurements[:-1]))[measured] + 0.0
 
 
 def _hashes(numbers: np.ndarray, measured: np.ndarray, width: int) -> np.ndarray:
@@ -332,7 +332,7 @@ def _hashes(numbers: np.ndarray, measured: np.ndarray, width: int) -> np.ndarray
     if count < 1:
         return np.empty(0, np.uint64)
     total: np.ndarray = np.zeros(count, np.uint64)
-    for place in range(width):
-        total = total * FACTOR + (numbers[place : place + count] + np.uint64(1))
+    for offset in range(width):
+        total = total * FACTOR + (numbers[offset : offset + count] + np.uint64(1))
     changes = np.append(0, np.cumsum((np.diff(measured, axis=0) != 0).any(axis=1)))
     return np.unique(total[changes[width - 1 :] - changes[:count] >= width // 2])

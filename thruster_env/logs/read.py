@@ -31,8 +31,8 @@ from thruster_env.logs.grid import (
     at_own_stamps,
     follows,
     grid_of,
-    held,
     in_seconds,
+    mean_held,
     sampled,
 )
 from thruster_env.logs.log import FEWEST_STEPS, Log, stale_inputs
@@ -112,67 +112,75 @@ def read_log(
         ValueError: if a column is missing, or a value is wrong; it names file, line and column.
     """
     is_file = isinstance(path, (str, PathLike))
-    for what, given in (("columns", columns), ("clock offsets", clock_offset)):
-        if not isinstance(given, Mapping | None):
-            raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(given)}")
-    beside = _described(Path(path)) if is_file else Description()
-    said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt, stamps))
+    for what, mapping in (("columns", columns), ("clock offsets", clock_offset)):
+        if not isinstance(mapping, Mapping | None):
+            raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(mapping)}")
+    description_file = _described(Path(path)) if is_file else Description()
+    description = description_file.updated(Description(columns or {}, {}, clock_offset or {}, dt, stamps))
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None
     if form is not None:
-        asked = [text for text in said.columns.values() if isinstance(text, str)]
-        recorded = Recorded(path, form, asked, said.stamps)
-        table, found = recorded.table(recorded.columns(wanted, said.columns, said.units, said.dt is None))
+        asked = [text for text in description.columns.values() if isinstance(text, str)]
+        recorded = Recorded(path, form, asked, description.stamps)
+        table, column_of = recorded.table(
+            recorded.columns(wanted, description.columns, description.units, description.dt is None)
+        )
     else:
-        check_stamps(said.stamps, None, path if is_file else name)
+        check_stamps(description.stamps, None, path if is_file else name)
         table = read_table(path) if is_file else table_of(path, name)
-        found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
+        column_of = find_columns(
+            wanted, table.names, description.columns, description.units, table.file, description.dt is None
+        )
     file = table.file
-    of_file, start, taken = _grid(table, found.get(TIME), said.dt, file, grid)
+    of_file, start, assumption = _grid(table, column_of.get(TIME), description.dt, file, grid)
     dt = of_file.dt
-    offsets = _offsets(said.clock_offset, wanted, found, of_file, file)
+    offsets = _offsets(description.clock_offset, wanted, column_of, of_file, file)
     samples, source, parts = {}, {}, {}
     rows, dropped = np.zeros(len(of_file.times), bool), []
-    for one in wanted:
-        if one.key not in found:
+    for channel in wanted:
+        if channel.key not in column_of:
             continue
-        series, there = _series(table, found[one.key], one, of_file)
-        samples[one.key] = series
-        rows |= there
-        if len(series.values) < len(of_file.times) or of_file.irregular or one.key in offsets:
-            source[one.key] = series  # elsewhere the rows tell the same
-        offset = offsets.get(one.key, 0.0)
+        series, present = _series(table, column_of[channel.key], channel, of_file)
+        samples[channel.key] = series
+        rows |= present
+        if len(series.values) < len(of_file.times) or of_file.irregular or channel.key in offsets:
+            source[channel.key] = series  # elsewhere the rows tell the same
+        offset = offsets.get(channel.key, 0.0)
         if not grid:
             continue
-        if one.kind == INPUT:
-            parts[one.key] = held(series, dt, of_file.rows - 1, offset, one.quantity.angle)
+        if channel.kind == INPUT:
+            parts[channel.key] = mean_held(series, dt, of_file.rows - 1, offset, channel.quantity.angle)
         else:
-            parts[one.key] = sampled(series, dt, of_file.rows, offset, one.quantity.angle)
+            parts[channel.key] = sampled(series, dt, of_file.rows, offset, channel.quantity.angle)
             lost = len(series.values) - int((~np.isnan(sampled(series, dt, of_file.rows))).sum())
-            dropped += [(one.key, lost)] if lost else []
+            dropped += [(channel.key, lost)] if lost else []
     marks, last = None, of_file.rows - 1
     if not grid:
-        driving = [one.key for one in wanted if one.kind == INPUT]
+        driving = [channel.key for channel in wanted if channel.kind == INPUT]
         marks, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]), start)
         last = len(marks) - 1
 
     def those(kind: str, rows: int) -> np.ndarray:
-        some = [parts[one.key] for one in wanted if one.kind == kind]
-        return np.column_stack(some) if some else np.empty((rows, 0))
+        columns = [parts[channel.key] for channel in wanted if channel.kind == kind]
+        return np.column_stack(columns) if columns else np.empty((rows, 0))
 
     driven = {
-        one.key: samples[one.key]._replace(times=samples[one.key].times - offsets.get(one.key, 0.0))
-        for one in wanted
-        if one.kind == INPUT
+        channel.key: samples[channel.key]._replace(
+            times=samples[channel.key].times - offsets.get(channel.key, 0.0)
+        )
+        for channel in wanted
+        if channel.kind == INPUT
     }
     end = float(of_file.times[-1]) if marks is not None else of_file.dt * (of_file.rows - 1)
     remarks = (
-        *([Remark(CLOCK, "", taken)] if taken else []),
+        *([Remark(CLOCK, "", assumption)] if assumption else []),
         *table.remarks,
         *stale_inputs(driven, end, dt, start),
     )
     referred = {
-        one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
+        channel.key: channel.quantity
+        for channel in wanted
+        if channel.kind not in (INPUT, MEASUREMENT) and channel.key in parts
     }
     recording = _recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file)
     if last < FEWEST_STEPS:
@@ -208,28 +216,30 @@ def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...
     is_gap = apart > (MOST_HELD + 1) * usual
     gaps = tuple((int(numbers[i]) + 1, int(apart[i]) - 1) for i in np.flatnonzero(is_gap))
     holes = np.maximum(np.round(apart[~is_gap] / usual).astype(int) - 1, 0)
-    moved = grid.moved[grid.moved > TOLERANCE * grid.dt]
-    farthest = float(moved.max()) if len(moved) else 0.0
+    shifts = grid.moved[grid.moved > TOLERANCE * grid.dt]
+    farthest = float(shifts.max()) if len(shifts) else 0.0
     doubled = int((np.diff(grid.times) == 0).sum())
-    return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(moved), farthest, doubled, dropped)
+    return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(shifts), farthest, doubled, dropped)
 
 
 def _described(path: Path) -> Description:
     """What the TOML file beside a log says, nothing if there is none."""
-    beside = path.with_suffix(".toml")
-    if not beside.is_file():
+    description = path.with_suffix(".toml")
+    if not description.is_file():
         return Description()
-    content = read_toml(beside, "what is said of a log")
+    content = read_toml(description, "what is said of a log")
     unknown = sorted(set(content) - set(Description._fields))
     if unknown:
         raise ValueError(
-            f"keys beside a log must be among {', '.join(Description._fields)}, but {beside} has {unknown}"
+            f"keys beside a log must be among {', '.join(Description._fields)}, but {description} has {unknown}"
         )
     for key, kind in (("columns", str), ("units", str), ("clock_offset", float | int)):
         part = content.get(key, {})
         if not isinstance(part, dict) or not all(isinstance(value, kind) for value in part.values()):
             what = "texts" if kind is str else "seconds"
-            raise ValueError(f"{key} beside a log must map names to {what}, but {beside} has {short_repr(part)}")
+            raise ValueError(
+                f"{key} beside a log must map names to {what}, but {description} has {short_repr(part)}"
+            )
     return Description(**content)
 
 
@@ -252,47 +262,47 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
                 f"{file} has {listed(table.names)}"
             )
         return Grid(dt, count, dt * np.arange(count), False), 0.0, ""
-    stamps, taken = table.dates(column.header), ""
+    stamps, assumption = table.dates(column.header), ""
     if stamps is None:
         where = f"column {column.header!r} of {file}"
-        stamps, taken = in_seconds(table.numbers(column.header), column.unit, column.header, where)
+        stamps, assumption = in_seconds(table.numbers(column.header), column.unit, column.header, where)
     if np.isnan(stamps).any():
         row = int(np.argmax(np.isnan(stamps)))
         raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
     if count <= FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
-    own = stamps if table.clock is None else stamps[table.clock]
-    steps = np.diff(own)
+    clocked = stamps if table.clock is None else stamps[table.clock]
+    steps = np.diff(clocked)
     doubled = (steps == 0).sum() > MOST_DOUBLED * len(steps) or len(steps) - (steps == 0).sum() < FEWEST_STEPS
     back = np.flatnonzero(steps <= 0 if doubled else steps < 0)
     if len(back):
         row = int(back[0]) + 1
         raise ValueError(
-            f"times must increase from row to row, but {follows(own[row - 1], own[row])} in "
+            f"times must increase from row to row, but {follows(clocked[row - 1], clocked[row])} in "
             f"{table.place(row, column.header)}"
         )
-    count = (own[-1] - own[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
+    count = (clocked[-1] - clocked[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
         raise ValueError(
             f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
         )
-    found = grid_of(stamps, dt, table.clock)
+    fitted = grid_of(stamps, dt, table.clock)
     if not grid:
-        found = Grid(found.dt, found.rows, stamps - stamps[0], True)
-    return found, float(stamps[0]), taken
+        fitted = Grid(fitted.dt, fitted.rows, stamps - stamps[0], True)
+    return fitted, float(stamps[0]), assumption
 
 
 def _offsets(
-    given: Mapping[str, float], wanted: list[Wanted], found: Mapping, grid: Grid, file: str
+    offset_of: Mapping[str, float], wanted: list[Wanted], found: Mapping, grid: Grid, file: str
 ) -> dict[str, float]:
     offsets, length = {}, grid.dt * (grid.rows - 1)
-    for name, seconds in given.items():
-        one = find_wanted(name, wanted)
-        if one is None or one.key not in found:
-            known = ", ".join(one.quantity.symbol for one in wanted if one.key in found)
+    for name, seconds in offset_of.items():
+        channel = find_wanted(name, wanted)
+        if channel is None or channel.key not in found:
+            known = ", ".join(channel.quantity.symbol for channel in wanted if channel.key in found)
             raise ValueError(f"clock offsets must be of channels {known}, but got {short_repr(name)} ({file})")
-        offsets[one.key] = finite(f"the clock offset of {name}", seconds)
-        if abs(offsets[one.key]) >= length:  # nothing of the channel would be left
+        offsets[channel.key] = finite(f"the clock offset of {name}", seconds)
+        if abs(offsets[channel.key]) >= length:  # nothing of the channel would be left
             raise ValueError(
                 f"the clock offset of {name} must be shorter than the log, {length:g} s, but got {seconds:g} "
                 f"({file})"
@@ -300,21 +310,21 @@ def _offsets(
     return offsets
 
 
-def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> tuple[Series, np.ndarray]:
+def _series(table: Table, column: Column, wanted: Wanted, grid: Grid) -> tuple[Series, np.ndarray]:
     """The samples of a column in the model's unit, and in which rows they are.
 
     Raises:
         ValueError: for a late input, or a sensor that never changes.
     """
     where = f"column {column.header!r} of {table.file}"
-    values = converted(table.numbers(column.header), column.unit, one.quantity.unit, where)
-    there = ~np.isnan(values)
-    if not there.any() and one.kind in (INPUT, MEASUREMENT):
+    values = converted(table.numbers(column.header), column.unit, wanted.quantity.unit, where)
+    present = ~np.isnan(values)
+    if not present.any() and wanted.kind in (INPUT, MEASUREMENT):
         raise ValueError(f"a column must hold numbers, but {where} has none")
-    if one.kind == INPUT and not there[0]:
+    if wanted.kind == INPUT and not present[0]:
         raise ValueError(
             f"an input must be known from the first row on, but it is missing in {table.place(0, column.header)}"
         )
-    if one.kind == MEASUREMENT and there.sum() > 1 and np.ptp(values[there]) == 0.0:
-        raise ValueError(f"a measurement must vary, but {where} is {values[there][0]:.10g} in all rows")
-    return Series(grid.times[there], values[there]), there
+    if wanted.kind == MEASUREMENT and present.sum() > 1 and np.ptp(values[present]) == 0.0:
+        raise ValueError(f"a measurement must vary, but {where} is {values[present][0]:.10g} in all rows")
+    return Series(grid.times[present], values[present]), present

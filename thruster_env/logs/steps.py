@@ -58,23 +58,27 @@ def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepMode
     Raises:
         ValueError: for a model of one sample time, or of another one than the logs.
     """
-    place, parts = sample_time_place(model, "a filter on a log's own stamps")
-    own = float(model.constants[place]) * parts
-    if dt is not None and not same_dt(own, dt):
-        raise ValueError(f"the dt of logs on their own stamps must be the model's {own:g} s, but is {dt:g} s")
-    given: dict[str, Any] = {name: getattr(model, name) for name in StateSpaceModel.__dataclass_fields__}
+    index, parts = sample_time_place(model, "a filter on a log's own stamps")
+    model_dt = float(model.constants[index]) * parts
+    if dt is not None and not same_dt(model_dt, dt):
+        raise ValueError(f"the dt of logs on their own stamps must be the model's {model_dt:g} s, but is {dt:g} s")
+    fields: dict[str, Any] = {name: getattr(model, name) for name in StateSpaceModel.__dataclass_fields__}
     form, count, inputs = type(model.constants), len(model.constants), model.inputs
-    given["transition"] = with_ratio(model.transition, form, count, place, inputs)
+    fields["transition"] = with_ratio(model.transition, form, count, index, inputs)
     slopes = model.transition_jacobian
     if slopes is not None:
         exact = by_complex_step(slopes)  # which is found anew
-        given["transition_jacobian"] = None if exact else with_ratio(slopes, form, count, place, inputs)
+        fields["transition_jacobian"] = None if exact else with_ratio(slopes, form, count, index, inputs)
     if model.operating_input is not None:
-        given["operating_input"] = np.append(model.operating_input, 1.0)
-    given |= {"inputs": inputs + 1, "input_quantities": (*model.input_quantities, RATIO), "operating_points": None}
-    found = AnyStepModel(**given)
-    object.__setattr__(found, "plain", model)
-    return found
+        fields["operating_input"] = np.append(model.operating_input, 1.0)
+    fields |= {
+        "inputs": inputs + 1,
+        "input_quantities": (*model.input_quantities, RATIO),
+        "operating_points": None,
+    }
+    any_step = AnyStepModel(**fields)
+    object.__setattr__(any_step, "plain", model)
+    return any_step
 
 
 def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
@@ -83,9 +87,9 @@ def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
 
 
 @makes_functions
-def with_ratio(function: Callable, form: type, count: int, place: int, inputs: int) -> Callable:
+def with_ratio(function: Callable, form: type, count: int, index: int, inputs: int) -> Callable:
     """`function(x, u, c)` with the constant at a place times u[inputs], of the other inputs."""
-    constants = (f"c[{i}] * u[{inputs}]" if i == place else f"c[{i}]" for i in range(count))
+    constants = (f"c[{i}] * u[{inputs}]" if i == index else f"c[{i}]" for i in range(count))
     names: dict[str, Any] = {"function": inlined(function), "form": form}
     return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
 
@@ -94,9 +98,9 @@ def as_rows(log: Log) -> Log:
     """A log on its own stamps as one of rows with step ratios; true states and other references are left out."""
     inputs, measurements = in_steps(log)
     quantities = (*log.input_quantities, RATIO)
-    given: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
-    given |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
-    return dataclasses.replace(log, **given)
+    fields: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
+    fields |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
+    return dataclasses.replace(log, **fields)
 
 
 def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +110,7 @@ def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
     is no measurement between them.
     """
     lengths = np.diff(log.times)
-    counts = np.array([count_steps(one, log.dt, log.resolution) for one in lengths.tolist()], dtype=int)
+    counts = np.array([count_steps(length, log.dt, log.resolution) for length in lengths.tolist()], dtype=int)
     ratios = np.repeat(lengths / counts / log.dt, counts)
     measurements = np.full((len(ratios) + 1, log.measurements.shape[1]), np.nan)
     measurements[np.concatenate([[0], np.cumsum(counts)])] = log.measurements

@@ -76,11 +76,11 @@ class Table:
                     f"columns must hold numbers, but column {column!r} of {self.file} holds {cells.dtype}"
                 )
         if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU":
-            found = cells.astype(np.float64)
+            numbers = cells.astype(np.float64)
         else:
             texts = _texts(cells)
             try:
-                found = np.array(texts, dtype=np.float64)
+                numbers = np.array(texts, dtype=np.float64)
                 if not _is_written("".join(texts)):
                     raise ValueError
             except ValueError:
@@ -89,10 +89,10 @@ class Table:
                 raise ValueError(
                     f"{rule}, but got {short_repr(cells[row])} in {self.place(row, column)}"
                 ) from None
-        if np.isinf(found).any():
-            row = int(np.argmax(np.isinf(found)))
-            raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
-        return found
+        if np.isinf(numbers).any():
+            row = int(np.argmax(np.isinf(numbers)))
+            raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.place(row, column)}")
+        return numbers
 
     def dates(self, column: str) -> np.ndarray | None:
         """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates."""
@@ -105,15 +105,15 @@ class Table:
         if all(map(_is_number, texts)):
             return None
         try:
-            found = seconds_of(texts)
+            seconds = seconds_of(texts)
         except ValueError as error:
             raise ValueError(f"{error} in column {column!r} of {self.file}") from None
-        if found is None:
+        if seconds is None:
             return None
         for row, text in enumerate(texts):
-            if text != MISSING_TEXT and np.isnan(found[row]):
+            if text != MISSING_TEXT and np.isnan(seconds[row]):
                 raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.place(row, column)}")
-        return found
+        return seconds
 
 
 def _texts(cells: Sequence | np.ndarray) -> list[str]:
@@ -196,11 +196,11 @@ def _read_csv(path: Path) -> Table:
 
 def _is_shortest(cells: Sequence[str]) -> bool:
     """Whether the last of some numbers has the fewest digits, behind the point where there are points."""
-    some = [cell.lstrip("+-") for cell in cells]
-    if any("." in cell for cell in some):
-        some = [cell.partition(".")[2] for cell in some]
-    *others, last = map(len, some)
-    return last < min(others, default=0)
+    texts = [cell.lstrip("+-") for cell in cells]
+    if any("." in cell for cell in texts):
+        texts = [cell.partition(".")[2] for cell in texts]
+    *lengths, last = map(len, texts)
+    return last < min(lengths, default=0)
 
 
 def _check_header(header: Sequence[str], line: int, path: Path) -> None:
@@ -208,12 +208,12 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
         raise ValueError(
             f"the first line must name the columns, but line {line} of {path} has numbers: {short_repr(header)}"
         )
-    seen = set()
+    names = set()
     for name in header:
-        if name and name in seen:
+        if name and name in names:
             rule = "names of columns must differ from one another"
             raise ValueError(f"{rule}, but line {line} of {path} has {short_repr(name)} twice")
-        seen.add(name)
+        names.add(name)
 
 
 def _read_parquet(path: Path) -> Table:
@@ -246,21 +246,21 @@ def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
         (count,) = struct.unpack_from("<H", file.read(ZIP_END), ZIP_COUNT)
         if count not in (len(archive.infolist()), 2**16 - 1):  # the package goes by the sizes alone
             raise ValueError(f"it says that it has {count} arrays, but lists {len(archive.infolist())}")
-        for one in archive.infolist():
-            with archive.open(one) as member:
+        for entry in archive.infolist():
+            with archive.open(entry) as member:
                 version = np.lib.format.read_magic(member)
                 read_header = np.lib.format.read_array_header_1_0
                 read_header = np.lib.format.read_array_header_2_0 if version == (2, 0) else read_header
                 shape, _, dtype = read_header(member)
                 total += math.prod(shape) * max(dtype.itemsize, 8)
                 check_bytes(total, "what an npz file holds", path)
-                if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > one.file_size:
-                    raise ValueError(f"{one.filename!r} ends within its array")
-            with archive.open(one) as member:
+                if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > entry.file_size:
+                    raise ValueError(f"{entry.filename!r} ends within its array")
+            with archive.open(entry) as member:
                 values = np.lib.format.read_array(member, allow_pickle=False)
                 if member.read(1):  # of another shape or type than is stated; the check sum is at the end
-                    raise ValueError(f"{one.filename!r} holds more than its array")
-                yield one.filename.removesuffix(".npy"), values
+                    raise ValueError(f"{entry.filename!r} holds more than its array")
+                yield entry.filename.removesuffix(".npy"), values
 
 
 @contextmanager
@@ -277,7 +277,7 @@ def _damaged(rule: str, path: Path) -> Iterator[None]:
         raise ValueError(f"{rule.format(path=path)}: {why}") from None
 
 
-def table_of(given: Any, name: str) -> Table:
+def table_of(columns: Any, name: str) -> Table:
     """A table that is in memory: a mapping from headers to arrays (rows,), or a pandas.DataFrame.
 
     An index of dates or of time differences is a column of seconds, and one that has a name is a column.
@@ -285,12 +285,12 @@ def table_of(given: Any, name: str) -> Table:
     Raises:
         ValueError: if it is neither, or its columns are not of equal length.
     """
-    if hasattr(given, "columns") and hasattr(given, "index"):
-        given = _with_index(given)
-    if not isinstance(given, Mapping) or not all(isinstance(header, str) for header in given):
+    if hasattr(columns, "columns") and hasattr(columns, "index"):
+        columns = _with_index(columns)
+    if not isinstance(columns, Mapping) or not all(isinstance(header, str) for header in columns):
         rule = "a log must be the path of a file, a pandas.DataFrame, a mapping from headers to arrays, or a Log"
-        raise ValueError(f"{rule}, but got {short_repr(given)}")
-    return _of_arrays(name, {header: _unmasked(values) for header, values in given.items()})
+        raise ValueError(f"{rule}, but got {short_repr(columns)}")
+    return _of_arrays(name, {header: _unmasked(values) for header, values in columns.items()})
 
 
 def _unmasked(values: Any) -> np.ndarray:
@@ -310,12 +310,14 @@ def _with_index(frame: Any) -> dict:
 
 def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
     rule = "a log must have columns of equal length with some rows"
-    first = next((name for name, one in cells.items() if one.ndim == 1 and len(one)), None)
+    first = next((name for name, column in cells.items() if column.ndim == 1 and len(column)), None)
     if first is None:
         raise ValueError(f"{rule}, but {path} has {listed(cells) or 'none'}")
-    for name, one in cells.items():
-        if one.shape != cells[first].shape:
-            sizes = f"{short_repr(name)} of shape {one.shape} beside {short_repr(first)} of {cells[first].shape}"
+    for name, column in cells.items():
+        if column.shape != cells[first].shape:
+            sizes = (
+                f"{short_repr(name)} of shape {column.shape} beside {short_repr(first)} of {cells[first].shape}"
+            )
             raise ValueError(f"{rule}, but {path} has {sizes}: leave one out")
     return Table(str(path), cells, range(1, len(cells[first]) + 1), "row")
 

@@ -40,11 +40,11 @@ DIGITS = f"%.{LEAST}g"
 
 def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, ...] = SUFFIXES) -> None:
     """Raise ValueError unless a file's ending is known and the package that writes it is installed."""
-    found = Path(path).suffix
-    if found not in suffixes:
+    ending = Path(path).suffix
+    if ending not in suffixes:
         known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         raise ValueError(f"{option} must end in {known}, but got {str(path)!r}")
-    if found == ".parquet":
+    if ending == ".parquet":
         _pyarrow()
 
 
@@ -77,7 +77,7 @@ def write_columns(
         ValueError: for another ending, if the file cannot be written, or for an existing log.
     """
     check_suffix(path, "a file of columns")
-    names, values = list(columns), [as_floats(one) for one in columns.values()]
+    names, values = list(columns), [as_floats(column) for column in columns.values()]
     content = _content(Path(path).suffix, dict(zip(names, values, strict=True)), digits)
     _check_over(Path(path), content, names if again else None)
     write_whole(path, content)
@@ -90,11 +90,11 @@ def _content(suffix: str, columns: dict[str, Any], digits: str | None) -> bytes:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerow(columns)
         if digits == EXACT:
-            rows = zip(*(one.tolist() for one in columns.values()), strict=True)
+            rows = zip(*(column.tolist() for column in columns.values()), strict=True)
             text.writelines(",".join(map(repr, row)) + "\n" for row in rows)
         else:
             table = np.column_stack(list(columns.values()))
-            kinds = [_digits(*one) for one in columns.items()] if digits is None else digits
+            kinds = [_digits(*column) for column in columns.items()] if digits is None else digits
             np.savetxt(text, table, delimiter=",", fmt=kinds)
         stream.write(text.getvalue().encode())
     elif suffix == ".npz":
@@ -121,8 +121,8 @@ def _check_over(path: Path, content: bytes, names: list[str] | None) -> None:
     """Raise ValueError for a file that is there, unless it is empty, the same, or has columns of these names."""
     if not path.is_file() or path.stat().st_size == 0:
         return
-    there = path.read_bytes() if path.stat().st_size == len(content) else b""
-    if there == content or (names is not None and _names_in(path) == names):
+    existing = path.read_bytes() if path.stat().st_size == len(content) else b""
+    if existing == content or (names is not None and _names_in(path) == names):
         return
     raise ValueError(f"a log must be written to a new file, because logs are never overwritten, but {path} exists")
 
@@ -141,21 +141,21 @@ def write_log(path: str | Path, log: Log) -> None:
     The last row has no input, as nothing is known of what acts after it.
     """
     columns = {"time_s": log.start + log.times}
-    for one, values in zip(log.input_quantities, log.inputs.T, strict=True):
-        columns[header_of(one, columns)] = np.append(values, np.nan)
-    for one, values in zip(log.measured, log.measurements.T, strict=True):
-        columns[header_of(one, columns)] = values
+    for quantity, values in zip(log.input_quantities, log.inputs.T, strict=True):
+        columns[header_of(quantity, columns)] = np.append(values, np.nan)
+    for quantity, values in zip(log.measured, log.measurements.T, strict=True):
+        columns[header_of(quantity, columns)] = values
     for key, values in log.references.items():
         columns[header_of(log.referred[key], columns)] = values
     write_columns(path, columns, EXACT)
 
 
-def header_of(quantity: Quantity, taken=()) -> str:
+def header_of(quantity: Quantity, used=()) -> str:
     """The header of a quantity's column, "measured_thrust_N": its name, or symbol if that is taken, and unit."""
     unit = suffix(quantity.unit)
     for text in (quantity.name, quantity.symbol):
         header = f"{plain(text)}_{unit}" if unit else plain(text)
-        if header not in taken:
+        if header not in used:
             return header
     raise ValueError(f"columns must have different headers, but {header} is that of two")
 
@@ -193,9 +193,9 @@ def draw_findings(log: Log) -> Figure:
 
     times = log.start + log.times
     inputs = np.vstack((log.inputs, np.full((1, log.inputs.shape[1]), np.nan)))
-    panels = [("", one, inputs[:, place]) for place, one in enumerate(log.input_quantities)]
-    for place, one in enumerate(log.measured):
-        panels.append((f"measurement:{one.symbol}", one, log.measurements[:, place]))
+    panels = [("", quantity, inputs[:, column]) for column, quantity in enumerate(log.input_quantities)]
+    for column, output in enumerate(log.measured):
+        panels.append((f"measurement:{output.symbol}", output, log.measurements[:, column]))
     panels = panels[-MOST_PANELS:]
     figure = new_figure((WIDTH, PANEL * len(panels) + ROOM))
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -203,8 +203,8 @@ def draw_findings(log: Log) -> Figure:
     named: dict[str, object] = {}
     for axis, (channel, quantity, values) in zip(axes, panels, strict=True):
         if channel:
-            there = ~np.isnan(values)
-            axis.plot(*thinned(times[there], values[there]), ".", color=BLUE, markersize=2.5, label="sample")
+            present = ~np.isnan(values)
+            axis.plot(*thinned(times[present], values[present]), ".", color=BLUE, markersize=2.5, label="sample")
         else:
             axis.step(*thinned(times, values), where="post", color=DARK, linewidth=0.9, label="input")
         for finding in log.findings:

@@ -15,7 +15,7 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats, short_repr
 from thruster_env.core.derivatives import by_complex_step
-from thruster_env.core.modules import said
+from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.graphs.python_floats import with_floats
 
@@ -107,7 +107,7 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                 result = function(*_arguments(arguments, model, point))
         except ArithmeticError as error:  # machine code has infinity there
             if at_mean and slopes:
-                _refuse_slopes(name, model, arguments, said(error))
+                _refuse_slopes(name, model, arguments, error_line(error))
             continue
         except Exception as error:
             if str(error).startswith("math "):  # "math domain error", where machine code has NaN
@@ -118,7 +118,7 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             where = _place(function)
-            raise ValueError(f"{name}{where} must work for {sizes}, but raised {said(error)}") from error
+            raise ValueError(f"{name}{where} must work for {sizes}, but raised {error_line(error)}") from error
         found = _shape(result)
         if found != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")

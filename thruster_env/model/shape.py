@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core import matrices
-from thruster_env.core.angles import kept
+from thruster_env.core.angles import with_wrapped_angles
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.equal_functions import first_equal
@@ -46,7 +46,7 @@ class Functions(NamedTuple):
 
 def innovation_of(shape: Shape, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], angles wrapped, zero in channels that are NaN in z."""
-    return kept(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
+    return with_wrapped_angles(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
 
 
 def constants_form(constants: tuple) -> type | int:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from thruster_env.core.progress import told
+from thruster_env.core.progress import with_progress
 from tuning.evaluation.baselines import (
     BY_IMPORTANCE,
     GIVEN,
@@ -123,7 +123,7 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         "noise": known.get(NOISE),
     }
     done: list[tuple[Choice, Evaluation]] = []
-    for one in told("filters on held-out seeds", list(choices.values())):
+    for one in with_progress("filters on held-out seeds", list(choices.values())):
         if one is not None and _found(one, done) is None:  # baselines may be the same filter
             done.append((one, evaluate(one.filter(scenario), data, scenario.scale)))
     found = {role: None if one is None else _found(one, done) for role, one in choices.items()}

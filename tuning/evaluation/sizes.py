@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.posterior import ALL_UP_TO
-from thruster_env.core.progress import told
+from thruster_env.core.progress import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
@@ -92,7 +92,7 @@ def few_seeds_first(
         pairs = zip(plan.scenarios, data, strict=True)
         return [evaluate(choice.with_size(n).filter(one), some, one.scale) for one, some in pairs]
 
-    early = [on(few, n) for n in told("N", sizes)]
+    early = [on(few, n) for n in with_progress("N", sizes)]
 
     def on_all(i: int) -> list[Evaluation]:
         return early[i] if all(len(one.seeds) <= FEW for one in fresh) else on(fresh, sizes[i])
@@ -113,9 +113,9 @@ def few_seeds_first(
         for i in set(best_ones()):
             train(i)
     best = best_ones()
-    whole = {i: on_all(i) for i in told("best N on all seeds", sorted(set(best)))}
+    whole = {i: on_all(i) for i in with_progress("best N on all seeds", sorted(set(best)))}
     hopeful = [i for i in range(len(sizes)) if not _surely_worse(early[i], [early[b] for b in best])]
-    for i in told("smallest N on all seeds", hopeful):
+    for i in with_progress("smallest N on all seeds", hopeful):
         if i not in whole:
             train(i)
             whole[i] = on_all(i)
@@ -231,7 +231,9 @@ def left_out(rows: Sequence[SizeRow], kept: int) -> list[int]:
 
 
 def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
-    return [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in told("N", sizes)]
+    return [
+        evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in with_progress("N", sizes)
+    ]
 
 
 def _outside(choice: Choice, plan: Plan, training: Sequence[Data]) -> float:

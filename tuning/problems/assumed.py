@@ -16,7 +16,7 @@ import numpy as np
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, positive, short_repr
-from thruster_env.core.modules import said
+from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
@@ -201,7 +201,7 @@ class AssumedProblem(Problem):
         except Exception as error:
             wanted = ", ".join(given) or "no arguments"
             raise ValueError(
-                f"the model of problem {self.name} must be made of {wanted}, but raised {said(error)}"
+                f"the model of problem {self.name} must be made of {wanted}, but raised {error_line(error)}"
             ) from error
         if not isinstance(model, StateSpaceModel):
             raise ValueError(

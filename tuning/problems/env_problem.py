@@ -11,7 +11,7 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats, covariance, short_repr
 from thruster_env.core.global_generators import GlobalGenerators
-from thruster_env.core.modules import said
+from thruster_env.core.modules import error_line
 from thruster_env.core.streams import (
     ACTION_SPACE,
     ADDED_NOISE,
@@ -270,7 +270,7 @@ class EnvProblem(AssumedProblem):
             made = make(**{**self.env_arguments, **(arguments or {})})
         except (gym.error.Error, TypeError, ImportError) as error:
             raise ValueError(
-                f"it must be possible to make the env of problem {name}, but {said(error)}"
+                f"it must be possible to make the env of problem {name}, but {error_line(error)}"
             ) from error
         if not isinstance(made, gym.Env):
             raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {short_repr(made)}")

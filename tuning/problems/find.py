@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from thruster_env.core.checks import FEW, any_case, meant, short_repr
-from thruster_env.core.modules import is_code, object_named, said
+from thruster_env.core.modules import error_line, is_code, object_named
 from tuning.problems.augmented import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
@@ -97,7 +97,7 @@ def _from_module(name: str) -> Problem:
             found = found()
         except Exception as error:
             raise ValueError(
-                f"a function must return a problem without arguments, but {name!r} raised {said(error)}"
+                f"a function must return a problem without arguments, but {name!r} raised {error_line(error)}"
             ) from error
     return named(checked_problem(found, name), name)
 

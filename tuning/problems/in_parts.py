@@ -9,7 +9,7 @@ import numpy as np
 from filters.engine.batch import Estimates, run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.core.progress import told
+from thruster_env.core.progress import with_progress
 from thruster_env.core.threads import cores
 from thruster_env.model.shape import LANES
 from tuning.problems.data import Data, padded
@@ -23,7 +23,7 @@ def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Esti
     The estimates of a part take at most about 256 MB, or are those of as many runs as there are cores.
     """
     parts = parts_of(filter_, data)
-    for first, last in told("runs", parts, [last - first for first, last in parts]):
+    for first, last in with_progress("runs", parts, [last - first for first, last in parts]):
         some = data.slice(first, last)
         yield some, estimates_on(filter_, some)
 

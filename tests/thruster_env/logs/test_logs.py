@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from thruster_env.logs.grid import Series, grid_of, held, sampled
+from thruster_env.logs.grid import Series, grid_of, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.read import read_log
 from thruster_env.model.affine import affine_model
@@ -71,8 +71,8 @@ def test_irregular_stamps_go_to_the_nearest_grid_time():
 
 def test_an_input_off_the_grid_is_the_mean_of_what_is_held():
     steps = Series(np.array([0.0, 0.25, 0.9]), np.array([1.0, 3.0, -1.0]))
-    np.testing.assert_allclose(held(steps, 0.1, 10), [1, 1, 2, 3, 3, 3, 3, 3, 3, -1], rtol=1e-12)
-    np.testing.assert_allclose(held(steps, 0.1, 4, offset=-0.5), [1, 1, 1, 1])  # before the first: its value
+    np.testing.assert_allclose(mean_held(steps, 0.1, 10), [1, 1, 2, 3, 3, 3, 3, 3, 3, -1], rtol=1e-12)
+    np.testing.assert_allclose(mean_held(steps, 0.1, 4, offset=-0.5), [1, 1, 1, 1])  # before the first: its value
 
 
 def test_a_clock_offset_moves_a_channel_continuously_and_back():

@@ -11,7 +11,7 @@ from filters.logs.figure import draw_log
 from thruster_env.core.angles import on_one_branch, with_breaks, wrapped
 from thruster_env.core.plots import MOST_POINTS, thinned
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.grid import Series, held, sampled
+from thruster_env.logs.grid import Series, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.read import read_log
 from tuning.identification.validation import validation_of
@@ -90,11 +90,11 @@ def test_samples_and_inputs_between_two_ends_are_at_the_cut():
     found = sampled(series, 0.1, 4, 0.01, True)
     np.testing.assert_allclose(wrapped(found[1] - 3.0), 0.6 * gap, atol=1e-12)
     assert abs(sampled(series, 0.1, 4, 0.01)[1]) < 1.0  # of plain numbers it is their average
-    mean = held(series, 0.1, 3, 0.0, True)
+    mean = mean_held(series, 0.1, 3, 0.0, True)
     np.testing.assert_allclose(wrapped(mean[1] - 3.0), 0.5 * gap, atol=1e-12)
-    np.testing.assert_allclose(held(series, 0.1, 3)[1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(mean_held(series, 0.1, 3)[1], 0.0, atol=1e-12)
     whole = Series(np.array([0.0, 0.1, 0.2]), np.array([3.0, -3.0, 3.1]))
-    np.testing.assert_array_equal(held(whole, 0.1, 3, 0.0, True), whole.values)
+    np.testing.assert_array_equal(mean_held(whole, 0.1, 3, 0.0, True), whole.values)
 
 
 def test_a_scale_and_a_rule_of_thumb_are_those_of_the_same_swaying_elsewhere():

@@ -97,23 +97,23 @@ def check_topics(read: Counts | Mapping[str, int], stated: Mapping[str, int], kn
         path: of the bag, for messages.
     """
     for topic, count in stated.items():
-        own = read.get(topic, 0)  # type: ignore[call-overload]
-        if own != count and (topic in read or topic not in known):
-            raise _lost(repr(topic), own, count, "metadata.yaml", path)
+        count_read = read.get(topic, 0)  # type: ignore[call-overload]
+        if count_read != count and (topic in read or topic not in known):
+            raise _lost(repr(topic), count_read, count, "metadata.yaml", path)
 
 
 def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
     size = path.stat().st_size
     alone, indexed, statistics, described = Counter[int](), Counter[int](), None, None
-    seen: Counter[int] = Counter()
+    records: Counter[int] = Counter()
     channels: dict[int, bytes] = {}
-    place = len(MCAP)
+    offset = len(MCAP)
     while True:
-        file.seek(place)
+        file.seek(offset)
         kind, count = struct.unpack("<BQ", _exact(file, 9))
-        if place + 9 + count > size:
+        if offset + 9 + count > size:
             raise ValueError("it ends within a record")
-        seen[kind] += 1
+        records[kind] += 1
         if kind == MESSAGE:
             alone[struct.unpack("<H", _exact(file, 2))[0]] += 1
         elif kind == CHUNK:
@@ -129,25 +129,25 @@ def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
             content = _exact(file, count)
             statistics, described = _statistics(content), struct.unpack_from("<HI", content, 8)
         elif kind == DATA_END:
-            _check_sum(file, 0, place, struct.unpack("<I", _exact(file, 4))[0], "data")
+            _check_sum(file, 0, offset, struct.unpack("<I", _exact(file, 4))[0], "data")
         elif kind == FOOTER:
             summary, _, check = struct.unpack("<QQI", _exact(file, 20))
             if summary:
-                _check_sum(file, summary, place + 25, check, "summary")
+                _check_sum(file, summary, offset + 25, check, "summary")
             break
-        place += 9 + count
-    schemas, named = described or (seen[SCHEMA], seen[CHANNEL])
-    if seen[CHUNK] and (seen[SCHEMA] < min(schemas, 1) or seen[CHANNEL] < named):
+        offset += 9 + count
+    schemas, named = described or (records[SCHEMA], records[CHANNEL])
+    if records[CHUNK] and (records[SCHEMA] < min(schemas, 1) or records[CHANNEL] < named):
         rule = "an MCAP file must have its schemas and channels in its summary"
         raise Refused(f"{rule}, but {path} has them in its chunks alone: mcap recover writes one that is read")
-    if seen[CHUNK_INDEX] and seen[CHUNK_INDEX] != seen[CHUNK]:
-        raise ValueError(f"it has {seen[CHUNK]} chunks, but an index of {seen[CHUNK_INDEX]}")
-    if seen[CHUNK] and seen[CHUNK_INDEX] and not seen[INDEX] and statistics != {}:
+    if records[CHUNK_INDEX] and records[CHUNK_INDEX] != records[CHUNK]:
+        raise ValueError(f"it has {records[CHUNK]} chunks, but an index of {records[CHUNK_INDEX]}")
+    if records[CHUNK] and records[CHUNK_INDEX] and not records[INDEX] and statistics != {}:
         raise ValueError("its chunks have no index of their messages")
-    found: dict[str, Counts] = {} if statistics is None else {"statistics": statistics}
-    if seen[INDEX] or not seen[CHUNK]:
-        found["records"] = indexed + alone
-    return found
+    counts: dict[str, Counts] = {} if statistics is None else {"statistics": statistics}
+    if records[INDEX] or not records[CHUNK]:
+        counts["records"] = indexed + alone
+    return counts
 
 
 def _statistics(content: bytes) -> dict[int, int]:
@@ -166,22 +166,22 @@ def _check_sum(file: BinaryIO, begin: int, end: int, check: int, what: str) -> N
     if not check:
         return
     file.seek(begin)
-    found, left = 0, end - begin
+    computed, left = 0, end - begin
     while left > 0 and (piece := file.read(min(left, PIECE))):
-        found, left = zlib.crc32(piece, found), left - len(piece)
-    if found != check:
+        computed, left = zlib.crc32(piece, computed), left - len(piece)
+    if computed != check:
         raise ValueError(f"the check sum of its {what} is wrong")
 
 
 def _of_ros1(file: BinaryIO, path: Path) -> dict[str, Counts]:
-    size, place = path.stat().st_size, file.seek(len(ROS1) + 1)
+    size, offset = path.stat().st_size, file.seek(len(ROS1) + 1)
     index, chunks = Counter[int](), Counter[int]()
-    seen: Counter[int] = Counter()
+    records: Counter[int] = Counter()
     stated, begin = (0, 0), 0
-    while place < size:
+    while offset < size:
         header = _fields(_exact(file, struct.unpack("<I", _exact(file, 4))[0]))
         (count,) = struct.unpack("<I", _exact(file, 4))
-        place = file.tell()
+        offset = file.tell()
         kind = header[b"op"][0]
         if kind == ROS1_HEADER:
             begin = int.from_bytes(header[b"index_pos"], "little")
@@ -193,28 +193,28 @@ def _of_ros1(file: BinaryIO, path: Path) -> dict[str, Counts]:
         elif kind == ROS1_CHUNK_INFO:
             for connection, messages in struct.iter_unpack("<II", _exact(file, count)):
                 chunks[connection] += messages
-        seen[kind] += kind != ROS1_CONNECTION or place > begin  # connections stand in chunks, too
-        place = file.seek(place + count)
-    if place != size:
+        records[kind] += kind != ROS1_CONNECTION or offset > begin  # connections stand in chunks, too
+        offset = file.seek(offset + count)
+    if offset != size:
         raise ValueError("it ends within a record")
-    found = seen[ROS1_CONNECTION], seen[ROS1_CHUNK]
-    if found != stated or seen[ROS1_CHUNK] != seen[ROS1_CHUNK_INFO]:
+    counted = records[ROS1_CONNECTION], records[ROS1_CHUNK]
+    if counted != stated or records[ROS1_CHUNK] != records[ROS1_CHUNK_INFO]:
         raise ValueError(
-            f"it has {found[0]} connections and {found[1]} chunks, but says {stated[0]} and {stated[1]}, and "
-            f"describes {seen[ROS1_CHUNK_INFO]} chunks"
+            f"it has {counted[0]} connections and {counted[1]} chunks, but says {stated[0]} and {stated[1]}, and "
+            f"describes {records[ROS1_CHUNK_INFO]} chunks"
         )
     return {"index": index, "index of chunks": chunks}
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
     """The fields of a record's header."""
-    found, place = {}, 0
-    while place < len(header):
-        (count,) = struct.unpack_from("<I", header, place)
-        name, _, value = header[place + 4 : place + 4 + count].partition(b"=")
-        found[name] = value
-        place += 4 + count
-    return found
+    fields, offset = {}, 0
+    while offset < len(header):
+        (count,) = struct.unpack_from("<I", header, offset)
+        name, _, value = header[offset + 4 : offset + 4 + count].partition(b"=")
+        fields[name] = value
+        offset += 4 + count
+    return fields
 
 
 def _number(header: Mapping[bytes, bytes], name: bytes) -> int:
@@ -302,12 +302,12 @@ def files_of(path: Path, kind: str) -> Iterator[Bag]:
     if mode in ("file", "message") and content["compression_format"] != "zstd":
         raise ValueError(f"it is packed by {content['compression_format']!r}")
     counts: dict[str, int] = {}
-    for one in content["topics_with_message_count"]:
-        name = one["topic_metadata"]["name"]
-        counts[name] = counts.get(name, 0) + one["message_count"]
+    for topic in content["topics_with_message_count"]:
+        name = topic["topic_metadata"]["name"]
+        counts[name] = counts.get(name, 0) + topic["message_count"]
     begin = content["starting_time"]["nanoseconds_since_epoch"] if content["message_count"] else None
-    files = tuple(path / PurePath(one).name for one in content["relative_file_paths"])
-    missing = [one.name for one in files if not one.is_file()]
+    files = tuple(path / PurePath(name).name for name in content["relative_file_paths"])
+    missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise ValueError(f"{', '.join(missing)} is not there")
     with TemporaryDirectory() as folder:
@@ -336,15 +336,15 @@ def unpacker(kind: str, path: Path) -> Any:
 
 def _unpacked(files: tuple[Path, ...], folder: Path, path: Path, kind: str) -> tuple[Path, ...]:
     """Files unpacked into a folder, as far as they are at most MOST_BYTES in all."""
-    zstd, total, found = unpacker(kind, path), 0, []
+    zstd, total, unpacked = unpacker(kind, path), 0, []
     for file in files:
-        found.append(folder / file.stem)
+        unpacked.append(folder / file.stem)
         with file.open("rb") as packed:
             stated = zstd.get_frame_info(packed.read(18)).decompressed_size  # of bytes that may hold its header
         check_bytes(total + (stated or 0), "what the files of a bag unpack to", path)
-        with zstd.open(file, "rb") as packed, found[-1].open("wb") as target:
+        with zstd.open(file, "rb") as packed, unpacked[-1].open("wb") as target:
             while piece := packed.read(min(PIECE, topics.MOST_BYTES)):
                 total += len(piece)
                 check_bytes(total, "what the files of a bag unpack to", path)
                 target.write(piece)
-    return tuple(found)
+    return tuple(unpacked)

@@ -108,14 +108,18 @@ class Contents:
         """Read the messages of a file; ValueError unless it has as many as it says."""
         stated = counts_of(file)
         with self._room.Reader(file) as reader:
-            names = {one.id: one.topic for one in reader.connections}
+            names = {connection.id: connection.topic for connection in reader.connections}
             if len(names) < len(reader.connections):
                 raise ValueError("it has two connections of one number")
             decoders = dict(self._decoders(reader.connections))
-            some = [one for one in reader.connections if one.id in decoders and decoders[one.id].leaves]
-            rows = Counter({one.id: 0 for one in some})
+            chosen = [
+                connection
+                for connection in reader.connections
+                if connection.id in decoders and decoders[connection.id].leaves
+            ]
+            rows = Counter({connection.id: 0 for connection in chosen})
             unpack = unpacker(KIND, self.path).decompress if is_packed else bytes
-            for connection, received, data in reader.messages(some) if some else ():
+            for connection, received, data in reader.messages(chosen) if chosen else ():
                 decoder = decoders[connection.id]
                 rows[connection.id] += 1
                 for topic, stamp, row in decoder.read(unpack(data)):
@@ -137,12 +141,12 @@ class Contents:
 
     def _decoders(self, connections: Sequence[Any]) -> Iterator[tuple[int, Decoder]]:
         """Decoders of the connections that are wanted, by number."""
-        for one in connections:
-            is_wanted = wants(self._wanted, one.topic)
-            if is_wanted or wants_pairs(self._wanted, one.topic):
-                decoder = Decoder(self._types, one, self._is_ros1, self._pairs)
+        for connection in connections:
+            is_wanted = wants(self._wanted, connection.topic)
+            if is_wanted or wants_pairs(self._wanted, connection.topic):
+                decoder = Decoder(self._types, connection, self._is_ros1, self._pairs)
                 if is_wanted or decoder.transforms:
-                    yield one.id, decoder
+                    yield connection.id, decoder
 
     def check(self, bag: Bag) -> None:
         """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says.
@@ -176,15 +180,15 @@ class Decoder:
         self.transforms = array_of_transforms(store.fielddefs, kind)
         row = dict(store.fielddefs[STAMPED][1])["transform"][1] if self.transforms else kind
         every = [*_leaves(store.fielddefs, row)] if kind in store.fielddefs else []
-        self.leaves = tuple(one for one in every if not one.why)
-        self.unread = {one.path: one.why for one in every if one.why}
+        self.leaves = tuple(leaf for leaf in every if not leaf.why)
+        self.unread = {leaf.path: leaf.why for leaf in every if leaf.why}
         encoding = "cdr" if is_ros1 else connection.ext.serialization_format
         if kind not in store.fielddefs or encoding != "cdr":
             what = f"messages of the type {kind[:80]}, which is not known"
             self.leaves, self.unread = (), {"": what if encoding == "cdr" else f"messages as {encoding[:80]}"}
         read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         self._message = lambda data: read(data, kind)
-        self._fields = attrgetter(*(one.path for one in self.leaves), "__class__") if self.leaves else None
+        self._fields = attrgetter(*(leaf.path for leaf in self.leaves), "__class__") if self.leaves else None
         fields = dict(store.fielddefs.get(kind, ((), ()))[1])
         self._has_header = "header" in fields and fields["header"][1] == HEADER_TYPE
         self._topic, self._pairs = connection.topic, pairs
@@ -196,8 +200,8 @@ class Decoder:
         if not self.transforms:
             yield self._topic, _stamp(message) if self._has_header else 0, self._fields(message)[:-1]
             return
-        for topic, one in self._pairs.topics(self._topic, getattr(message, self.transforms)):
-            yield topic, _stamp(one), self._fields(one.transform)[:-1]
+        for topic, transform in self._pairs.topics(self._topic, getattr(message, self.transforms)):
+            yield topic, _stamp(transform), self._fields(transform.transform)[:-1]
 
 
 class Samples:
@@ -215,18 +219,18 @@ class Samples:
         first, count = not self.received, 2
         self.received.append(received)
         self.stamps.append(stamp)
-        for place, (leaf, value) in enumerate(zip(self.leaves, row, strict=True)):
+        for index, (leaf, value) in enumerate(zip(self.leaves, row, strict=True)):
             if not leaf.is_array:
-                self.numbers[place].append(value)
+                self.numbers[index].append(value)
                 count += 1
-            elif first or self.widths[place] == len(value):
-                self.widths[place] = len(value)
+            elif first or self.widths[index] == len(value):
+                self.widths[index] = len(value)
                 if len(value) <= MOST_COLUMNS:
-                    self.numbers[place].extend(value)
+                    self.numbers[index].extend(value)
                     count += len(value)
             else:
-                self.widths[place] = -1
-                del self.numbers[place][:]
+                self.widths[index] = -1
+                del self.numbers[index][:]
         return count
 
     def columns(self) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -259,28 +263,28 @@ def _are_set(stamps: np.ndarray) -> bool:
 
 def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str, str]) -> Topic:
     """A topic whose messages are of one type or several, in order of their times [s] since the beginning [ns]."""
-    stamps, received = (np.concatenate([np.empty(0, np.int64), *some]) for some in _ticks(parts))
+    stamps, received = (np.concatenate([np.empty(0, np.int64), *stamp_arrays]) for stamp_arrays in _ticks(parts))
     has_stamps = _are_set(stamps[np.argsort(received, kind="stable")])
     ticks = (stamps if has_stamps else received).astype(np.int64)
     order = np.argsort(ticks, kind="stable")
     values: dict[str, np.ndarray] = {}
     unread, row = dict(unread), 0
-    for one in parts:
-        columns, others = one.columns()
-        unread |= others
+    for part in parts:
+        columns, skipped = part.columns()
+        unread |= skipped
         for field, numbers in columns.items():
             values.setdefault(field, np.full(len(ticks), np.nan))[row : row + len(numbers)] = numbers
-        row += len(one.received)
-    times, received = ((some[order] - begin) / TICKS for some in (ticks, received))
-    values = {key: one[order] for key, one in values.items()}
+        row += len(part.received)
+    times, received = ((instants[order] - begin) / TICKS for instants in (ticks, received))
+    values = {key: column[order] for key, column in values.items()}
     clock = (HEADER, received) if has_stamps else (RECEIPT, None)
     return Topic(name, times, values, unread=unread, clock=clock[0], received=clock[1])
 
 
 def _ticks(parts: Sequence[Samples]) -> Iterator[list[np.ndarray]]:
     """The stamps of messages, and when they were received [ns]."""
-    yield [np.array(one.stamps, np.int64) for one in parts]
-    yield [np.array(one.received, np.int64) for one in parts]
+    yield [np.array(part.stamps, np.int64) for part in parts]
+    yield [np.array(part.received, np.int64) for part in parts]
 
 
 def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Iterator[Leaf]:
@@ -306,13 +310,15 @@ def _check_types(defined: dict) -> None:
     Nor may an array hold messages without numbers, of which any count fits into a few bytes.
     """
     for kind, (constants, fields) in defined.items():
-        names = [kind, *(one[0] for one in constants), *(one[0] for one in fields)]
+        names = [kind, *(entry[0] for entry in constants), *(entry[0] for entry in fields)]
         arrays = [what for _, (node, what) in fields if node.name in ("ARRAY", "SEQUENCE")]
         sound = [
-            all(isinstance(one[2], (bool, int, float, str)) for one in constants),
+            all(isinstance(constant[2], (bool, int, float, str)) for constant in constants),
             all(map(NAME.fullmatch, names)) and len(names) <= MOST_FIELDS,
             max((what[1] for _, (node, what) in fields if node.name == "ARRAY"), default=0) <= MOST_FIELDS,
-            not any(inner.name == "NAME" and _is_void(defined, one) for (inner, one), _ in arrays),
+            not any(
+                inner.name == "NAME" and _is_void(defined, element_kind) for (inner, element_kind), _ in arrays
+            ),
         ]
         if not all(sound):
             raise ValueError(f"the type {kind[:80]!r} is none of a message")

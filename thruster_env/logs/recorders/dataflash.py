@@ -50,24 +50,34 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     reader = package("pymavlink.DFReader", KIND, path)
     with reading(KIND, path), silent():
         with _without_clock(reader.DFReader_binary)(str(path)) as index:
-            offsets = [np.array(one, np.int64) for one in index.offsets]
+            offsets = [np.array(kind_offsets, np.int64) for kind_offsets in index.offsets]
             content = np.memmap(path, np.uint8, "r")
             formats = _formats(reader, index, offsets, content, path)
-        if not any(len(offsets[kind]) for kind, (one, *_) in formats.items() if one.form.name not in FORMATS):
+        if not any(
+            len(offsets[kind]) for kind, (definition, *_) in formats.items() if definition.form.name not in FORMATS
+        ):
             raise ValueError("it holds no messages but those that describe others")
     damage = _damage(formats, offsets, content)
-    names = None if wanted is None else {one.partition(".")[0].partition("#")[0] for one in wanted}
-    some = [(one.form.name, kind, one) for kind, each in formats.items() for one in each]
-    for name, group in groupby(sorted(some, key=lambda one: one[0]), lambda one: one[0]):
+    names = None if wanted is None else {column.partition(".")[0].partition("#")[0] for column in wanted}
+    definitions = [
+        (definition.form.name, kind, definition) for kind, each in formats.items() for definition in each
+    ]
+    for name, group in groupby(sorted(definitions, key=lambda entry: entry[0]), lambda entry: entry[0]):
         if name in FORMATS or not (names is None or name in names):
             continue
-        found: dict[str, list[tuple[Topic, np.ndarray]]] = {}
-        for _, kind, one in group:
-            own = offsets[kind]
-            own = own[(own >= one.begin) & (own < one.end) & (own + one.form.len <= len(content))]
-            for topic, places in _instances(one.form, content, own) if len(own) else ():
-                found.setdefault(topic.name, []).append((topic._replace(damage=damage), places))
-        for each in found.values():
+        parts: dict[str, list[tuple[Topic, np.ndarray]]] = {}
+        for _, kind, definition in group:
+            kind_offsets = offsets[kind]
+            kind_offsets = kind_offsets[
+                (kind_offsets >= definition.begin)
+                & (kind_offsets < definition.end)
+                & (kind_offsets + definition.form.len <= len(content))
+            ]
+            for topic, topic_offsets in (
+                _instances(definition.form, content, kind_offsets) if len(kind_offsets) else ()
+            ):
+                parts.setdefault(topic.name, []).append((topic._replace(damage=damage), topic_offsets))
+        for each in parts.values():
             yield joined(*map(list, zip(*each, strict=True)))
 
 
@@ -89,28 +99,28 @@ def _formats(
     """
     size = len(content)
     defined: dict[int, list[tuple[int, bytes]]] = {}
-    for place in offsets[FMT].tolist():
-        body = content[place + HEADER : place + DESCRIPTION].tobytes()
+    for offset in offsets[FMT].tolist():
+        body = content[offset + HEADER : offset + DESCRIPTION].tobytes()
         if len(body) == DESCRIPTION - HEADER:
             each = defined.setdefault(body[0], [])
             if not each or each[-1][1] != body:
-                each.append((place, body))
+                each.append((offset, body))
     units = _units(index, offsets, content)
-    found = {kind: [Definition(form, 0, size)] for kind, form in index.formats.items()}
+    definitions = {kind: [Definition(form, 0, size)] for kind, form in index.formats.items()}
     for kind, each in defined.items():
         if len(each) < 2:
             continue
         if len({body[1] for _, body in each}) > 1 and not reader.dfindexer.available:
             raise Refused(f"a DataFlash log must define a message once, but {path} defines {kind} twice")
-        ends = [place for place, _ in each[1:]] + [size]
-        found[kind] = []
-        for (place, body), end in zip(each, ends, strict=True):
+        ends = [offset for offset, _ in each[1:]] + [size]
+        definitions[kind] = []
+        for (offset, body), end in zip(each, ends, strict=True):
             form = reader.DFFormat(kind, body[2:6], body[1], *(_text(body[a:b]) for a, b in ((6, 22), (22, 86))))
-            for set_ids in (set_them for at, of, set_them in units if of == kind and place < at < end):
+            for set_ids in (set_them for at, of, set_them in units if of == kind and offset < at < end):
                 set_ids(form)
-            begin = place if found[kind] else 0
-            found[kind].append(Definition(form, begin, end))
-    return found
+            begin = offset if definitions[kind] else 0
+            definitions[kind].append(Definition(form, begin, end))
+    return definitions
 
 
 def _units(
@@ -121,20 +131,20 @@ def _units(
     form = index.formats.get(kind)
     if form is None or not {"UnitIds", "MultIds"} <= set(form.colhash):
         return []
-    found: list[tuple[int, int, Callable[[Any], None]]] = []
-    for place in offsets[kind].tolist():
-        body = content[place + HEADER : place + form.len].tobytes()
+    setters: list[tuple[int, int, Callable[[Any], None]]] = []
+    for offset in offsets[kind].tolist():
+        body = content[offset + HEADER : offset + form.len].tobytes()
         if len(body) + HEADER < form.len:
             continue
         values = struct.unpack(form.msg_struct, body)
         ids, factors = (_text(values[form.colhash[name]]) for name in ("UnitIds", "MultIds"))
 
-        def set_ids(one: Any, ids: str = ids, factors: str = factors) -> None:
-            one.set_unit_ids(ids, index.unit_lookup)
-            one.set_mult_ids(factors, index.mult_lookup)
+        def set_ids(form: Any, ids: str = ids, factors: str = factors) -> None:
+            form.set_unit_ids(ids, index.unit_lookup)
+            form.set_mult_ids(factors, index.mult_lookup)
 
-        found.append((place, int(values[1]), set_ids))
-    return found
+        setters.append((offset, int(values[1]), set_ids))
+    return setters
 
 
 def _text(part: bytes) -> str:
@@ -148,38 +158,40 @@ def _damage(
     begins = [np.empty(0, np.int64)]
     ends = [np.empty(0, np.int64)]
     for kind, each in formats.items():
-        for one in each:
-            own = offsets[kind][(offsets[kind] >= one.begin) & (offsets[kind] < one.end)]
-            begins.append(own)
-            ends.append(own + one.form.len)
+        for definition in each:
+            starts = offsets[kind][(offsets[kind] >= definition.begin) & (offsets[kind] < definition.end)]
+            begins.append(starts)
+            ends.append(starts + definition.form.len)
     order = np.argsort(np.concatenate(begins))
     begin, end = np.concatenate(begins)[order], np.concatenate(ends)[order]
     if not len(begin):
         return ""
     holes = np.append(begin[0], begin[1:] - end[:-1])
-    lost, places, after = int(holes[holes > 0].sum()), int((holes > 0).sum()), len(content) - int(end[-1])
+    lost, hole_count, after = int(holes[holes > 0].sum()), int((holes > 0).sum()), len(content) - int(end[-1])
     rest = set(content[len(content) - after :].tolist()) if 0 < after < LONGEST else set()
     is_rest = rest in (set(), {0}, {255})
-    nameless = sum(len(one) for kind, one in enumerate(offsets) if kind not in formats)
-    some = [f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"] * (lost > 0)
+    nameless = sum(len(kind_offsets) for kind, kind_offsets in enumerate(offsets) if kind not in formats)
+    texts = [f"{lost} bytes in {hole_count} place{'s' * (hole_count != 1)} of the log belong to no message"] * (
+        lost > 0
+    )
     unlike = (
-        one.form.name
+        definition.form.name
         for kind, each in formats.items()
-        for one in each
-        if len(offsets[kind]) and struct.calcsize(one.form.msg_struct) + HEADER != one.form.len
+        for definition in each
+        if len(offsets[kind]) and struct.calcsize(definition.form.msg_struct) + HEADER != definition.form.len
     )
     unnamed = (
-        one.form.name
+        definition.form.name
         for kind, each in formats.items()
-        for one in each
-        if len(offsets[kind]) and sum(map(bool, one.form.columns)) != len(one.form.format)
+        for definition in each
+        if len(offsets[kind]) and sum(map(bool, definition.form.columns)) != len(definition.form.format)
     )
-    some += [f"the format of {name!r} is not as long as its messages" for name in unlike]
-    some += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
-    some += [f"{nameless} messages of the log have no format"] * (nameless > 0)
-    some += ["the log is cut off: its last message is not whole"] * (after < 0)
-    some += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST or not is_rest)
-    return ", and ".join(some)
+    texts += [f"the format of {name!r} is not as long as its messages" for name in unlike]
+    texts += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
+    texts += [f"{nameless} messages of the log have no format"] * (nameless > 0)
+    texts += ["the log is cut off: its last message is not whole"] * (after < 0)
+    texts += [f"the last {after} bytes of the log belong to no message"] * (after >= LONGEST or not is_rest)
+    return ", and ".join(texts)
 
 
 @cache
@@ -210,27 +222,29 @@ def _instances(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[
     units = {name: UNITS.get(unit, unit) for name, unit in units.items()}
     which = columns.get(form.instance_field, np.zeros(len(ticks), int))
     for number in np.unique(which):
-        own = which == number
+        in_instance = which == number
         fields = {
-            key: one for name, values in columns.items() for key, one in columns_of(name, values[own]).items()
+            key: column
+            for name, values in columns.items()
+            for key, column in columns_of(name, values[in_instance]).items()
         }
         name = f"{form.name}#{number:g}" if number else form.name
-        told = {key: units.get(key.partition("[")[0], "") for key in fields}
-        yield Topic(name, ticks[own], fields, told), offsets[own]
+        field_units = {key: units.get(key.partition("[")[0], "") for key in fields}
+        yield Topic(name, ticks[in_instance], fields, field_units), offsets[in_instance]
 
 
 def _columns(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
     """Name, ArduPilot's kind and numbers (samples,) of each column of a message that holds numbers."""
-    place = HEADER
+    offset = HEADER
     for name, kind in zip(form.columns, form.format, strict=False):
         if kind in TEXTS:
-            place += TEXTS[kind]
+            offset += TEXTS[kind]
             continue
-        kept, divisor = np.dtype(NUMBERS[kind][0]), NUMBERS[kind][1]
-        place += kept.itemsize
-        if place > form.len:
+        stored, divisor = np.dtype(NUMBERS[kind][0]), NUMBERS[kind][1]
+        offset += stored.itemsize
+        if offset > form.len:
             return
-        at = offsets + (place - kept.itemsize)
-        bytewise = np.ndarray((len(content) - kept.itemsize + 1,), kept, content, strides=(1,))
+        at = offsets + (offset - stored.itemsize)
+        bytewise = np.ndarray((len(content) - stored.itemsize + 1,), stored, content, strides=(1,))
         numbers = bytewise[at]
         yield name, kind, numbers if divisor == 1.0 else numbers / divisor

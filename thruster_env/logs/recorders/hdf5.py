@@ -32,10 +32,10 @@ FEWEST = 2  # samples; what has fewer is a constant
 
 
 def topics_of(
-    found: Mapping[str, Any],
+    arrays: Mapping[str, Any],
     path: Path,
     wanted: Wanted = None,
-    unit: Callable[[Any], Sequence[str]] = lambda one: (),
+    unit: Callable[[Any], Sequence[str]] = lambda array: (),
 ) -> Iterator[Topic]:
     """The channels among arrays: a vector, or a matrix whose columns are channels NAME[0], NAME[1] and so on.
 
@@ -43,7 +43,7 @@ def topics_of(
     is as long as the array; of a matrix, times may run along either side.
 
     Args:
-        found: arrays by "GROUP.NAME", with shape, dtype and what `[...]` reads; or a text, why one is refused.
+        arrays: by "GROUP.NAME", with shape and dtype, read by `[...]`; or the text why an array is refused.
         path: of the file, for messages.
         wanted: columns that are read; None for all.
         unit: of an array, or one for each of its columns; empty where it has none.
@@ -51,35 +51,35 @@ def topics_of(
     Raises:
         ValueError: if an array is wanted that is refused, or too large.
     """
-    sizes = {name: _size(one) for name, one in found.items()}
+    sizes = {name: _size(array) for name, array in arrays.items()}
     vectors: dict[str, dict[str, int]] = {}  # of times, their lengths by group and name
     for name, size in sizes.items():
         if size is not None and size[1] == 1 and _is_time(name):
             vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
     known: dict[str, tuple[np.ndarray | None, str]] = {}
     if wanted is None:
-        within = {name[:place] for name in found for place, letter in enumerate(name) if letter in "({"}
-        refused = {name: why for name, one in found.items() if (why := _why_not(one)) and name not in within}
+        within = {name[:end] for name in arrays for end, letter in enumerate(name) if letter in "({"}
+        refused = {name: why for name, array in arrays.items() if (why := _why_not(array)) and name not in within}
         yield from [Topic("", None, {}, unread=refused)] if refused else []
-    for name, one in found.items():
+    for name, array in arrays.items():
         if wanted is not None and not any(each == name or each.startswith(f"{name}[") for each in wanted):
             continue
-        if why := _why_not(one):
+        if why := _why_not(array):
             if wanted is not None:
                 raise Refused(f"a field must be an array of numbers, but {name!r} is {why} ({path})")
             continue
         if sizes[name] is None:
             continue
         clock, along = next(
-            (each for each in _clocks(name, vectors) if each[1] in one.shape), (None, max(one.shape))
+            (each for each in _clocks(name, vectors) if each[1] in array.shape), (None, max(array.shape))
         )
-        if math.prod(one.shape) > MOST_COLUMNS * along:
+        if math.prod(array.shape) > MOST_COLUMNS * along:
             continue
         group, _, field = name.rpartition(".")
         try:
-            values = _read(name, one, path)
+            values = _read(name, array, path)
             if clock is not None and clock not in known:
-                known = {clock: _times(clock, found[clock], path, unit)}
+                known = {clock: _times(clock, arrays[clock], path, unit)}
         except Refused:
             raise
         except Exception as error:  # of this one alone
@@ -92,8 +92,8 @@ def topics_of(
             continue
         values = values if values.shape[0] == along else values.T
         fields = columns_of(field, values)
-        own, taken = known[clock] if clock is not None else (None, "")
-        yield Topic(group, own, fields, _units(unit(one), [*fields]), taken=taken)
+        times, clock_remark = known[clock] if clock is not None else (None, "")
+        yield Topic(group, times, fields, _units(unit(array), [*fields]), taken=clock_remark)
 
 
 def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
@@ -103,25 +103,25 @@ def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
 
 
 def _times(
-    clock: str, one: Any, path: Path, unit: Callable[[Any], Sequence[str]]
+    clock: str, vector: Any, path: Path, unit: Callable[[Any], Sequence[str]]
 ) -> tuple[np.ndarray | None, str]:
     """The times in a vector [s], None for those of an unknown unit; and how they were read, in words."""
     try:
-        times = _read(clock, one, path).astype(np.float64)
-        return in_seconds(times, ", ".join(unit(one)) or parted(clock)[1], clock, f"{clock!r} of {path}")
+        times = _read(clock, vector, path).astype(np.float64)
+        return in_seconds(times, ", ".join(unit(vector)) or parted(clock)[1], clock, f"{clock!r} of {path}")
     except Refused:
         raise
     except ValueError:
         return None, ""
 
 
-def _why_not(one: Any) -> str:
+def _why_not(array: Any) -> str:
     """Why an array is not read, empty if it may be."""
-    if isinstance(one, str):
-        return one
-    if one.dtype.kind not in NUMERIC:
-        return getattr(one, "what", f"of {one.dtype}")
-    sides = _sides(one)
+    if isinstance(array, str):
+        return array
+    if array.dtype.kind not in NUMERIC:
+        return getattr(array, "what", f"of {array.dtype}")
+    sides = _sides(array)
     if len(sides) > 2:
         return f"of {len(sides)} dimensions"
     return (
@@ -129,14 +129,14 @@ def _why_not(one: Any) -> str:
     )
 
 
-def _sides(one: Any) -> list[int]:
+def _sides(array: Any) -> list[int]:
     """The sides of an array of more than one entry; Simulink writes signals as 1 x 1 x samples."""
-    return [side for side in one.shape if side != 1]
+    return [side for side in array.shape if side != 1]
 
 
-def _size(one: Any) -> tuple[int, int] | None:
+def _size(array: Any) -> tuple[int, int] | None:
     """The longer and the shorter side of a vector or matrix of numbers, None for anything else."""
-    if _why_not(one) or 0 in one.shape or not (sides := _sides(one)):
+    if _why_not(array) or 0 in array.shape or not (sides := _sides(array)):
         return None
     return max(sides), min(sides) if len(sides) == 2 else 1
 
@@ -153,10 +153,10 @@ def _clocks(name: str, vectors: Mapping[str, Mapping[str, int]]) -> Iterator[tup
         yield from vectors.get(group, {}).items()
 
 
-def _read(name: str, one: Any, path: Path) -> np.ndarray:
+def _read(name: str, array: Any, path: Path) -> np.ndarray:
     """An array, of which sides of one entry are left out."""
-    check_bytes(math.prod(one.shape) * max(one.dtype.itemsize, 8), f"the array {name!r}", path)
-    return np.squeeze(np.asarray(one[...]))
+    check_bytes(math.prod(array.shape) * max(array.dtype.itemsize, 8), f"the array {name!r}", path)
+    return np.squeeze(np.asarray(array[...]))
 
 
 KIND = "HDF5 file"
@@ -190,23 +190,23 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     if find_spec("h5py") is None:
         package("h5py", KIND, path)  # which says how to install it
     with reading(KIND, path), opened("hdf5", path) as file:
-        found = {
-            name: one if isinstance(one, str) else Dataset(file, number, one)
-            for number, (name, one) in enumerate(file.told["datasets"].items())
+        datasets = {
+            name: description if isinstance(description, str) else Dataset(file, number, description)
+            for number, (name, description) in enumerate(file.told["datasets"].items())
         }
-        yield from topics_of(found, path, wanted, _unit)
+        yield from topics_of(datasets, path, wanted, _unit)
 
 
 class Dataset:
     """A dataset in a file that another process reads."""
 
-    def __init__(self, file: Opened, number: int, told: Mapping[str, Any]):
+    def __init__(self, file: Opened, number: int, description: Mapping[str, Any]):
         """Keep what is known of it; nothing is read."""
         self._file, self._number = file, number
-        self.shape = tuple(int(one) for one in told["shape"])
-        self.dtype = np.dtype(told["dtype"] if told["kind"] in NUMERIC else object)
-        self.what = f"of {told['dtype']}"
-        self.attributes = {key.lower(): value for key, value in told["attributes"].items()}
+        self.shape = tuple(int(side) for side in description["shape"])
+        self.dtype = np.dtype(description["dtype"] if description["kind"] in NUMERIC else object)
+        self.what = f"of {description['dtype']}"
+        self.attributes = {key.lower(): value for key, value in description["attributes"].items()}
 
     def __getitem__(self, key: Any) -> np.ndarray:
         """Read all of it, in its unit."""
@@ -214,41 +214,41 @@ class Dataset:
         is_unsigned = stored.dtype.kind == "i" and str(self.attributes.get(UNSIGNED)).lower() == "true"
         stored = stored.view(stored.dtype.str.replace("i", "u")) if is_unsigned else stored
         scale, offset, least, greatest = (self._number_of(name) for name in (SCALE, OFFSET, LEAST, GREATEST))
-        absent = [one for name in MISSING for one in self._numbers_of(name)]
+        absent = [marker for name in MISSING for marker in self._numbers_of(name)]
         if RANGE in self.attributes:
             least, greatest = self._numbers_of(RANGE)
         if is_unsigned:  # the numbers of attributes have the type of what is stored
-            absent = [one % 256**stored.itemsize for one in absent]
-        if all(one is None for one in (scale, offset, least, greatest)) and not absent:
+            absent = [marker % 256**stored.itemsize for marker in absent]
+        if all(number is None for number in (scale, offset, least, greatest)) and not absent:
             return stored
         values = stored.astype(np.float64) * (1.0 if scale is None else scale) + (offset or 0.0)
-        for one in absent:
-            values[stored == one] = np.nan
+        for marker in absent:
+            values[stored == marker] = np.nan
         values[stored < (-np.inf if least is None else least)] = np.nan
         values[stored > (np.inf if greatest is None else greatest)] = np.nan
         return values
 
     def _number_of(self, name: str) -> float | int | None:
         """An attribute that is a number, or an array of one; None for none."""
-        some = self._numbers_of(name)
-        if len(some) > 1:
-            raise ValueError(f"the attribute {name}={some} is no number")
-        return some[0] if some else None
+        numbers = self._numbers_of(name)
+        if len(numbers) > 1:
+            raise ValueError(f"the attribute {name}={numbers} is no number")
+        return numbers[0] if numbers else None
 
     def _numbers_of(self, name: str) -> list[float | int]:
         """The numbers of an attribute, empty for none."""
         value = self.attributes.get(name, [])
-        some = value if isinstance(value, list) else [value]
-        if not all(isinstance(one, int | float) for one in some):
+        numbers = value if isinstance(value, list) else [value]
+        if not all(isinstance(number, int | float) for number in numbers):
             raise ValueError(f"the attribute {name}={value!r} is no number")
-        return some
+        return numbers
 
 
-def _unit(one: Dataset) -> list[str]:
+def _unit(dataset: Dataset) -> list[str]:
     """The units that a dataset says it has; of "seconds since 2026-05-01", as of CF conventions, "seconds"."""
     for name in UNITS:
-        value = one.attributes.get(name)
-        some = np.ravel(np.array(value, object)).tolist()
-        if value is not None and all(isinstance(text, str) for text in some):
-            return [text.partition(" since ")[0].strip() for text in some]
+        value = dataset.attributes.get(name)
+        texts = np.ravel(np.array(value, object)).tolist()
+        if value is not None and all(isinstance(text, str) for text in texts):
+            return [text.partition(" since ")[0].strip() for text in texts]
     return []

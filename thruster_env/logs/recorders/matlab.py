@@ -46,7 +46,7 @@ def arrays_of(path: Path) -> dict[str, Any]:
 
     Source: MathWorks, "MAT-File Format", level 5.
     """
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     size, total = path.stat().st_size, 0
     with path.open("rb") as file:
         order = {b"IM": "<", b"MI": ">"}.get(file.read(HEADER)[HEADER - 2 :])
@@ -63,25 +63,25 @@ def arrays_of(path: Path) -> dict[str, Any]:
                 data = bytearray(tag + file.read(count))
             total += len(data)
             for element in _elements(data, 0, len(data), order):
-                _add(data, element, order, "", found, path)
+                _add(data, element, order, "", arrays, path)
     if tag:
         raise ValueError("it ends within an array")
-    return found
+    return arrays
 
 
 def _unpacked(file: BinaryIO, count: int, order: str, total: int, path: Path) -> bytearray:
     """What an element unpacks to, as much as its first bytes say; the total is of those before [bytes]."""
-    packed, place = zlib.decompressobj(), 0
+    packed, filled = zlib.decompressobj(), 0
     out = bytearray(TAG)
     end = file.tell() + count
     piece = b""
-    while place < len(out) and (piece or file.tell() < end):
+    while filled < len(out) and (piece or file.tell() < end):
         piece = piece or file.read(min(end - file.tell(), PIECE))
-        data = packed.decompress(piece, min(len(out) - place, PIECE))
+        data = packed.decompress(piece, min(len(out) - filled, PIECE))
         piece = packed.unconsumed_tail
-        out[place : place + len(data)] = data
-        place += len(data)
-        if place == TAG == len(out):
+        out[filled : filled + len(data)] = data
+        filled += len(data)
+        if filled == TAG == len(out):
             size = struct.unpack(f"{order}II", out)[1]
             check_bytes(total + TAG + size, WHOLE, path)
             out += bytes(size)
@@ -90,24 +90,24 @@ def _unpacked(file: BinaryIO, count: int, order: str, total: int, path: Path) ->
     if packed.decompress(piece + file.read(end - file.tell()), 1) or not packed.eof:  # the check sum is at its end
         raise ValueError("it holds an array that is packed and damaged")
     file.seek(end)
-    del out[place:]
+    del out[filled:]
     return out
 
 
 def _elements(data: bytes | bytearray, begin: int, end: int, order: str) -> list[tuple[int, int, int]]:
     """Type, place and bytes of the elements that follow one another; ValueError unless they are sound."""
-    parts, place = [], begin
-    while place < end:
-        if place + 8 > end:
+    parts, offset = [], begin
+    while offset < end:
+        if offset + 8 > end:
             raise ValueError("it ends within an element")
-        kind, count = struct.unpack_from(f"{order}II", data, place)
-        at, after = place + 8, place + 8 + count + (-count) % 8
+        kind, count = struct.unpack_from(f"{order}II", data, offset)
+        at, after = offset + 8, offset + 8 + count + (-count) % 8
         if kind >> 16:  # up to four bytes within the tag
-            kind, count, at, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+            kind, count, at, after = kind & 0xFFFF, kind >> 16, offset + 4, offset + 8
         if kind not in (*NUMBERS, MATRIX, *TEXTS) or at + count > min(end, after):
             raise ValueError("it holds a damaged element")
         parts.append((kind, at, count))
-        place = after
+        offset = after
     return parts
 
 
@@ -116,7 +116,7 @@ def _add(
     element: tuple[int, int, int],
     order: str,
     name: str,
-    found: dict[str, Any],
+    arrays: dict[str, Any],
     path: Path,
 ) -> None:
     """Add an array by its own name, or that of its field; of a structure its fields."""
@@ -143,22 +143,22 @@ def _add(
         raise ValueError("it holds a damaged array")
     sides = struct.unpack_from(f"{order}{parts[1][2] // 4}i", data, parts[1][1])
     name = name or _text(data, parts[2])
-    if len(found) > MOST_FIELDS:
+    if len(arrays) > MOST_FIELDS:
         raise ValueError(f"it has more than {MOST_FIELDS} arrays")
     if of == STRUCTURE and sides == (1, 1):
-        _add_fields(data, parts, order, name, found, path)
+        _add_fields(data, parts, order, name, arrays, path)
     elif of in (CELL, STRUCTURE) and 0 < math.prod(sides) <= MOST_FIELDS and min(sides) > 0:
-        found[name] = OTHERS[of]
+        arrays[name] = OTHERS[of]
         if of == STRUCTURE:
-            _add_fields(data, parts, order, name, found, path, math.prod(sides))
+            _add_fields(data, parts, order, name, arrays, path, math.prod(sides))
         else:
-            for place, one in enumerate(parts[3:], 1):
-                _add(data, one, order, f"{name}{{{place}}}", found, path)
+            for index, cell in enumerate(parts[3:], 1):
+                _add(data, cell, order, f"{name}{{{index}}}", arrays, path)
     elif of not in NUMERIC or flags & COMPLEX:
-        found[name] = OTHERS.get(of, "of complex numbers" if of in NUMERIC else "an object of MATLAB's")
+        arrays[name] = OTHERS.get(of, "of complex numbers" if of in NUMERIC else "an object of MATLAB's")
     else:
         check_bytes(8 * math.prod(sides), f"the array {name!r}", path)
-        found[name] = _numbers(data, parts, order, sides)
+        arrays[name] = _numbers(data, parts, order, sides)
 
 
 def _add_fields(
@@ -166,7 +166,7 @@ def _add_fields(
     parts: list,
     order: str,
     name: str,
-    found: dict[str, Any],
+    arrays: dict[str, Any],
     path: Path,
     count: int | None = None,
 ) -> None:
@@ -177,11 +177,11 @@ def _add_fields(
     _, at, size = parts[4]
     if length < 1 or size % length or size // length * (count or 1) != len(parts[5:]):
         raise ValueError("it holds a damaged structure")
-    fields = [_text(data, (INT8, at + place, length)) for place in range(0, size, length)]
-    for place, element in enumerate(parts[5:]):
-        number, field = divmod(place, len(fields))
+    fields = [_text(data, (INT8, at + start, length)) for start in range(0, size, length)]
+    for index, element in enumerate(parts[5:]):
+        number, field = divmod(index, len(fields))
         whose = name if count is None else f"{name}({number + 1})"
-        _add(data, element, order, f"{whose}.{fields[field]}", found, path)
+        _add(data, element, order, f"{whose}.{fields[field]}", arrays, path)
 
 
 def _numbers(data: bytes | bytearray, parts: list, order: str, sides: tuple[int, ...]) -> np.ndarray:

@@ -50,7 +50,7 @@ def chosen_clock(topics: Mapping[str, Clocked], asked: str | None, path: Path) -
     Raises:
         ValueError: if the stamps of headers are asked for, and a topic has none.
     """
-    without = [name for name, one in topics.items() if one.clock == RECEIPT]
+    without = [name for name, topic in topics.items() if topic.clock == RECEIPT]
     if asked == HEADER and without:
         rule = "stamps must be in the headers of all topics of a log"
         raise ValueError(f"{rule}, but {without[0]} of {path} has none (use --stamps receipt)")
@@ -70,14 +70,14 @@ def _of_another_clock(topics: Mapping[str, Clocked]) -> str:
     How far a clock is ahead of reception is compared at the same times of reception, because simulated time may
     run at another rate.
     """
-    longest = max(topics.values(), key=lambda one: len(one.times))
+    longest = max(topics.values(), key=lambda topic: len(topic.times))
     if longest.received is None or len(longest.times) < FEWEST:
         return ""
     received = longest.received[longest.order]
     ahead = longest.times[longest.order] - received
-    for name, one in topics.items():
-        if one.received is not None and len(one.times) >= FEWEST:
-            apart = one.times - one.received - np.interp(one.received, received, ahead)
+    for name, topic in topics.items():
+        if topic.received is not None and len(topic.times) >= FEWEST:
+            apart = topic.times - topic.received - np.interp(topic.received, received, ahead)
             if np.median(abs(apart)) > APART:
                 return name
     return ""

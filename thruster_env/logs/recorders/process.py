@@ -31,17 +31,17 @@ class Opened:
         """Open a file of a format."""
         self._child, self._path = child, path
         files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
-        request = {"format": form, "path": str(path.absolute()), "files": [str(one.absolute()) for one in files]}
+        request = {"format": form, "path": str(path.absolute()), "files": [str(file.absolute()) for file in files]}
         limits = {"memory": topics.MOST_MEMORY, "bytes": topics.MOST_BYTES}
         self.told = self._ask(json.dumps({**request, **limits}))
 
     def read(self, number: int) -> np.ndarray:
         """An array of the file: numbers and dates as they are stored, others as texts."""
-        told = self._ask(str(number))
-        shape = tuple(int(one) for one in told["shape"])
-        if "texts" in told:
-            return np.array(told["texts"], object).reshape(shape)
-        kind = np.dtype(str(told["dtype"]))
+        answer = self._ask(str(number))
+        shape = tuple(int(one) for one in answer["shape"])
+        if "texts" in answer:
+            return np.array(answer["texts"], object).reshape(shape)
+        kind = np.dtype(str(answer["dtype"]))
         if kind.kind not in KINDS:
             raise ValueError(f"numbers of {kind}")
         values = np.empty(shape, kind)
@@ -62,13 +62,13 @@ class Opened:
         answer = self._child.stdout.readline()  # type: ignore[union-attr]
         if not answer.endswith(b"\n"):
             raise ValueError(self._end())
-        told = json.loads(answer)
-        if told.get("is_memory"):
+        content = json.loads(answer)
+        if content.get("is_memory"):
             most = f"{topics.MOST_MEMORY:.3g} bytes of memory"
             raise Refused(f"a file must take at most {most}, but {self._path} takes more")
-        if "error" in told:
-            raise ValueError(told["error"])
-        return told
+        if "error" in content:
+            raise ValueError(content["error"])
+        return content
 
     def _end(self) -> str:
         """Why the other process has ended, in words."""

@@ -51,100 +51,102 @@ class Walk:
         import h5py
 
         for key in group:
-            own = f"{name}.{key}" if name else key
+            full_name = f"{name}.{key}" if name else key
             try:
                 if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                    self.found[own] = "a link"
+                    self.found[full_name] = "a link"
                     continue
-                one = group[key]
-                number = _address(one)
+                member = group[key]
+                number = _address(member)
                 if key == REFERENCES:
                     continue
-                if number in self._seen and isinstance(one, h5py.Group):  # of which there might be no end
-                    self.found[own] = "a group that has another name, too"
+                if number in self._seen and isinstance(member, h5py.Group):  # of which there might be no end
+                    self.found[full_name] = "a group that has another name, too"
                     continue
                 self._seen.add(number)
-                self._add(one, own, depth, _text(group.attrs.get(CLASS)) == "struct")
+                self._add(member, full_name, depth, _text(group.attrs.get(CLASS)) == "struct")
             except TooMany:
                 raise
             except Exception as error:  # of this one alone
-                self.found[own] = f"damaged: {_line(error)}"
+                self.found[full_name] = f"damaged: {_line(error)}"
 
-    def _add(self, one: Any, name: str, depth: int, in_structure: bool = False) -> None:
+    def _add(self, node: Any, name: str, depth: int, in_structure: bool = False) -> None:
         """Add an object, a group with what is in it."""
         import h5py
 
         self._count += 1
         if self._count > MOST_OBJECTS:
             raise TooMany(f"it has more than {MOST_OBJECTS} objects")
-        if OBJECT in one.attrs or SPARSE in one.attrs:
+        if OBJECT in node.attrs or SPARSE in node.attrs:
             self.found[name] = "an object or a sparse matrix of MATLAB's"
-        elif isinstance(one, h5py.Group):
+        elif isinstance(node, h5py.Group):
             if depth < DEEPEST:
-                self._members(one, name, depth + 1)
-        elif isinstance(one, h5py.Dataset):
-            self._dataset(one, name, depth, in_structure)
+                self._members(node, name, depth + 1)
+        elif isinstance(node, h5py.Dataset):
+            self._dataset(node, name, depth, in_structure)
 
-    def _dataset(self, one: Any, name: str, depth: int, in_structure: bool) -> None:
+    def _dataset(self, dataset: Any, name: str, depth: int, in_structure: bool) -> None:
         import h5py
 
-        kind = _text(one.attrs.get(CLASS))
-        if one.is_virtual or one.external:
+        kind = _text(dataset.attrs.get(CLASS))
+        if dataset.is_virtual or dataset.external:
             self.found[name] = "kept in another file"
-        elif one.chunks is not None and math.prod(one.chunks) * one.dtype.itemsize > self._most:
+        elif dataset.chunks is not None and math.prod(dataset.chunks) * dataset.dtype.itemsize > self._most:
             self.found[name] = "packed in parts that are too large"
-        elif one.size and not one.id.get_storage_size():
+        elif dataset.size and not dataset.id.get_storage_size():
             self.found[name] = "never written"
-        elif one.size and (why := _why_not_whole(one, self._most)):
+        elif dataset.size and (why := _why_not_whole(dataset, self._most)):
             self.found[name] = why
-        elif one.attrs.get(EMPTY, 0) or kind == "char" or one.shape is None:
+        elif dataset.attrs.get(EMPTY, 0) or kind == "char" or dataset.shape is None:
             return
-        elif h5py.check_ref_dtype(one.dtype) is h5py.Reference and (kind == "cell" or (in_structure and not kind)):
-            self._referred(one, name, depth, "{}" if kind == "cell" else "()")
-        elif one.dtype.names is None:
-            self.found[name] = (one, None)
+        elif h5py.check_ref_dtype(dataset.dtype) is h5py.Reference and (
+            kind == "cell" or (in_structure and not kind)
+        ):
+            self._referred(dataset, name, depth, "{}" if kind == "cell" else "()")
+        elif dataset.dtype.names is None:
+            self.found[name] = (dataset, None)
         else:
-            names = [field for field in one.dtype.names if one.dtype[field].kind in NUMERIC]
-            self.found |= {f"{name}.{field}": (one, field) for field in names}
+            names = [field for field in dataset.dtype.names if dataset.dtype[field].kind in NUMERIC]
+            self.found |= {f"{name}.{field}": (dataset, field) for field in names}
 
-    def _referred(self, one: Any, name: str, depth: int, brackets: str) -> None:
+    def _referred(self, dataset: Any, name: str, depth: int, brackets: str) -> None:
         """Add what the entries of a cell array, or those of a field of an array of structures, refer to."""
         group, _, field = name.rpartition(".")
         self.found[name if brackets == "{}" else group] = MANY[brackets]
-        if one.size > MOST_OBJECTS or depth >= DEEPEST:
+        if dataset.size > MOST_OBJECTS or depth >= DEEPEST:
             return
-        for place, reference in enumerate(
-            np.asarray(one[()]).reshape(-1), 1
+        for index, reference in enumerate(
+            np.asarray(dataset[()]).reshape(-1), 1
         ):  # MATLAB counts along columns, from 1
-            own = f"{name}{{{place}}}" if brackets == "{}" else f"{group}({place}).{field}"
+            full_name = f"{name}{{{index}}}" if brackets == "{}" else f"{group}({index}).{field}"
             if reference:
-                self._add(self._file[reference], own, depth + 1)
+                self._add(self._file[reference], full_name, depth + 1)
 
 
-def _why_not_whole(one: Any, most_bytes: int) -> str:
+def _why_not_whole(dataset: Any, most_bytes: int) -> str:
     """Why a dataset does not hold as many numbers as it says; empty if it does, or may not be read for its size.
 
     The library gives the fill value for parts that are not there, as where their index is damaged.
     """
-    stated, stored = one.size * one.dtype.itemsize, one.id.get_storage_size()
-    if one.chunks is None:
-        is_other = one.dtype.kind in NUMERIC and stored != stated
+    stated, stored = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size()
+    if dataset.chunks is None:
+        is_other = dataset.dtype.kind in NUMERIC and stored != stated
         return f"damaged: it says {stated} bytes, but has {stored}" if is_other else ""
-    parts = math.prod(-(-side // chunk) for side, chunk in zip(one.shape, one.chunks, strict=True))
-    count = one.id.get_num_chunks() if stated <= most_bytes else parts
+    parts = math.prod(-(-side // chunk) for side, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    count = dataset.id.get_num_chunks() if stated <= most_bytes else parts
     if count > parts:
         return f"damaged: it says that it has {parts} parts, but has {count}"
-    is_missing = one.dtype.kind == "f" and np.isnan(one.fillvalue)
+    is_missing = dataset.dtype.kind == "f" and np.isnan(dataset.fillvalue)
     return f"{parts - count} of its {parts} parts were never written, or are lost" * (
         count < parts and not is_missing
     )
 
 
-def _address(one: Any) -> int:
+def _address(node: Any) -> int:
     """Where an object stands in its file."""
     import h5py
 
-    return h5py.h5o.get_info(one.id).addr
+    return h5py.h5o.get_info(node.id).addr
 
 
 class TooMany(ValueError):
@@ -159,16 +161,18 @@ def _line(error: object) -> str:
     return " ".join(str(error).split())[:160] or type(error).__name__
 
 
-def _described(one: Any, field: str | None) -> dict[str, Any]:
+def _described(dataset: Any, field: str | None) -> dict[str, Any]:
     """Shape, type and attributes of a dataset."""
-    kind = one.dtype if field is None else one.dtype[field]
-    told = (
+    kind = dataset.dtype if field is None else dataset.dtype[field]
+    attributes = (
         {}
         if field is not None
-        else {key: _plain(value) for key, value in one.attrs.items() if key.lower() in TOLD and _is_some(value)}
+        else {
+            key: _plain(value) for key, value in dataset.attrs.items() if key.lower() in TOLD and _is_some(value)
+        }
     )
     plain = kind.str if kind.kind in NUMERIC else str(kind)
-    return {"shape": list(one.shape), "kind": kind.kind, "dtype": plain, "attributes": told}
+    return {"shape": list(dataset.shape), "kind": kind.kind, "dtype": plain, "attributes": attributes}
 
 
 def _is_some(value: Any) -> bool:
@@ -182,7 +186,7 @@ def _plain(value: Any) -> Any:
     """An attribute as text, a number, or a list of these."""
     value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     if isinstance(value, list):
-        return [_plain(one) for one in value]
+        return [_plain(entry) for entry in value]
     return value if isinstance(value, int | float) else _text(value)
 
 
@@ -208,22 +212,22 @@ def hdf5(request: dict) -> tuple[dict[str, Any], Reader]:
     """The datasets of an HDF5 file, and what reads one of them."""
     import h5py
 
-    found = Walk(h5py.File(request["path"], "r"), request["bytes"]).found
-    names, told = [*found], dict[str, Any]()
-    for name, one in found.items():
+    contents = Walk(h5py.File(request["path"], "r"), request["bytes"]).found
+    names, descriptions = [*contents], dict[str, Any]()
+    for name, entry in contents.items():
         try:
-            told[name] = one if isinstance(one, str) else _described(*one)
+            descriptions[name] = entry if isinstance(entry, str) else _described(*entry)
         except Exception as error:
-            told[name] = f"damaged: {_line(error)}"
+            descriptions[name] = f"damaged: {_line(error)}"
 
     def read(number: int) -> np.ndarray:
-        one = found[names[number]]
-        if isinstance(one, str):
-            raise ValueError(one)
-        dataset, field = one
+        entry = contents[names[number]]
+        if isinstance(entry, str):
+            raise ValueError(entry)
+        dataset, field = entry
         return dataset[()] if field is None else dataset.fields(field)[()]
 
-    return {"datasets": told}, read
+    return {"datasets": descriptions}, read
 
 
 def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
@@ -233,10 +237,10 @@ def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
     numbers, size, tables = 0, 0, []
     for file in request["files"]:
         of_file = pyarrow.parquet.read_metadata(file)
-        groups = [of_file.row_group(place) for place in range(of_file.num_row_groups)]
-        parts = [group.column(place) for group in groups for place in range(group.num_columns)]
+        groups = [of_file.row_group(index) for index in range(of_file.num_row_groups)]
+        parts = [group.column(index) for group in groups for index in range(group.num_columns)]
         numbers += of_file.num_rows * of_file.num_columns
-        size += sum(one.total_uncompressed_size for one in parts)
+        size += sum(part.total_uncompressed_size for part in parts)
     names = pyarrow.parquet.read_schema(request["files"][0]).names
     if request["files"] != [request["path"]] and max(8 * numbers, size) <= request["bytes"]:
         tables.append(
@@ -265,22 +269,25 @@ def main() -> None:
         out.flush()
 
     try:
-        told, read = {"hdf5": hdf5, "parquet": parquet}[request["format"]](request)
+        description, read = {"hdf5": hdf5, "parquet": parquet}[request["format"]](request)
     except Exception as error:
         answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         return
-    answer(told)
+    answer(description)
     for line in sys.stdin:
         try:
             values = np.ascontiguousarray(read(int(line)))
             if values.dtype.kind in SENT:
-                told, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
+                description, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
             else:
-                told, data = {"texts": [str(one)[:LONGEST] for one in values.reshape(-1)]}, memoryview(b"")
+                description, data = (
+                    {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]},
+                    memoryview(b""),
+                )
         except Exception as error:
             answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         else:
-            answer({**told, "shape": list(values.shape)}, data)
+            answer({**description, "shape": list(values.shape)}, data)
 
 
 if __name__ == "__main__":

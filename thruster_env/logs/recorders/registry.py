@@ -41,7 +41,7 @@ FORMATS = (
     Format(matlab.KIND, (".mat",), matlab.MAGIC, matlab.topics, False),
     Format(hdf5.KIND, (".h5", ".hdf5", ".hdf"), hdf5.MAGIC, hdf5.topics, False),
 )
-ENDINGS = tuple(ending for one in FORMATS for ending in one.endings)
+ENDINGS = tuple(ending for form in FORMATS for ending in form.endings)
 
 
 class Samples(NamedTuple):
@@ -100,19 +100,19 @@ def format_of(path: str | Path) -> Format | None:
         ValueError: if a file's first bytes are not those of its ending, or it cannot be read.
     """
     path = Path(path)
-    named = next((one for one in FORMATS if path.suffix.lower() in one.endings), None)
+    named = next((form for form in FORMATS if path.suffix.lower() in form.endings), None)
     if (path / METADATA).is_file():
-        return next(one for one in FORMATS if ".db3" in one.endings)
+        return next(form for form in FORMATS if ".db3" in form.endings)
     if path.is_dir() and named is not None:
         raise unreadable(named.kind, path, "it is a folder")
     if named is None and (path.suffix.lower() in SUFFIXES or not path.is_file()):
         return None
     try:
         with path.open("rb") as file:
-            first = file.read(max(len(one.magic) for one in FORMATS))
+            first = file.read(max(len(form.magic) for form in FORMATS))
     except OSError as error:
         raise ValueError(f"a log must be a file that can be read, but {path} is not: {error.strerror}") from None
-    begun = next((one for one in FORMATS if first.startswith(one.magic)), None)
+    begun = next((form for form in FORMATS if first.startswith(form.magic)), None)
     if named is not None and begun is not named:
         why = "it is empty" if not first else f"it begins with {first[:8]!r}"
         raise unreadable(named.kind, path, why if begun is None else f"it is a {begun.kind}")
@@ -136,18 +136,18 @@ def contents(path: str | Path, stamps: str | None = None) -> Contents:
         return _of_table(read_table(path))
     form = _known(path)
     check_stamps(stamps, form, path)
-    listed, found, clocked = list[Field](), list[tuple[str, str, Samples]](), dict[str, Clocked]()
+    listed, entries, clocked = list[Field](), list[tuple[str, str, Samples]](), dict[str, Clocked]()
     unread, damage = dict[str, str](), dict[str, None]()
     for topic in form.topics(Path(path), None):
-        found += [(topic.name, *one) for one in _samples(topic)]
-        clocked |= {topic.name: found[-1][2].clocked} if topic.clock and topic.values else {}
+        entries += [(topic.name, *column) for column in _samples(topic)]
+        clocked |= {topic.name: entries[-1][2].clocked} if topic.clock and topic.values else {}
         unread |= {topic.column(name) if name else topic.name: why for name, why in topic.unread.items()}
         damage |= {topic.damage: None} if topic.damage else {}
         if not form.has_receipt:  # nothing has to be known of all topics first
-            listed += [_field(name, topic, one) for topic, name, one in found]
-            found.clear()
+            listed += [_field(name, topic, samples) for topic, name, samples in entries]
+            entries.clear()
     clock = stamps or chosen_clock(clocked, None, Path(path)).clock
-    listed += [_field(name, topic, one.by(clock)) for topic, name, one in found]
+    listed += [_field(name, topic, samples.by(clock)) for topic, name, samples in entries]
     return Contents(listed, unread, tuple(damage))
 
 
@@ -163,17 +163,17 @@ def _of_table(table: Table) -> Contents:
                 times = in_seconds(table.numbers(clock.header), clock.unit, clock.header, where)[0]
         except ValueError:  # the column is listed, or why it is not
             times = None
-    found, unread = list[Field](), dict[str, str]()
+    listed, unread = list[Field](), dict[str, str]()
     for name in table.names:
         try:
             values = table.numbers(name)
         except ValueError as error:
             unread[name] = "dates" if clock and name == clock.header and times is not None else str(error)
         else:
-            there = ~np.isnan(values) & (True if times is None else ~np.isnan(times))
-            own = times[there] if times is not None else None
-            found.append(_field(name, "", Samples(own, values[there], parted(name)[1] or "")))
-    return Contents(found, unread, ())
+            present = ~np.isnan(values) & (True if times is None else ~np.isnan(times))
+            known_times = times[present] if times is not None else None
+            listed.append(_field(name, "", Samples(known_times, values[present], parted(name)[1] or "")))
+    return Contents(listed, unread, ())
 
 
 def fields(path: str | Path, stamps: str | None = None) -> list[Field]:
@@ -204,9 +204,9 @@ def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
     """
     wanted: Wanted = None if names is None else frozenset(names)
     return {
-        name: one
+        name: samples
         for topic in _known(path).topics(Path(path), wanted)
-        for name, one in _samples(topic)
+        for name, samples in _samples(topic)
         if wanted is None or name in wanted
     }
 
@@ -219,15 +219,15 @@ def _samples(topic: Topic) -> Iterator[tuple[str, Samples]]:
 
 
 def _known(path: str | Path) -> Format:
-    found = format_of(path)
-    if found is None:
+    form = format_of(path)
+    if form is None:
         kinds = ", ".join(ENDINGS)
         raise ValueError(f"a recorder's file must end in {kinds} or be a folder with {METADATA}, but got {path}")
-    return found
+    return form
 
 
-def _field(name: str, topic: str, one: Samples) -> Field:
-    times, values = one.times, one.values
+def _field(name: str, topic: str, samples: Samples) -> Field:
+    times, values = samples.times, samples.values
     nothing, count = float("nan"), len(values)
     rate = gap = begin = end = nothing
     if times is not None and count:
@@ -245,4 +245,6 @@ def _field(name: str, topic: str, one: Samples) -> Field:
         with np.errstate(all="ignore"):  # a part without numbers has no mean
             sums = np.add.reduceat(np.where(known, values, 0.0), starts)
             course = sums / np.add.reduceat(known, starts, dtype=int)
-    return Field(name, topic, count, rate, gap, begin, end, one.clock, one.unit, *ends, tuple(course.tolist()))
+    return Field(
+        name, topic, count, rate, gap, begin, end, samples.clock, samples.unit, *ends, tuple(course.tolist())
+    )

@@ -48,27 +48,27 @@ def joined(parts: Sequence[Topic], order: Sequence[np.ndarray] | None = None) ->
     """
     if len(parts) == 1:
         return parts[0]
-    times = np.concatenate([np.empty(0) if one.times is None else one.times for one in parts])
+    times = np.concatenate([np.empty(0) if part.times is None else part.times for part in parts])
     rows = np.argsort(times if order is None else np.concatenate(order), kind="stable")
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
-    unread, place = dict(parts[0].unread), 0
-    for one in parts:
-        end = place + len(np.empty(0) if one.times is None else one.times)
-        unread |= one.unread
-        for field, numbers in one.values.items():
-            values.setdefault(field, np.full(len(times), np.nan))[place:end] = numbers
-            unit = one.units.get(field, "")
+    unread, row = dict(parts[0].unread), 0
+    for part in parts:
+        end = row + len(np.empty(0) if part.times is None else part.times)
+        unread |= part.unread
+        for field, numbers in part.values.items():
+            values.setdefault(field, np.full(len(times), np.nan))[row:end] = numbers
+            unit = part.units.get(field, "")
             if units.setdefault(field, unit) != unit:
                 unread[field] = f"in {units[field] or 'no unit'} and in {unit or 'no unit'}"
-        place = end
+        row = end
     return Topic(
         parts[0].name,
         times[rows],
         {field: numbers[rows] for field, numbers in values.items() if field not in unread},
         {field: unit for field, unit in units.items() if unit},
         unread,
-        " ".join(dict.fromkeys(one.damage for one in parts if one.damage)),
+        " ".join(dict.fromkeys(part.damage for part in parts if part.damage)),
     )
 
 
@@ -77,7 +77,7 @@ Reader = Callable[[Path, Wanted], Iterator[Topic]]
 
 def wants(wanted: Wanted, topic: str) -> bool:
     """Whether a column of a topic is wanted."""
-    return wanted is None or any(one.startswith(f"{topic}.") for one in wanted)
+    return wanted is None or any(column.startswith(f"{topic}.") for column in wanted)
 
 
 def package(module: str, kind: str, path: Path) -> Any:
@@ -102,8 +102,8 @@ def check_bytes(count: int | float, what: str, path: Path) -> None:
 
 def unreadable(kind: str, path: Path, why: object) -> ValueError:
     """The error for a file that is not what its name says."""
-    said = " ".join(str(why).split())
-    return ValueError(f"a {kind} must be one, but {path} is not: {said[:200] or type(why).__name__}")
+    text = " ".join(str(why).split())
+    return ValueError(f"a {kind} must be one, but {path} is not: {text[:200] or type(why).__name__}")
 
 
 @contextmanager
@@ -147,20 +147,20 @@ def bounded(what: str, path: Path) -> Iterator[None]:
 def silent() -> Iterator[None]:
     """Keep packages from printing, also those in C; nothing may be yielded within."""
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        kept = os.dup(2)
+        stderr_copy = os.dup(2)
         try:
             os.dup2(nowhere.fileno(), 2)
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr_copy, 2)
+            os.close(stderr_copy)
 
 
 def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """The fields of an array (samples,) or (samples, entries): NAME, or NAME[0], NAME[1] and so on."""
     if values.ndim == 1:
         return {name: values.astype(np.float64)}
-    return {f"{name}[{place}]": values[:, place].astype(np.float64) for place in range(values.shape[1])}
+    return {f"{name}[{index}]": values[:, index].astype(np.float64) for index in range(values.shape[1])}
 
 
 # Transforms between frames: messages that hold arrays of them give one topic for each pair of frames.
@@ -194,7 +194,7 @@ def _has_frames(fields: Mapping, defined: dict) -> bool:
 
 def wants_pairs(wanted: Wanted, topic: str) -> bool:
     """Whether a column is wanted that may belong to a pair of frames of a topic."""
-    return wanted is not None and any(one.startswith(f"{topic}/") for one in wanted)
+    return wanted is not None and any(column.startswith(f"{topic}/") for column in wanted)
 
 
 class Pairs:
@@ -211,8 +211,8 @@ class Pairs:
         Raises:
             ValueError: if two pairs have one name, or there are more than MOST_FIELDS.
         """
-        for one in transforms:
-            parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+        for transform in transforms:
+            parent, child = transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/")
             name = f"{topic}/{parent}/{child}"
             if self._pairs.setdefault(name, (topic, parent, child)) != (topic, parent, child):
                 raise self._doubled(name)
@@ -220,7 +220,7 @@ class Pairs:
                 raise Refused(
                     f"a bag must have at most {MOST_FIELDS} pairs of frames, but got more ({self._path})"
                 )
-            yield name, one
+            yield name, transform
 
     def check(self, topics: Container[str]) -> None:
         """Raise ValueError if a pair has the name of one of the topics of the bag."""

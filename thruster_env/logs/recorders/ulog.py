@@ -40,7 +40,7 @@ SEVERAL = 4  # messages that follow one another: none begin by chance
 APPENDED = struct.pack("<HB", 40, ord("B")) + bytes(8) + b"\1"  # flags of a log to which data were appended
 FORMAT, SUBSCRIPTION = b"FA"
 KINDS = b"ABCDFILMOPQRS"  # of messages
-TEXTS, LEVELS = b"LC", (*(bytes([one]) for one in b"01234567"),)  # messages of text, and what they begin with
+TEXTS, LEVELS = b"LC", (*(bytes([level]) for level in b"01234567"),)  # messages of text, and what they begin with
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
@@ -60,7 +60,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """
     check_bytes(path.stat().st_size, "a ULog", path)
     core = package("pyulog.core", KIND, path)
-    names = None if wanted is None else sorted({one.partition(".")[0].partition("#")[0] for one in wanted})
+    names = None if wanted is None else sorted({column.partition(".")[0].partition("#")[0] for column in wanted})
     with reading(KIND, path), silent():
         content = path.read_bytes()
         parts = _whole_parts(content)
@@ -72,29 +72,32 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             content = content.replace(APPENDED, APPENDED[:-1] + b"\0", 1)
         _check_formats(core.ULog(BytesIO(content), parse_header_only=True).message_formats)
         log = core.ULog(BytesIO(content), names)
-        found = log.data_list
-        if not found and wanted is None:
+        data_list = log.data_list
+        if not data_list and wanted is None:
             raise ValueError("it holds no data")
-    places = 1 + len(parts) - (not parts or parts[0][0] == START) - (not parts or parts[-1][1] == size)
-    damage = f"{lost} bytes in {places} place{'s' * (places != 1)} of the log belong to no message"
+    hole_count = 1 + len(parts) - (not parts or parts[0][0] == START) - (not parts or parts[-1][1] == size)
+    damage = f"{lost} bytes in {hole_count} place{'s' * (hole_count != 1)} of the log belong to no message"
     if strays:
         are = "message is" if strays == 1 else "messages are"
         damage = f"{damage}, and " * bool(lost) + f"{strays} {are} damaged, or of a kind that is not known"
     elif not lost:
         damage = "some messages of the log are not as long as their formats say" if log.file_corruption else ""
-    while found:
-        some = [found.pop(0)]
-        while found and (found[0].name, found[0].multi_id) == (some[0].name, some[0].multi_id):
-            some.append(found.pop(0))
-        name = f"{some[0].name}#{some[0].multi_id}" if some[0].multi_id else some[0].name
+    while data_list:
+        same_topic = [data_list.pop(0)]
+        while data_list and (data_list[0].name, data_list[0].multi_id) == (
+            same_topic[0].name,
+            same_topic[0].multi_id,
+        ):
+            same_topic.append(data_list.pop(0))
+        name = f"{same_topic[0].name}#{same_topic[0].multi_id}" if same_topic[0].multi_id else same_topic[0].name
         if wants(wanted, name):
-            yield joined([_topic(name, data, damage) for data in some])
+            yield joined([_topic(name, data, damage) for data in same_topic])
 
 
 def _topic(name: str, data: Any, damage: str) -> Topic:
     if STAMP not in data.data:
         return Topic(name, None, {}, unread={"": "messages without times"})
-    kinds = {one.field_name: one.type_str for one in data.field_data}
+    kinds = {field.field_name: field.type_str for field in data.field_data}
     numbers = _numbers(data.data, kinds)
     known = {field: UNITS.get(field.rpartition(".")[2].partition("[")[0], "") for field in numbers}
     units = {field: unit for field, unit in known.items() if unit}
@@ -106,40 +109,43 @@ def _whole_parts(content: bytes) -> list[tuple[int, int]]:
 
     The package goes through damaged parts byte by byte, and reads what the next bytes say each time.
     """
-    parts, place = [], START
-    while place < len(content):
-        begin = place
-        while (after := _after(content, place)) is not None:
-            place = after
-        if place > begin:
-            parts.append((begin, place))
-        place = next((one for one in range(place + 1, len(content)) if _begins(content, one)), len(content))
+    parts, offset = [], START
+    while offset < len(content):
+        begin = offset
+        while (after := _after(content, offset)) is not None:
+            offset = after
+        if offset > begin:
+            parts.append((begin, offset))
+        offset = next(
+            (candidate for candidate in range(offset + 1, len(content)) if _begins(content, candidate)),
+            len(content),
+        )
     return parts
 
 
-def _after(content: bytes, place: int) -> int | None:
+def _after(content: bytes, offset: int) -> int | None:
     """Where the message ends that begins at a place, None where none does."""
-    if place + HEADER > len(content):
+    if offset + HEADER > len(content):
         return None
-    count, kind = struct.unpack_from("<HB", content, place)
-    end = place + HEADER + count
+    count, kind = struct.unpack_from("<HB", content, offset)
+    end = offset + HEADER + count
     if kind not in KINDS:  # one that is newer than these
         follows = end + HEADER <= len(content) and content[end + 2] in KINDS
         return end if kind and 0 < count <= LONGEST and follows else None
     return end if end <= len(content) else None
 
 
-def _begins(content: bytes, place: int) -> bool:
+def _begins(content: bytes, offset: int) -> bool:
     """Whether several messages follow one another from a place on."""
-    if place + HEADER > len(content) or content[place + 2] not in KINDS:
+    if offset + HEADER > len(content) or content[offset + 2] not in KINDS:
         return False
     for _ in range(SEVERAL):
-        after = _after(content, place)
+        after = _after(content, offset)
         if after is None:
             return False
         if after == len(content):
             return True
-        place = after
+        offset = after
     return True
 
 
@@ -150,10 +156,10 @@ def _checked_definitions(content: bytes, parts: Sequence[tuple[int, int]], path:
     the last one, and drops what belongs to the first.
     """
     formats, subscribed, strays = dict[bytes, bytes](), set[int](), 0
-    for place, last in parts:
-        while place < last:
-            count, kind = struct.unpack_from("<HB", content, place)
-            begin, end = place + HEADER, place + HEADER + count
+    for offset, last in parts:
+        while offset < last:
+            count, kind = struct.unpack_from("<HB", content, offset)
+            begin, end = offset + HEADER, offset + HEADER + count
             is_text = kind not in TEXTS or content[begin : begin + 1] in LEVELS
             if kind not in KINDS or not is_text or (kind == FORMAT and subscribed):  # formats come first
                 strays += 1
@@ -169,16 +175,16 @@ def _checked_definitions(content: bytes, parts: Sequence[tuple[int, int]], path:
                     rule = "a ULog must give each subscription its own number"
                     raise Refused(f"{rule}, but {path} gives {number} again, to {what!r}")
                 subscribed.add(number)
-            place = end
+            offset = end
     return strays
 
 
 def _numbers(data: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
     """All fields but the stamp, text and padding."""
-    some = [
+    names = [
         name for name in data if name != STAMP and kinds.get(name, "char") != "char" and "_padding" not in name
     ]
-    return {name: data[name].astype(np.float64) for name in some}
+    return {name: data[name].astype(np.float64) for name in names}
 
 
 def _check_formats(formats: Mapping) -> None:

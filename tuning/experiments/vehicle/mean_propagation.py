@@ -32,4 +32,4 @@ class MeanPropagatingEnKF(EnsembleKalmanFilter):
     """
 
     name: ClassVar[str] = "mean-propagating enkf"
-    page: ClassVar[Page] = EnsembleKalmanFilter.page._replace(advance=advance_from_the_mean)
+    page: ClassVar[Page] = EnsembleKalmanFilter.page._replace(propagate=advance_from_the_mean)
