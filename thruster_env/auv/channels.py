@@ -114,7 +114,7 @@ def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
     i = SYMBOLS.index(symbol)
     _, _, unit, angle = STATES[i]
     name = symbol if name is None else name
-    deviation = next(one.deviation for one in INSTRUMENTS.values() if name in one.channels)
+    deviation = next(instrument.deviation for instrument in INSTRUMENTS.values() if name in instrument.channels)
     return Channel(
         Quantity(f"measured {STATES[i].name}" + (" (satellites)" if name != symbol else ""), name, unit, angle),
         deviation**2,
@@ -124,9 +124,9 @@ def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
     )
 
 
-def unit_row(place: int, count: int) -> str:
+def unit_row(index: int, count: int) -> str:
     """Source of a tuple of `count` zeros, with a one at a place."""
-    return tuple_of("1.0" if i == place else "0.0" for i in range(count))
+    return tuple_of("1.0" if i == index else "0.0" for i in range(count))
 
 
 CHANNELS: dict[str, Channel] = {
@@ -150,16 +150,16 @@ def channels_of(names: tuple[str, ...], states: int) -> tuple[Channel, ...]:
     if unknown:
         rule = f"sensors of a model of {states} states must measure {', '.join(known)}"
         raise ValueError(f"{rule}, but got {', '.join(unknown)}")
-    places = {name: known.index(MEASURED[name]) for name in names}
+    indices = {name: known.index(MEASURED[name]) for name in names}
     return tuple(
-        CHANNELS[name]._replace(slopes=written_out("slopes", "x, dy, c", unit_row(place, states)))
-        for name, place in places.items()
+        CHANNELS[name]._replace(slopes=written_out("slopes", "x, dy, c", unit_row(index, states)))
+        for name, index in indices.items()
     )
 
 
 def suite(name: str) -> dict[str, Instrument]:
     """The instrument of each channel of a suite; ValueError if there is no such suite."""
-    instruments = [INSTRUMENTS[one] for one in SUITES[one_of("sensors", name, tuple(SUITES))]]
+    instruments = [INSTRUMENTS[instrument] for instrument in SUITES[one_of("sensors", name, tuple(SUITES))]]
     return {channel: instrument for instrument in instruments for channel in instrument.channels}
 
 

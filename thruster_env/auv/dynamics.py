@@ -218,14 +218,14 @@ def current_rates(x, u, c):
     along, across, below = in_body_axes(attitude, x[8], u[4], u[5], u[6])
     p, q, r = x[3], x[4], x[5]
     through_water = (x[0] - along, x[1] - across, x[2] - below, p, q, r)
-    moved = accelerated(forces(through_water, down(attitude), u, c), c)
+    accelerations = accelerated(forces(through_water, down(attitude), u, c), c)
     return (
-        moved[0] + r * across - q * below,
-        moved[1] + p * below - r * along,
-        moved[2] + q * along - p * across,
-        moved[3],
-        moved[4],
-        moved[5],
+        accelerations[0] + r * across - q * below,
+        accelerations[1] + p * below - r * along,
+        accelerations[2] + q * along - p * across,
+        accelerations[3],
+        accelerations[4],
+        accelerations[5],
         *angle_rates(attitude, p, q, r),
         *in_earth_axes(attitude, x[8], x[0], x[1], x[2]),
     )
@@ -237,8 +237,8 @@ def drifting_rates(x, u, c):
 
     What changes the current [m/s] is process noise alone, and it has no component down.
     """
-    told = (u[0], u[1], u[2], u[3], x[12], x[13], 0.0)
-    return (*current_rates(x, told, c), 0.0, 0.0)
+    inputs = (u[0], u[1], u[2], u[3], x[12], x[13], 0.0)
+    return (*current_rates(x, inputs, c), 0.0, 0.0)
 
 
 @inlined
@@ -252,15 +252,17 @@ def drifting_rates_tangent(x, dx, u, c):
     d_along, d_across, d_below = in_body_axes_tangent(attitude, d_attitude, x[8], dx[8], flow, d_flow)
     through_water = (x[0] - along, x[1] - across, x[2] - below, p, q, r)
     d_through = (dx[0] - d_along, dx[1] - d_across, dx[2] - d_below, dp, dq, dr)
-    moved = accelerated(forces_tangent(through_water, d_through, down_tangent(attitude, d_attitude), u, c), c)
+    accelerations = accelerated(
+        forces_tangent(through_water, d_through, down_tangent(attitude, d_attitude), u, c), c
+    )
     velocity, d_velocity = (x[0], x[1], x[2]), (dx[0], dx[1], dx[2])
     return (
-        moved[0] + dr * across + r * d_across - dq * below - q * d_below,
-        moved[1] + dp * below + p * d_below - dr * along - r * d_along,
-        moved[2] + dq * along + q * d_along - dp * across - p * d_across,
-        moved[3],
-        moved[4],
-        moved[5],
+        accelerations[0] + dr * across + r * d_across - dq * below - q * d_below,
+        accelerations[1] + dp * below + p * d_below - dr * along - r * d_along,
+        accelerations[2] + dq * along + q * d_along - dp * across - p * d_across,
+        accelerations[3],
+        accelerations[4],
+        accelerations[5],
         *angle_rates_tangent(attitude, d_attitude, q, r, dp, dq, dr),
         *in_earth_axes_tangent(attitude, d_attitude, x[8], dx[8], velocity, d_velocity),
         0.0,
@@ -347,7 +349,7 @@ def required_substeps(p: VehicleParameters, dt: float, thrust: float, plane: flo
     u = (*force, *(rng.choice([-1.0, 1.0], (2, 200)) * plane))
     limit = ONE_STEP_ACCURACY * 2.0 * high[:, None]
 
-    def moved(count):
+    def propagated(count):
         c, x = derive_constants(p, dt / count), tuple(part * high[:, None])
         for _ in range(count):
             x = motion_substep(x, u, c)
@@ -355,9 +357,9 @@ def required_substeps(p: VehicleParameters, dt: float, thrust: float, plane: flo
 
     count = 1
     with np.errstate(all="ignore"):
-        before = moved(count)
+        before = propagated(count)
         while count <= 64:
-            after = moved(2 * count)
+            after = propagated(2 * count)
             if (np.abs(after - before) <= limit).all():
                 return count
             count, before = 2 * count, after

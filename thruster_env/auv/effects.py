@@ -34,7 +34,7 @@ for _current_name, _signal in {
 Current = dict[str, tuple[Effect, ...]]
 
 
-def make_current(given) -> Current:
+def make_current(current) -> Current:
     """Signals by direction, from None, three numbers (north, east, down) [m/s] or a mapping from directions.
 
     Each entry of a mapping is a number or a list of signals of CURRENT_SIGNALS, which are added:
@@ -42,26 +42,28 @@ def make_current(given) -> Current:
 
     Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
-    if given is None:
+    if current is None:
         return {}
-    if not isinstance(given, Mapping):
-        entries = list(given) if hasattr(given, "__iter__") and not isinstance(given, str) else []
+    if not isinstance(current, Mapping):
+        entries = list(current) if hasattr(current, "__iter__") and not isinstance(current, str) else []
         if len(entries) != len(DIRECTIONS):
             rule = "current must be three velocities (north, east, down) [m/s] or a mapping from directions"
-            raise ValueError(f"{rule}, but got {short_repr(given)}")
-        given = dict(zip(DIRECTIONS, entries, strict=True))
-    unknown = [direction for direction in given if direction not in DIRECTIONS]
+            raise ValueError(f"{rule}, but got {short_repr(current)}")
+        current = dict(zip(DIRECTIONS, entries, strict=True))
+    unknown = [direction for direction in current if direction not in DIRECTIONS]
     if unknown:
         raise ValueError(
             f"directions of current must be among {', '.join(DIRECTIONS)}, but got {short_repr(unknown)}"
         )
-    found = {direction: _signals(direction, given[direction]) for direction in DIRECTIONS if direction in given}
-    return {direction: signals for direction, signals in found.items() if signals}
+    signals_of = {
+        direction: _signals(direction, current[direction]) for direction in DIRECTIONS if direction in current
+    }
+    return {direction: signals for direction, signals in signals_of.items() if signals}
 
 
-def _signals(direction: str, given) -> tuple[Effect, ...]:
-    plain = not isinstance(given, (Mapping, Effect, list, tuple)) and given is not None
-    signals = CURRENT_SIGNALS.make({"name": "constant", "value": given} if plain else given)
+def _signals(direction: str, signals_or_speed) -> tuple[Effect, ...]:
+    plain = not isinstance(signals_or_speed, (Mapping, Effect, list, tuple)) and signals_or_speed is not None
+    signals = CURRENT_SIGNALS.make({"name": "constant", "value": signals_or_speed} if plain else signals_or_speed)
     within(f"the current {direction}", sum(signal.largest() for signal in signals), FASTEST)
     return tuple(signal for signal in signals if signal != ConstantSignal(0.0))
 

@@ -66,8 +66,8 @@ class ModelledVehicle(ModelledEnv):
 
         names = {state.symbol: i for i, state in enumerate(model.states)}
         std = np.sqrt(np.maximum(np.diag(cov), 0.0)).tolist()
-        shown = {"x": "x", "y": "y", "depth": "z", "phi": "phi", "theta": "theta", "psi": "psi", "u": "u"}
-        known = {name: names[symbol] for name, symbol in shown.items() if symbol in names}
+        symbol_of = {"x": "x", "y": "y", "depth": "z", "phi": "phi", "theta": "theta", "psi": "psi", "u": "u"}
+        known = {name: names[symbol] for name, symbol in symbol_of.items() if symbol in names}
         values = {name: float(mean[i]) for name, i in known.items()}
         spreads = {f"{name}_std": std[i] for name, i in known.items() if f"{name}_std" in Overlay._fields}
         return Overlay(label, **values, **spreads)

@@ -59,20 +59,20 @@ def split_channels(channels: tuple[str, ...], states: str, attitude: str) -> tup
         raise ValueError(
             f"sensors of a measured attitude must measure phi and theta, but got {', '.join(channels)}"
         )
-    told = [channels.index(name) for name in names]
-    return told, [i for i in range(len(channels)) if i not in told]
+    attitude_channels = [channels.index(name) for name in names]
+    return attitude_channels, [i for i in range(len(channels)) if i not in attitude_channels]
 
 
 def derivative_by_attitude(move: Callable, state: np.ndarray, inputs: list[float], plant: Plant) -> np.ndarray:
     """Derivative (n, 2) of a whole step with respect to its last inputs, roll and pitch (central differences)."""
 
-    def moved(tilt: np.ndarray) -> np.ndarray:
+    def propagated(tilt: np.ndarray) -> np.ndarray:
         x, u = state.tolist(), [*inputs[:-2], *tilt.tolist()]
         for _ in range(plant.substeps):
             x = move(x, u, plant.constants)
         return np.array(x)
 
-    return np.transpose([(moved(tilt) - moved(-tilt)) / (2.0 * TILT) for tilt in TILT * np.eye(2)])
+    return np.transpose([(propagated(tilt) - propagated(-tilt)) / (2.0 * TILT) for tilt in TILT * np.eye(2)])
 
 
 @dataclass(frozen=True)
@@ -260,8 +260,8 @@ def model_of_plant(
     method = one_of("integration", integration, METHODS)
     attitude = one_of("attitude", attitude, ATTITUDES)
     n, torque_is_input = MODELS[states].count, plant.propeller_torque is None
-    told, seen = split_channels(plant.channels, states, attitude)
-    observe, observe_jacobian = observation_of(tuple(plant.channels[i] for i in seen), n)
+    as_inputs, observed = split_channels(plant.channels, states, attitude)
+    observe, observe_jacobian = observation_of(tuple(plant.channels[i] for i in observed), n)
     if parameter_factors is not None:
         changed = scaled(plant.parameters, parameter_factors, VehicleParameters._fields)
         plant = plant._replace(parameters=checked(changed))
@@ -274,16 +274,16 @@ def model_of_plant(
     std, wandering = positive("current_std", current_std), positive("current_time", current_time)
     high = state_range(plant, n, std)
     prior_factor = positive("prior_cov_factor", prior_cov_factor)
-    cruise, held = speed * np.eye(n)[0], [at_cruise.get(quantity.symbol, 0.0) for quantity in inputs]
+    cruise, operating_input = speed * np.eye(n)[0], [at_cruise.get(quantity.symbol, 0.0) for quantity in inputs]
     q = _block(plant.process_noise_cov, n, 2.0 * std**2 * plant.dt / wandering)
-    r = plant.measurement_noise_cov[np.ix_(seen, seen)]
-    if told:
-        slopes = derivative_by_attitude(move, cruise, held, plant)
-        q = q + slopes @ plant.measurement_noise_cov[np.ix_(told, told)] @ slopes.T
+    r = plant.measurement_noise_cov[np.ix_(observed, observed)]
+    if as_inputs:
+        slopes = derivative_by_attitude(move, cruise, operating_input, plant)
+        q = q + slopes @ plant.measurement_noise_cov[np.ix_(as_inputs, as_inputs)] @ slopes.T
     if process_noise_cov is not None:
         q = covariance("process_noise_cov", process_noise_cov, n)
     if measurement_noise_cov is not None:
-        r = covariance("measurement_noise_cov", measurement_noise_cov, len(seen))
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(observed))
     return StateSpaceModel(
         transition=move,
         observe=observe,
@@ -297,20 +297,20 @@ def model_of_plant(
         constants=plant.constants,
         substeps=plant.substeps,
         operating_state=cruise,
-        operating_input=held,
+        operating_input=operating_input,
         state_low=np.where(np.arange(n) == 0, 0.0, -high),
         state_high=high,
         states=(*STATES, *CURRENT_STATES)[:n],
         input_quantities=inputs,
-        measurements=[CHANNELS[plant.channels[i]].quantity for i in seen],
+        measurements=[CHANNELS[plant.channels[i]].quantity for i in observed],
         outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
     )
 
 
 def state_range(plant: Plant, n: int, current_std: float = CURRENT_STD) -> np.ndarray:
     """Largest state (n,) of normal operation of n states; a current's is three standard deviations."""
-    own = operating_range(plant.parameters, plant.max_thrust)
-    return np.append(own, [3.0 * current_std] * len(CURRENT_STATES))[:n]
+    vehicle_range = operating_range(plant.parameters, plant.max_thrust)
+    return np.append(vehicle_range, [3.0 * current_std] * len(CURRENT_STATES))[:n]
 
 
 MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
@@ -324,9 +324,9 @@ def _smallest(channels: tuple[str, ...]) -> str:
 
 def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
     """The covariance of the first n states, those of the vehicle and then those of the current."""
-    whole = np.diag(np.append(np.zeros(len(cov)), [of_current] * len(CURRENT_STATES)))
-    whole[: len(cov), : len(cov)] = cov
-    return whole[:n, :n]
+    extended = np.diag(np.append(np.zeros(len(cov)), [of_current] * len(CURRENT_STATES)))
+    extended[: len(cov), : len(cov)] = cov
+    return extended[:n, :n]
 
 
 # The vehicle in continuous time: its rates and spectral densities, from which follows a model for any dt.
@@ -363,5 +363,5 @@ def continuous_auv(**arguments) -> ContinuousModel:
     """
     model = auv_model(**arguments)
     states = next(name for name, steps in MODELS.items() if steps.count == model.n)
-    symbols = [one.symbol for one in model.input_quantities]
+    symbols = [quantity.symbol for quantity in model.input_quantities]
     return ContinuousModel.of(model, rates_of(states, "K_prop" in symbols, "phi" in symbols))

@@ -120,27 +120,27 @@ def checked(parameters: VehicleParameters) -> VehicleParameters:
         positive(name, values[name], zero_allowed=True)
     if values["yG"] != 0.0:
         raise ValueError(f"yG must be 0 (a centre of gravity amidships), but got {values['yG']}")
-    found = VehicleParameters(**values)
-    matrix = mass_matrix(found)
+    result = VehicleParameters(**values)
+    matrix = mass_matrix(result)
     smallest = np.linalg.eigvalsh((matrix + matrix.T) / 2)[0]
     if smallest <= 0.0:
         raise ValueError(
             f"the mass matrix must be positive definite, but got the smallest eigenvalue {smallest:.4g}"
         )
-    return found
+    return result
 
 
-def parameters_of(given: Mapping) -> VehicleParameters:
+def parameters_of(fields: Mapping) -> VehicleParameters:
     """Parameters from a mapping of all fields but those of linear damping, which may be left out."""
     known, needed = (
         VehicleParameters._fields,
         set(VehicleParameters._fields) - set(VehicleParameters._field_defaults),
     )
-    unknown, missing = sorted(map(str, set(given) - set(known))), sorted(needed - set(given))
+    unknown, missing = sorted(map(str, set(fields) - set(known))), sorted(needed - set(fields))
     if unknown or missing:
-        said = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"got {', '.join(unknown)}"] * bool(unknown)
-        raise ValueError(f"a preset mapping must have the fields of VehicleParameters, but {' and '.join(said)}")
-    return checked(VehicleParameters(**given))
+        faults = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"got {', '.join(unknown)}"] * bool(unknown)
+        raise ValueError(f"a preset mapping must have the fields of VehicleParameters, but {' and '.join(faults)}")
+    return checked(VehicleParameters(**fields))
 
 
 def derive_constants(p: VehicleParameters, substep: float = 0.0, propeller_torque: float = 0.0) -> Constants:

@@ -68,9 +68,9 @@ def run(name: str) -> np.ndarray:
     for k in range(count):
         x = navigation_substep(x, manoeuvre.inputs((k + 0.5) * step), c)
         states.append(x)
-    found = np.array(states)
-    found.setflags(write=False)
-    return found
+    trajectory = np.array(states)
+    trajectory.setflags(write=False)
+    return trajectory
 
 
 def _switched(time: float, period: float | None) -> float:
@@ -135,30 +135,30 @@ class Path(NamedTuple):
         )
 
 
-def make_path(given, depth: float = 0.0) -> Path:
+def make_path(path, depth: float = 0.0) -> Path:
     """A path from a manoeuvre's name or from two or more points (north, east, down) [m], so much [m] deeper.
 
     Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
-    if isinstance(given, str):
-        points = by_arc_length(run(one_of("path", given, tuple(MANOEUVRES)))[:, 9:], SPACING)
+    if isinstance(path, str):
+        points = by_arc_length(run(one_of("path", path, tuple(MANOEUVRES)))[:, 9:], SPACING)
     else:
         rule = "path must be a manoeuvre's name or two or more points of three finite numbers [m]"
         try:
-            points = as_floats(given)
+            points = as_floats(path)
         except ValueError:
             points = np.empty(0)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
-            raise ValueError(f"{rule}, but got {short_repr(given)}")
+            raise ValueError(f"{rule}, but got {short_repr(path)}")
         if len(points) > MOST_POINTS or np.abs(points).max() > 1e6:
             raise ValueError(
-                f"path must have at most {MOST_POINTS} points within 1e6 m, but got {short_repr(given)}"
+                f"path must have at most {MOST_POINTS} points within 1e6 m, but got {short_repr(path)}"
             )
     pieces = np.diff(points, axis=0)
     lengths = np.linalg.norm(pieces, axis=1)
     if (np.hypot(pieces[:, 0], pieces[:, 1]) < 1e-6 * (1.0 + lengths)).any():
         raise ValueError(
-            f"each piece of path must lead somewhere else than up or down, but got {short_repr(given)}"
+            f"each piece of path must lead somewhere else than up or down, but got {short_repr(path)}"
         )
     return Path(points[:-1] + [0.0, 0.0, depth], pieces / lengths[:, None], lengths)
 
@@ -166,5 +166,5 @@ def make_path(given, depth: float = 0.0) -> Path:
 def by_arc_length(points: np.ndarray, spacing: float) -> np.ndarray:
     """Points of a polyline (K, 3) at equal distances along it, near to `spacing`, both ends included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    places = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))
-    return np.stack([np.interp(places, along, column) for column in points.T], axis=-1)
+    distances = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))
+    return np.stack([np.interp(distances, along, column) for column in points.T], axis=-1)

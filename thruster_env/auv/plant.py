@@ -169,27 +169,27 @@ def make_plant(
     )
 
 
-def _sensors(given, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
+def _sensors(sensors, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
     """Effects and instrument of each channel."""
-    if given is None or isinstance(given, str):
-        instruments = suite("default" if given is None else given)
-        return {channel: _timing(one, dt) for channel, one in instruments.items()}, instruments
-    if not isinstance(given, Mapping):
-        if not hasattr(given, "__iter__"):
+    if sensors is None or isinstance(sensors, str):
+        instruments = suite("default" if sensors is None else sensors)
+        return {channel: _timing(instrument, dt) for channel, instrument in instruments.items()}, instruments
+    if not isinstance(sensors, Mapping):
+        if not hasattr(sensors, "__iter__"):
             rule = "sensors must be a suite's name, a list of channels or a mapping from them"
-            raise ValueError(f"{rule}, but got {short_repr(given)}")
-        names = list(given)
+            raise ValueError(f"{rule}, but got {short_repr(sensors)}")
+        names = list(sensors)
         known = [one_of("a channel of sensors", name, tuple(CHANNELS)) for name in names]
-        given = {name: _timing(default_instrument(name), dt) for name in known}
-        if len(given) != len(names):
+        sensors = {name: _timing(default_instrument(name), dt) for name in known}
+        if len(sensors) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
-    if not given:
+    if not sensors:
         raise ValueError("sensors must name at least one channel, but got none")
-    if len(given) > MAX_CHANNELS:
-        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
+    if len(sensors) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(sensors)}")
     effects = {
         one_of("a channel of sensors", channel, tuple(CHANNELS)): VEHICLE_SENSOR_EFFECTS.make(effects)
-        for channel, effects in given.items()
+        for channel, effects in sensors.items()
     }
     return effects, {channel: default_instrument(channel) for channel in effects}
 
@@ -200,31 +200,31 @@ def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
     return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
 
 
-def _initial_distribution(given) -> tuple[np.ndarray, np.ndarray]:
+def _initial_distribution(initial_state) -> tuple[np.ndarray, np.ndarray]:
     at_speed = np.eye(STATES_COUNT)[0]
     fixed = np.zeros((STATES_COUNT, STATES_COUNT))
-    if given is None:
+    if initial_state is None:
         return CRUISE_SPEED * at_speed, np.diag(DEFAULT_INITIAL_VARIANCES)
-    if not isinstance(given, Mapping):
-        return state("initial_state", given), fixed
-    if set(given) == {"speed"}:
-        return positive("the speed of initial_state", given["speed"], zero_allowed=True) * at_speed, fixed
-    if set(given) == {"mean", "cov"}:
-        mean = state("the mean of initial_state", given["mean"])
+    if not isinstance(initial_state, Mapping):
+        return state("initial_state", initial_state), fixed
+    if set(initial_state) == {"speed"}:
+        return positive("the speed of initial_state", initial_state["speed"], zero_allowed=True) * at_speed, fixed
+    if set(initial_state) == {"mean", "cov"}:
+        mean = state("the mean of initial_state", initial_state["mean"])
         largest = LARGEST_STATE**2
-        return mean, covariance("the cov of initial_state", given["cov"], STATES_COUNT, largest=largest)
+        return mean, covariance("the cov of initial_state", initial_state["cov"], STATES_COUNT, largest=largest)
     raise ValueError(
         "initial_state must be None, twelve numbers, {'speed': U} or {'mean': [..], 'cov': [..]}, "
-        f"but got {short_repr(given)}"
+        f"but got {short_repr(initial_state)}"
     )
 
 
 def state(name: str, value) -> np.ndarray:
     """Return a state (12,); raise ValueError unless it is twelve numbers from which finite ones can follow."""
-    given = vector(name, value, STATES_COUNT)
-    if np.abs(given).max() > LARGEST_STATE:
+    entries = vector(name, value, STATES_COUNT)
+    if np.abs(entries).max() > LARGEST_STATE:
         raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
-    return given
+    return entries
 
 
 # A vehicle as data for JSON, for files that record their plant.

@@ -94,40 +94,40 @@ class Registry:
 
         return decorate
 
-    def make(self, given) -> tuple[Effect, ...]:
+    def make(self, effects) -> tuple[Effect, ...]:
         """Effects from None, one effect or a sequence of them, each an object or a mapping with its `name`.
 
         Raises ValueError if an argument is wrong; the message states the rule and the value.
         """
-        if given is None:
+        if effects is None:
             return ()
-        if isinstance(given, (Mapping, Effect)):
-            given = [given]
-        if isinstance(given, str) or not hasattr(given, "__iter__"):
+        if isinstance(effects, (Mapping, Effect)):
+            effects = [effects]
+        if isinstance(effects, str) or not hasattr(effects, "__iter__"):
             raise ValueError(
-                f"{self.argument} must be a list of mappings with a name, but got {short_repr(given)}"
+                f"{self.argument} must be a list of mappings with a name, but got {short_repr(effects)}"
             )
-        return tuple(self._make_one(one) for one in given)
+        return tuple(self._make_one(entry) for entry in effects)
 
-    def _make_one(self, given) -> Effect:
+    def _make_one(self, entry) -> Effect:
         known: tuple[type[Effect], ...] = tuple(self.effects.values())
-        if isinstance(given, known):
-            return given
+        if isinstance(entry, known):
+            return entry
         names = ", ".join(self.effects)
-        if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
+        if not isinstance(entry, Mapping) or entry.get("name") not in tuple(self.effects):
             rule = f"each entry of {self.argument} must be a mapping whose name is one of {names}"
-            raise ValueError(f"{rule}, but got {short_repr(given)}")
-        cls = self.effects[given["name"]]
-        arguments = {key: value for key, value in given.items() if key != "name"}
+            raise ValueError(f"{rule}, but got {short_repr(entry)}")
+        cls = self.effects[entry["name"]]
+        arguments = {key: value for key, value in entry.items() if key != "name"}
         fields = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(arguments) - set(fields), key=str)
         if unknown:
-            rule = f"arguments of {given['name']!r} must be among {', '.join(fields)}"
+            rule = f"arguments of {entry['name']!r} must be among {', '.join(fields)}"
             raise ValueError(f"{rule}, but got {unknown}")
         try:
             return cls(**arguments)
         except TypeError:  # a field without a default is missing
-            rule = f"{given['name']!r} must be given {', '.join(fields)}"
+            rule = f"{entry['name']!r} must be given {', '.join(fields)}"
             raise ValueError(f"{rule}, but got {short_repr(arguments)}") from None
 
 
@@ -158,9 +158,9 @@ def encoded(
     """
     numbers: list[float] = []
     rows = 0
-    for place, effect in enumerate(effects):
+    for index, effect in enumerate(effects):
         parameters = _representable(effect, effect.parameters(context))
-        number = place + (lost_with if effect.loses and lost_with is not None else first_number)
+        number = index + (lost_with if effect.loses and lost_with is not None else first_number)
         header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
         numbers += [*header, *parameters]
         rows += effect.rows(context)
@@ -171,8 +171,10 @@ def _representable(effect: Effect, parameters: list[float]) -> list[float]:
     """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
     smallest, largest = MAGNITUDES
     parts: list[Any] = [*_numbers(dataclasses.astuple(effect)), 0.0]
-    given = [abs(value) for value in np.hstack(parts) if value]
-    if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
+    magnitudes = [abs(value) for value in np.hstack(parts) if value]
+    if min(magnitudes, default=1.0) < smallest or not all(
+        abs(value) <= largest for value in (*magnitudes, *parameters)
+    ):
         rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
         raise ValueError(f"{rule}, and so must what follows from them, but got {short_repr(effect)}")
     return [float(value) for value in parameters]

@@ -20,21 +20,21 @@ LONGEST_INTERVAL = 1_000_000  # steps between two samples
 
 
 @inlined
-def hold_missing(memory, b, j, target, held, valid, missing, begin):
-    """Where copy j's measurement is missing repeat the last one, kept in row `held`, and mark it as not valid."""
+def hold_missing(memory, b, j, target, last, valid, missing, begin):
+    """Where copy j's measurement is missing repeat the last one, kept in row `last`, and mark it as not valid."""
     if begin:
-        memory[b, held, j] = 0.0
+        memory[b, last, j] = 0.0
     if missing:
-        memory[b, target, j] = memory[b, held, j]
+        memory[b, target, j] = memory[b, last, j]
         memory[b, valid, j] = 0.0
-    memory[b, held, j] = memory[b, target, j]
+    memory[b, last, j] = memory[b, target, j]
 
 
 @inlined
 def dropout(memory, b, target, rows, number, numbers, at, begin):
     """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
     begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
-    held, lost = rows, rows + 1
+    last, lost = rows, rows + 1
     for j in range(memory.shape[2]):
         u, _, _, _ = uniforms(memory, b, j, number)
         if begin:
@@ -43,7 +43,7 @@ def dropout(memory, b, target, rows, number, numbers, at, begin):
             memory[b, lost, j] = 0.0 if u < ends else 1.0
         else:
             memory[b, lost, j] = 1.0 if u < begins else 0.0
-        hold_missing(memory, b, j, target, held, valid, memory[b, lost, j] > 0.0, begin)
+        hold_missing(memory, b, j, target, last, valid, memory[b, lost, j] > 0.0, begin)
 
 
 @inlined
@@ -137,16 +137,16 @@ def probability(name: str, value) -> float:
 def recorded_value(time, numbers, at):
     """Value of a series at a time [s], linear between samples; numbers: sample time, repeat, count, values."""
     sample_time, repeat, count = numbers[at], numbers[at + 1], int(numbers[at + 2])
-    place = max(time / sample_time, 0.0)
+    position = max(time / sample_time, 0.0)
     if repeat > 0.0:
-        place = place % count
+        position = position % count
     else:
-        place = min(place, count - 1.0)
-    before = min(int(place), count - 1)
+        position = min(position, count - 1.0)
+    before = min(int(position), count - 1)
     after = before + 1
     if after >= count:
         after = 0 if repeat > 0.0 else before
-    share = place - before
+    share = position - before
     return (1.0 - share) * numbers[at + 3 + before] + share * numbers[at + 3 + after]
 
 

@@ -78,12 +78,12 @@ def delay(memory, b, target, rows, number, numbers, at, begin):
             for i in range(steps):
                 memory[b, rows + i, j] = memory[b, target, j]
                 memory[b, rows + steps + i, j] = memory[b, valid, j]
-        place = rows + int(memory[b, STEP, j]) % steps
+        slot = rows + int(memory[b, STEP, j]) % steps
         now, now_valid = memory[b, target, j], memory[b, valid, j]
-        memory[b, target, j] = memory[b, place, j]
-        memory[b, valid, j] = memory[b, place + steps, j]
-        memory[b, place, j] = now
-        memory[b, place + steps, j] = now_valid
+        memory[b, target, j] = memory[b, slot, j]
+        memory[b, valid, j] = memory[b, slot + steps, j]
+        memory[b, slot, j] = now
+        memory[b, slot + steps, j] = now_valid
 
 
 @SENSOR_EFFECTS.register("student-t")

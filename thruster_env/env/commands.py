@@ -22,8 +22,8 @@ def one_number(action, quantity: Quantity) -> float:
             return number
     try:
         item = action.item if hasattr(action, "item") else np.asarray(action).item
-        given = item()
-        number = math.nan if isinstance(given, (str, bytes)) else float(given)
+        entry = item()
+        number = math.nan if isinstance(entry, (str, bytes)) else float(entry)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
         number = math.nan
     if number != number:
@@ -65,9 +65,11 @@ def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: n
     wrong = np.isnan(commands)
     if wrong.any():
         lost = wrong.reshape(copies, -1).any(axis=1)
-        found = np.flatnonzero(lost if ignored is None else lost & ~ignored)
-        if len(found):
-            raise ValueError(f"actions must be {_rows(quantities)} and not NaN, but got NaN in copy {found[0]}")
+        lost_copies = np.flatnonzero(lost if ignored is None else lost & ~ignored)
+        if len(lost_copies):
+            raise ValueError(
+                f"actions must be {_rows(quantities)} and not NaN, but got NaN in copy {lost_copies[0]}"
+            )
     return commands.reshape(-1) if p == 1 else commands
 
 
@@ -150,6 +152,6 @@ def _space(entries: int) -> gym.spaces.Box:
 
 def _observed(state: np.ndarray, observation: np.ndarray, appended: int) -> np.ndarray:
     """State (..., n), then the last entries of an observation (..., d), in float32."""
-    kept = observation[..., observation.shape[-1] - appended :]
+    last_entries = observation[..., observation.shape[-1] - appended :]
     with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
-        return np.concatenate([state.astype(np.float32), kept], axis=-1)
+        return np.concatenate([state.astype(np.float32), last_entries], axis=-1)

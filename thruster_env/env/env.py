@@ -121,8 +121,8 @@ class ReportRows(NamedTuple):
     @property
     def states(self) -> int:
         """Number of states, for a plant whose info has them."""
-        place = self.info["state"]
-        return place.stop - place.start if isinstance(place, slice) else 1
+        rows = self.info["state"]
+        return rows.stop - rows.start if isinstance(rows, slice) else 1
 
     @property
     def flags(self) -> tuple[int, ...]:
@@ -154,7 +154,7 @@ def observations_of(report: np.ndarray, observed: list[int]) -> np.ndarray:
 
 def views_of(report: np.ndarray, rows: ReportRows) -> tuple[np.ndarray, ...]:
     """Views of the vectors in a report (reported,) that `info_maker` takes."""
-    vectors = [report[place] for place in rows.info.values() if isinstance(place, slice)]
+    vectors = [report[index] for index in rows.info.values() if isinstance(index, slice)]
     return (*vectors, report[rows.valid])
 
 
@@ -164,16 +164,16 @@ def info_maker(rows: ReportRows) -> Callable[[np.ndarray, tuple[np.ndarray, ...]
     It is generated for the plant's entries, because a step has to be fast. Numbers are NumPy scalars, because
     clients ask every value for its dtype.
     """
-    places = tuple((name, None if isinstance(place, slice) else place) for name, place in rows.info.items())
-    return _info_maker(places, bool(rows.dropping))
+    layout = tuple((name, None if isinstance(index, slice) else index) for name, index in rows.info.items())
+    return _info_maker(layout, bool(rows.dropping))
 
 
 @cache
-def _info_maker(places: tuple[tuple[str, int | None], ...], drops: bool) -> Callable:
-    vectors = [name for name, place in places if place is None]
+def _info_maker(layout: tuple[tuple[str, int | None], ...], drops: bool) -> Callable:
+    vectors = [name for name, index in layout if index is None]
     entries = [
-        f"{name!r}: views[{vectors.index(name)}].copy()" if place is None else f"{name!r}: report[{place}]"
-        for name, place in places
+        f"{name!r}: views[{vectors.index(name)}].copy()" if index is None else f"{name!r}: report[{index}]"
+        for name, index in layout
     ]
     if drops:
         entries.append(f"'measurement_valid': views[{len(vectors)}] > 0.0")
@@ -182,7 +182,7 @@ def _info_maker(places: tuple[tuple[str, int | None], ...], drops: bool) -> Call
 
 def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str, np.ndarray]:
     """The same of N copies: arrays with one row per copy, and the mask (N,) as `_key` for each key."""
-    info = {name: report[place].T for name, place in rows.info.items()}
+    info = {name: report[index].T for name, index in rows.info.items()}
     if rows.dropping:
         info["measurement_valid"] = report[rows.valid].T > 0.0
     return info | {f"_{key}": mask for key in info}

@@ -75,8 +75,8 @@ class ModelEnv(gym.Env):
 
     def step(self, action):
         """Apply an input (p,), clipped to its bounds, for one step; ValueError for one that is not p numbers."""
-        given = some_numbers(action, self.truth.input_quantities)
-        self._u[:] = np.clip(given, self.action_space.low, self.action_space.high)
+        inputs = some_numbers(action, self.truth.input_quantities)
+        self._u[:] = np.clip(inputs, self.action_space.low, self.action_space.high)
         self._step += 1
         observation, info = self._moved()
         return observation, 0.0, False, False, info
@@ -103,7 +103,9 @@ def with_noise(
 
 def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
     try:
-        low, high = (np.array(np.broadcast_to(np.asarray(one, dtype=np.float64), count)) for one in (low, high))
+        low, high = (
+            np.array(np.broadcast_to(np.asarray(bound, dtype=np.float64), count)) for bound in (low, high)
+        )
     except (TypeError, ValueError):
         low, high = np.full(1, np.nan), np.zeros(1)
     if not (low <= high).all():
@@ -173,9 +175,9 @@ class ModelledEnv:
         A file without this entry (None) is not compared.
         """
         if tuned_for is not None:
-            others = self.tuned_differences(tuned_for, file)
-            if others:
-                warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=5)
+            differences = self.tuned_differences(tuned_for, file)
+            if differences:
+                warnings.warn(f"{file} was tuned for {', '.join(differences)}", stacklevel=5)
 
 
 # A policy's memory between two steps of its env.

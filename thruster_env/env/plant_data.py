@@ -29,14 +29,14 @@ def check_same(entries: Entries, tuned_for: Mapping, data: Mapping, file: str | 
         file: its path.
     """
     try:
-        essential, others = differences(entries, tuned_for, data)
+        essential, further = differences(entries, tuned_for, data)
     except ValueError as error:
         raise ValueError(f"{error} (in the tuned file {file})") from None
     if essential:
         raise ValueError(
             f"a tuned file must be for the plant it is used with, but {file} was tuned for {', '.join(essential)}"
         )
-    return others
+    return further
 
 
 def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
@@ -51,8 +51,8 @@ def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str
     compared = [name for name in entries.names if name not in ("preset", "parameters")]
     differing = [name for name in compared if not _alike(then[name], now[name])]
     essential = [_both(name, then[name], now[name]) for name in differing if name in entries.essential]
-    others = [_both(name, then[name], now[name]) for name in differing if name not in entries.essential]
-    return _parameters_that_differ(entries.parameters, then, now) + essential, others
+    further = [_both(name, then[name], now[name]) for name in differing if name not in entries.essential]
+    return _parameters_that_differ(entries.parameters, then, now) + essential, further
 
 
 def mappings(effects: tuple[Effect, ...]) -> list[dict]:
@@ -62,11 +62,13 @@ def mappings(effects: tuple[Effect, ...]) -> list[dict]:
 
 def _parameters_that_differ(known: tuple[str, ...], then: Mapping, now: Mapping) -> list[str]:
     """The presets if both have one, else the parameters."""
-    one, other = (data["parameters"] if isinstance(data["parameters"], Mapping) else {} for data in (then, now))
-    names = [name for name in known if not _alike(one.get(name), other.get(name))]
+    earlier, later = (
+        data["parameters"] if isinstance(data["parameters"], Mapping) else {} for data in (then, now)
+    )
+    names = [name for name in known if not _alike(earlier.get(name), later.get(name))]
     if names and then["preset"] is not None and now["preset"] is not None:
         return [_both("preset", then["preset"], now["preset"])]
-    return [_both(name, one.get(name), other.get(name)) for name in names]
+    return [_both(name, earlier.get(name), later.get(name)) for name in names]
 
 
 def _both(name: str, then, now) -> str:
@@ -78,12 +80,12 @@ def _words(value) -> str:
     return ", ".join(value) if listed else value if isinstance(value, str) else short_repr(value)
 
 
-def _alike(one, other) -> bool:
+def _alike(first, other) -> bool:
     """Whether two values of JSON are the same but for rounding."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_alike, one, other))
-    if isinstance(one, int | float) and isinstance(other, int | float):
-        return math.isclose(one, other, rel_tol=1e-9)
-    return one == other
+    if isinstance(first, Mapping) and isinstance(other, Mapping):
+        return first.keys() == other.keys() and all(_alike(first[key], other[key]) for key in first)
+    if isinstance(first, list) and isinstance(other, list):
+        return len(first) == len(other) and all(map(_alike, first, other))
+    if isinstance(first, int | float) and isinstance(other, int | float):
+        return math.isclose(first, other, rel_tol=1e-9)
+    return first == other

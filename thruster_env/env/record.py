@@ -147,8 +147,8 @@ class ReplayEnv(gym.Env):
         valid = ~np.isnan(z)
         self._last = np.where(valid, z, self._last)
         info = {"measurement": self._last.copy(), "measurement_valid": valid}
-        there = {key: float(values[self._row]) for key, values in self.log.references.items()}
-        info["references"] = {key: value for key, value in there.items() if value == value}
+        references = {key: float(values[self._row]) for key, values in self.log.references.items()}
+        info["references"] = {key: value for key, value in references.items() if value == value}
         return self._last.copy(), info
 
 
@@ -162,13 +162,18 @@ def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceM
         known = {name: value for name, value in options.items() if value is not None}
         log = read_log(log, _made(_maker(offer, options.get("dt") or ANY_DT), model), **known)
     maker = _maker(offer, log.dt)
-    found = _made(maker, model)
-    for ones, others, what in (
-        (log.input_quantities, found.input_quantities, "inputs"),
-        (log.measured, found.measurements, "measurements"),
+    made_model = _made(maker, model)
+    for logged, modelled, what in (
+        (log.input_quantities, made_model.input_quantities, "inputs"),
+        (log.measured, made_model.measurements, "measurements"),
     ):
-        if [(one.symbol, one.unit) for one in ones] != [(one.symbol, one.unit) for one in others]:
-            listed = [", ".join(one.short_label for one in some) or "none" for some in (ones, others)]
+        if [(quantity.symbol, quantity.unit) for quantity in logged] != [
+            (quantity.symbol, quantity.unit) for quantity in modelled
+        ]:
+            listed = [
+                ", ".join(quantity.short_label for quantity in quantities) or "none"
+                for quantities in (logged, modelled)
+            ]
             raise ValueError(f"{what} of log {log.name} must be the model's, {listed[1]}, but it has {listed[0]}")
     return log, maker
 
@@ -194,7 +199,7 @@ def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
 
 def _made(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
     try:
-        found = maker()
+        result = maker()
     except ValueError:
         raise
     except Exception as error:
@@ -202,8 +207,8 @@ def _made(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
             f"the model of a log must be made without arguments, but {short_repr(named)} raised "
             f"{error_line(error)}"
         ) from error
-    if not isinstance(found, StateSpaceModel):
+    if not isinstance(result, StateSpaceModel):
         raise ValueError(
-            f"the model of a log must be a StateSpaceModel, but {short_repr(named)} makes {short_repr(found)}"
+            f"the model of a log must be a StateSpaceModel, but {short_repr(named)} makes {short_repr(result)}"
         )
-    return found
+    return result

@@ -140,9 +140,9 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         return infos_of(report, self._rows, np.ones(self.num_envs, dtype=bool) if mask is None else mask)
 
 
-def _autoreset_mode(given) -> AutoresetMode:
+def _autoreset_mode(mode_or_name) -> AutoresetMode:
     try:
-        return AutoresetMode(given)
+        return AutoresetMode(mode_or_name)
     except ValueError:
         names = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        raise ValueError(f"autoreset_mode must be one of {names}, but got {given!r}") from None
+        raise ValueError(f"autoreset_mode must be one of {names}, but got {mode_or_name!r}") from None

@@ -91,8 +91,8 @@ class Canvas:
         """Draw only inside a rectangle from now on; without arguments, everywhere again."""
         self.large.set_clip([round(value * SCALE) for value in (left, top, width, height)])
 
-    def text(self, text: str, place, size: int = 11, colour=SOFT_INK, align: float = 0.0) -> int:
-        """Write at place, the left (align 0), middle (0.5) or right (1) of the text's centre line; its width [px].
+    def text(self, text: str, point, size: int = 11, colour=SOFT_INK, align: float = 0.0) -> int:
+        """Write with the left (align 0), middle (0.5) or right (1) of the centre line at a point; its width [px].
 
         Text and pictures come on top of everything drawn, in the order of the calls.
         """
@@ -103,7 +103,7 @@ class Canvas:
             self._words[key] = self._word(text, size, colour)
         word = self._words[key]
         (width, height), zoom = word.get_size(), self._zoom
-        self._on_top.append((word, (round(zoom * place[0] - align * width), round(zoom * place[1] - height / 2))))
+        self._on_top.append((word, (round(zoom * point[0] - align * width), round(zoom * point[1] - height / 2))))
         return width if zoom == 1.0 else round(width / zoom)
 
     def picture(self, array: np.ndarray, centre) -> None:
@@ -113,8 +113,8 @@ class Canvas:
         if self._zoom != 1.0:
             width, height = (max(1, round(side * self._zoom)) for side in (width, height))
             image = pygame.transform.smoothscale(image, (width, height))
-        place = round(self._zoom * centre[0] - width / 2), round(self._zoom * centre[1] - height / 2)
-        self._on_top.append((image, place, None, pygame.BLEND_PREMULTIPLIED))
+        corner = round(self._zoom * centre[0] - width / 2), round(self._zoom * centre[1] - height / 2)
+        self._on_top.append((image, corner, None, pygame.BLEND_PREMULTIPLIED))
 
     def keep(self) -> None:
         """Make what has been drawn so far the background of every frame."""

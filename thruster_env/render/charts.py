@@ -183,8 +183,8 @@ class Charts:
         canvas, count = self._canvas, len(columns[strip.name])
         x = RIGHT - np.arange(count)[::-1] * (RIGHT - LEFT) / STEPS
         estimate, std = columns[f"estimated_{strip.name}"], columns[f"estimated_{strip.name}_std"]
-        others = [columns[name] for name in (strip.measured, strip.reference) if name]
-        values = np.concatenate((columns[strip.name], estimate, *others))
+        compared = [columns[name] for name in (strip.measured, strip.reference) if name]
+        values = np.concatenate((columns[strip.name], estimate, *compared))
         axis = fitting_axis(values, strip.scale, strip.top + 2, strip.height - 4)._replace(downward=strip.downward)
 
         def line(values, colour, width):

@@ -37,9 +37,9 @@ from thruster_env.thruster.preset_file import BY_CHANNEL, checked_band, is_file,
 _FURTHER = (
     "dead_band_low",  # [V], not positive
     "dead_band_high",  # [V], not negative
-    *(f"bias_{place}" for place in range(MAX_CHANNELS)),  # by the channel's place, in its unit
-    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # a: the reading's share in what a lagging sensor holds,
-    *(f"after_{place}" for place in range(MAX_CHANNELS)),  # w: the share of the present value in the reading
+    *(f"bias_{index}" for index in range(MAX_CHANNELS)),  # by the channel's place, in its unit
+    *(f"kept_{index}" for index in range(MAX_CHANNELS)),  # a: the reading's share in what a lagging sensor holds,
+    *(f"after_{index}" for index in range(MAX_CHANNELS)),  # w: the share of the present value in the reading
 )
 _named_tuple: Any = NamedTuple  # type checkers know fields only where they are written out
 LoggedConstants = _named_tuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
@@ -113,22 +113,24 @@ def logged_model(
     Raises:
         ValueError: if an argument is wrong; the message states the rule and the value.
     """
-    plant, seen = logged_plant(dead_band=dead_band, bias=bias, lag=lag, **plant_arguments)
+    plant, recorder = logged_plant(dead_band=dead_band, bias=bias, lag=lag, **plant_arguments)
     base = model_of_plant(
         plant._replace(dead_band=NO_BAND), operating_voltage=operating_voltage, prior_cov_factor=prior_cov_factor
     )
-    return with_recorder(base, plant, seen)
+    return with_recorder(base, plant, recorder)
 
 
 def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Recorder]:
     """A plant and the properties of its recorder, arguments of `logged_model`."""
     preset = plant_arguments.get("preset")
     recorder = read_preset(preset).recorder if preset is not None and is_file(preset) else {}
-    own = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
-    of, dt = own.get("dt"), plant_arguments.get("dt")
-    if of is not None and dt is not None and "process_noise_cov" in own and not same_dt(of, dt):
-        own["process_noise_cov"] = noise_for_dt(own["process_noise_cov"], of, positive("dt", dt)).tolist()
-    plant = make_plant(**{**own, **plant_arguments})
+    defaults = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
+    of, dt = defaults.get("dt"), plant_arguments.get("dt")
+    if of is not None and dt is not None and "process_noise_cov" in defaults and not same_dt(of, dt):
+        defaults["process_noise_cov"] = noise_for_dt(
+            defaults["process_noise_cov"], of, positive("dt", dt)
+        ).tolist()
+    plant = make_plant(**{**defaults, **plant_arguments})
     variances = [recorder.get("measurement_noise_cov", {}).get(channel) for channel in plant.channels]
     if None not in variances and plant_arguments.get("measurement_noise_cov") is None:
         cov = covariance("measurement_noise_cov", variances, len(variances), positive_definite=True)
@@ -137,27 +139,31 @@ def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> t
         {channel: value for channel, value in recorder.get(name, {}).items() if channel in plant.channels}
         for name in ("bias", "lag")
     ]
-    bias, lag = (of_file if given is None else given for of_file, given in zip(known, (bias, lag), strict=True))
+    bias, lag = (
+        of_file if argument is None else argument for of_file, argument in zip(known, (bias, lag), strict=True)
+    )
     return plant, recorder_of(plant, dead_band, bias, lag)
 
 
-def with_recorder(base: StateSpaceModel, plant: Plant, seen: Recorder, *, always: bool = False) -> StateSpaceModel:
+def with_recorder(
+    base: StateSpaceModel, plant: Plant, recorder: Recorder, *, always: bool = False
+) -> StateSpaceModel:
     """A plant's model with its recorder's properties; without any the model itself, unless `always`."""
-    if seen == Recorder() and not always:
+    if recorder == Recorder() and not always:
         return base
-    channels, lags, biases = plant.channels, dict(seen.lag), dict(seen.bias)
+    channels, lags, biases = plant.channels, dict(recorder.lag), dict(recorder.bias)
     lagging = tuple(channel in lags for channel in channels)
     of_plant = Constants(*base.constants)
     step = of_plant.substep
-    given = (
+    values = (
         *of_plant,
-        seen.dead_band_low,
-        seen.dead_band_high,
+        recorder.dead_band_low,
+        recorder.dead_band_high,
         *_by_place(biases.get(channel, 0.0) for channel in channels),
         *_by_place(lag_weights(lags.get(channel, 0.0), step)[0] for channel in channels),
         *_by_place(lag_weights(lags.get(channel, 0.0), step)[1] for channel in channels),
     )
-    constants = LaggingConstants(*given, 1.0) if any(lagging) else LoggedConstants(*given)
+    constants = LaggingConstants(*values, 1.0) if any(lagging) else LoggedConstants(*values)
     f, f_slopes, h, h_slopes = _functions(channels, lagging)
     read = channel_functions(channels)[0]
 
@@ -167,14 +173,16 @@ def with_recorder(base: StateSpaceModel, plant: Plant, seen: Recorder, *, always
         return np.array([*state, *(shows[i] for i, lags_behind in enumerate(lagging) if lags_behind)])
 
     voltage = float(base.operating_input[0])
-    driving = float(outside(voltage, seen.dead_band_low, seen.dead_band_high))
+    driving = float(outside(voltage, recorder.dead_band_low, recorder.dead_band_high))
     operating = steady_state(plant.parameters, driving, plant.ambient_velocity)[:2]
-    added = [one for one, lags_behind in zip(base.measurements, lagging, strict=True) if lags_behind]
+    added = [quantity for quantity, lags_behind in zip(base.measurements, lagging, strict=True) if lags_behind]
     slopes = np.vstack([np.eye(2), _slopes_at(base, plant.channels, lagging)])
     q = np.zeros((2 + len(added),) * 2)
     q[:2, :2] = base.process_noise_cov
     ends = [extended(end) for end in (base.state_low, base.state_high)]
-    lagging_states = (Quantity(f"lagging {one.symbol}", f"{one.symbol}_lag", one.unit) for one in added)
+    lagging_states = (
+        Quantity(f"lagging {quantity.symbol}", f"{quantity.symbol}_lag", quantity.unit) for quantity in added
+    )
     return base.replace(
         transition=f,
         observe=h,
@@ -185,7 +193,7 @@ def with_recorder(base: StateSpaceModel, plant: Plant, seen: Recorder, *, always
         prior_mean=extended(base.prior_mean),
         prior_cov=slopes @ base.prior_cov @ slopes.T,
         operating_state=extended(operating),
-        operating_points=None if seen != Recorder() else base.operating_points,
+        operating_points=None if recorder != Recorder() else base.operating_points,
         state_low=np.minimum(*ends),
         state_high=np.maximum(*ends),
         states=(*base.states, *lagging_states),
@@ -218,24 +226,24 @@ def lag_weights(lag: float, step: float) -> tuple[float, float]:
 
 
 def _by_place(values) -> tuple[float, ...]:
-    given = [float(value) for value in values]
-    return (*given, *(0.0,) * (MAX_CHANNELS - len(given)))
+    entries = [float(value) for value in values]
+    return (*entries, *(0.0,) * (MAX_CHANNELS - len(entries)))
 
 
 def _slopes_at(base: StateSpaceModel, channels, lagging) -> np.ndarray:
     """Slopes of what lagging sensors show at the prior mean, (lags, 2)."""
     rows = channel_functions(channels)[1](tuple(base.prior_mean), base.constants)
-    some = [row for row, lags_behind in zip(rows, lagging, strict=True) if lags_behind]
-    return np.array(some, dtype=np.float64).reshape(len(some), 2)
+    lagging_rows = [row for row, lags_behind in zip(rows, lagging, strict=True) if lags_behind]
+    return np.array(lagging_rows, dtype=np.float64).reshape(len(lagging_rows), 2)
 
 
 @makes_functions
 def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Callable, ...]:
     """Transition, its Jacobian, observation and its Jacobian, for some channels of which some lag."""
     read, read_slopes = channel_functions(channels)
-    places = [i for i, lags_behind in enumerate(lagging) if lags_behind]
-    n = 2 + len(places)
-    state_of = {channel: 2 + number for number, channel in enumerate(places)}
+    lagging_channels = [i for i, lags_behind in enumerate(lagging) if lags_behind]
+    n = 2 + len(lagging_channels)
+    state_of = {channel: 2 + number for number, channel in enumerate(lagging_channels)}
     names: dict[str, Any] = {
         "substep": substep,
         "substep_jacobian": substep_jacobian,
@@ -245,23 +253,23 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     }
     drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
     move = drive, "s = substep((x[0], x[1]), v, c)"
-    reads = ("y = read((x[0], x[1]), c)",) if places else ()
-    shown = {i: f"((1.0 - c.after_{i}) * x[{state_of[i]}] + c.after_{i} * y[{i}])" for i in places}
-    lags = [f"c.kept_{i} * {shown[i]} + (1.0 - c.kept_{i}) * y[{i}]" for i in places]
+    reads = ("y = read((x[0], x[1]), c)",) if lagging_channels else ()
+    lagged = {i: f"((1.0 - c.after_{i}) * x[{state_of[i]}] + c.after_{i} * y[{i}])" for i in lagging_channels}
+    lags = [f"c.kept_{i} * {lagged[i]} + (1.0 - c.kept_{i}) * y[{i}]" for i in lagging_channels]
     transition = written_out("transition", "x, u, c", *move, *reads, tuple_of(["s[0]", "s[1]", *lags]), **names)
     lines = [*move, "a = substep_jacobian((x[0], x[1]), v, c)"]
-    lines += ["b = read_slopes((x[0], x[1]), c)"] if places else []
+    lines += ["b = read_slopes((x[0], x[1]), c)"] if lagging_channels else []
 
     def slope(i, j):
         if i < 2:
             return f"a[{i}][{j}]" if j < 2 else "0.0"
-        channel = places[i - 2]
+        channel = lagging_channels[i - 2]
         if j < 2:
             return f"(1.0 - c.kept_{channel} * (1.0 - c.after_{channel})) * b[{channel}][{j}]"
         return f"c.kept_{channel} * (1.0 - c.after_{channel})" if i == j else "0.0"
 
     transition_jacobian = written_out("transition_jacobian", "x, u, c", *lines, matrix_of(n, n, slope), **names)
-    reading = tuple_of(f"{shown.get(i, f'y[{i}]')} + c.bias_{i}" for i in range(len(channels)))
+    reading = tuple_of(f"{lagged.get(i, f'y[{i}]')} + c.bias_{i}" for i in range(len(channels)))
 
     def row(i, j):
         share = f"c.after_{i} * " if i in state_of else ""

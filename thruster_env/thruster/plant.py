@@ -169,25 +169,25 @@ def make_plant(
     )
 
 
-def _sensors(given) -> dict[str, tuple[Effect, ...]]:
-    if given is None:
-        given = ("thrust",)
-    if not isinstance(given, Mapping):
-        if isinstance(given, str) or not hasattr(given, "__iter__"):
+def _sensors(sensors) -> dict[str, tuple[Effect, ...]]:
+    if sensors is None:
+        sensors = ("thrust",)
+    if not isinstance(sensors, Mapping):
+        if isinstance(sensors, str) or not hasattr(sensors, "__iter__"):
             raise ValueError(
-                f"sensors must be a list of channels or a mapping from them, but got {short_repr(given)}"
+                f"sensors must be a list of channels or a mapping from them, but got {short_repr(sensors)}"
             )
-        names = list(given)
-        given = {name: () for name in names if isinstance(name, str)}
-        if len(given) != len(names):
+        names = list(sensors)
+        sensors = {name: () for name in names if isinstance(name, str)}
+        if len(sensors) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
-    if not given:
+    if not sensors:
         raise ValueError("sensors must name at least one channel, but got none")
-    if len(given) > MAX_CHANNELS:
-        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
+    if len(sensors) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(sensors)}")
     return {
         one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
-        for channel, effects in given.items()
+        for channel, effects in sensors.items()
     }
 
 
@@ -210,10 +210,10 @@ def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[
 
 def state(name: str, value) -> np.ndarray:
     """Return a state (2,); raise ValueError unless it is two numbers from which finite ones can follow."""
-    given = vector(name, value, 2)
-    if np.abs(given).max() > LARGEST_STATE:
+    entries = vector(name, value, 2)
+    if np.abs(entries).max() > LARGEST_STATE:
         raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
-    return given
+    return entries
 
 
 # A thruster as data for JSON, for files that record their plant.

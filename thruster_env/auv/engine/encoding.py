@@ -150,8 +150,8 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
         Q_ROOT: plant.process_noise_cov,
         R_ROOT: plant.measurement_noise_cov,
     }
-    for place, cov in roots.items():
-        numbers[place : place + cov.size] = covariance_root(cov).ravel()
+    for offset, cov in roots.items():
+        numbers[offset : offset + cov.size] = covariance_root(cov).ravel()
     numbers[CHANNEL_COUNT] = m
     numbers[CHANNEL_CODES : CHANNEL_CODES + m] = [CHANNELS[channel].code for channel in plant.channels]
     for i, channel in enumerate(plant.channels):
@@ -178,14 +178,17 @@ def _program(plant: Plant, numbers: np.ndarray) -> tuple[list[float], int]:
     chains = [(0, plant.current.get(name, ()), CURRENT + i) for i, name in enumerate(DIRECTIONS)]
     chains += [(1, effects, READINGS + i) for i, effects in enumerate(plant.sensors.values())]
     instruments = list(plant.instruments.values())  # what one of them measures is lost together
-    first = [*range(len(DIRECTIONS)), *(len(DIRECTIONS) + instruments.index(one) for one in instruments)]
+    first = [
+        *range(len(DIRECTIONS)),
+        *(len(DIRECTIONS) + instruments.index(instrument) for instrument in instruments),
+    ]
     known = known_effects()
     program: list[float] = []
     rows = 0
     for index, (section, effects, target) in enumerate(chains):
         number, with_first = index * _SPACING, first[index] * _SPACING
-        code, taken = encoded(effects, known[section], target, FIXED_ROWS + rows, number, context, with_first)
+        code, row_count = encoded(effects, known[section], target, FIXED_ROWS + rows, number, context, with_first)
         numbers[SECTIONS + section] += len(effects)
         program += code
-        rows += taken
+        rows += row_count
     return program, rows

@@ -112,11 +112,11 @@ def take_commands(memory, b, numbers):
     """Clip the commands to the action space, and let the propeller and the planes follow them."""
     top, torque, plane, ratio = numbers[MAX_THRUST], numbers[MAX_TORQUE], numbers[MAX_PLANE], numbers[TORQUE_RATIO]
     of_propeller, of_planes = numbers[PROPELLER_DECAY], numbers[PLANE_DECAY]
-    told = numbers[INPUT_COUNT] > 3.0  # of the torque
-    stern = COMMAND + (2 if told else 1)
+    has_torque = numbers[INPUT_COUNT] > 3.0  # of the torque
+    stern = COMMAND + (2 if has_torque else 1)
     for j in range(memory.shape[2]):
         thrust = min(max(memory[b, COMMAND, j], 0.0), top)
-        turning = limited(memory[b, COMMAND + 1, j], torque) if told else ratio * thrust
+        turning = limited(memory[b, COMMAND + 1, j], torque) if has_torque else ratio * thrust
         stern_plane, rudder = limited(memory[b, stern, j], plane), limited(memory[b, stern + 1, j], plane)
         memory[b, INPUTS, j] = thrust + of_propeller * (memory[b, INPUTS, j] - thrust)
         memory[b, INPUTS + 1, j] = turning + of_propeller * (memory[b, INPUTS + 1, j] - turning)
@@ -150,13 +150,15 @@ def _tell_time_and_end(memory, b, numbers):
         size = 0.0
         for i in range(N):
             size += abs(memory[b, STATE + i, j])
-        kept = abs(memory[b, STATE + THETA, j]) < steepest and size < LARGEST
-        memory[b, TERMINATED, j] = 0.0 if kept else 1.0
+        within_limits = abs(memory[b, STATE + THETA, j]) < steepest and size < LARGEST
+        memory[b, TERMINATED, j] = 0.0 if within_limits else 1.0
 
 
 def machine_code() -> tuple[Callable, CompiledOrPython]:
     """The compiled `step(first, last, memory, numbers, out, begin)` of vehicles: `thruster_env.env.copies`."""
-    return machine_code_of(_step(known_effects(), tuple(sorted(CHANNELS.values(), key=lambda one: one.code))))
+    return machine_code_of(
+        _step(known_effects(), tuple(sorted(CHANNELS.values(), key=lambda channel: channel.code)))
+    )
 
 
 @cache
@@ -230,10 +232,10 @@ class Copies(PlantCopies):
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
-        given = checked_options(options).get("state")
-        if given is None:
+        start = checked_options(options).get("state")
+        if start is None:
             return None
-        state = checked_state("the state of options", given)
+        state = checked_state("the state of options", start)
         return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((N, N))), self.task)[0]
 
 

@@ -101,16 +101,16 @@ class Renderer(PlantRenderer):
         from thruster_env.auv.rendering.view import Dials, Gauges, View
         from thruster_env.render.charts import Charts, Strip
 
-        given = self._made_with
+        arguments = self._made_with
         strips = (
             Strip("depth", "depth [m]", 2, 254, 54, 100.0, *_named("depth"), says_numbers=False, downward=True),
             Strip("u", "speed ahead [m/s]", 2, 330, 52, 1.0, *_named("u")),
         )
-        self._view = View(self._canvas, given["path"])
+        self._view = View(self._canvas, arguments["path"])
         self._dials = Dials(self._canvas, PANEL)
-        self._charts = Charts(self._canvas, strips, top=PANEL, dt=given["dt"])
-        self._gauges = Gauges(self._canvas, given["max_thrust"], given["max_plane"])
-        self._path = given["path"]
+        self._charts = Charts(self._canvas, strips, top=PANEL, dt=arguments["dt"])
+        self._gauges = Gauges(self._canvas, arguments["max_thrust"], arguments["max_plane"])
+        self._path = arguments["path"]
 
     def _draw(self, columns: dict[str, np.ndarray], count: int, label: str) -> None:
         moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))

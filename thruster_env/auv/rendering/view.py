@@ -59,13 +59,13 @@ class View:
     def draw(self, columns: dict[str, np.ndarray], moment: Moment, offset: float) -> None:
         """Draw the newest moment; the path to follow is `offset` [m] deeper than its points."""
         trail = _points(columns, "")
-        seen = trail[np.isfinite(trail).all(axis=1)]
-        place = seen[-1] if len(seen) else np.zeros(3)
-        path = _part_in_view(self._path, seen) + [0.0, 0.0, offset]
-        shown = np.concatenate([seen, path, [place]])
-        low, high = shown.min(axis=0), shown.max(axis=0)
+        visited = trail[np.isfinite(trail).all(axis=1)]
+        position = visited[-1] if len(visited) else np.zeros(3)
+        path = _part_in_view(self._path, visited) + [0.0, 0.0, offset]
+        corners = np.concatenate([visited, path, [position]])
+        low, high = corners.min(axis=0), corners.max(axis=0)
         floor = high[2] + 0.12 * max(LEAST_SIZE, float((high - low).max()))
-        self._fit(np.concatenate([shown, shown * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]]))
+        self._fit(np.concatenate([corners, corners * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]]))
         canvas = self._canvas
         canvas.clip(0, 0, WIDTH, HEIGHT)
         self._draw_grid(low, high, floor)
@@ -73,14 +73,14 @@ class View:
             canvas.lines(self._on_bottom(run, floor), SHADOW, 1.5)
         for k in range(0, len(path) - 1, 2 * DASH):
             canvas.lines(self._at(path[k : k + DASH + 1]), REFERENCE, 1.5)
-        self._draw_band(columns, place)
+        self._draw_band(columns, position)
         for run in _runs(_points(columns, "estimated_")):
             canvas.lines(self._at(run), ESTIMATE, 3)
         for run in _runs(trail):
             canvas.lines(self._at(run), INK, 1.25)
-        canvas.lines([self._at(place), self._on_bottom(place, floor)], SOFT_INK, 0.75)
-        canvas.dots([self._on_bottom(place, floor)], 2.0, SHADOW)
-        self._draw_vehicle(place, moment)
+        canvas.lines([self._at(position), self._on_bottom(position, floor)], SOFT_INK, 0.75)
+        canvas.dots([self._on_bottom(position, floor)], 2.0, SHADOW)
+        self._draw_vehicle(position, moment)
         canvas.clip()
         self._write(moment)
 
@@ -111,7 +111,7 @@ class View:
             canvas.lines(self._at(np.array([(first[0], east, floor), (last[0], east, floor)])), GRID, 0.75)
         canvas.text(f"grid {number(step, 0 if step >= 1 else 1)} m", (WIDTH - 8, HEIGHT - 10), 10, SOFT_INK, 1.0)
 
-    def _draw_band(self, columns: dict[str, np.ndarray], place: np.ndarray) -> None:
+    def _draw_band(self, columns: dict[str, np.ndarray], position: np.ndarray) -> None:
         """The ellipse of two standard deviations of the position, taken as independent of one another."""
         mean = np.array([newest(columns, f"estimated_{name}") for name in ("x", "y", "depth")])
         std = np.array([newest(columns, f"estimated_{name}_std") for name in ("x", "y", "depth")])
@@ -124,12 +124,12 @@ class View:
         radii = np.maximum(SIGMAS * self._scale * np.sqrt(np.maximum(variances, 0.0)), 3.0)
         self._canvas.polygon(self._at(mean) + (axes @ (radii[:, None] * circle)).T, BAND)
 
-    def _draw_vehicle(self, place: np.ndarray, moment: Moment) -> None:
+    def _draw_vehicle(self, position: np.ndarray, moment: Moment) -> None:
         axes = attitude(moment.phi, moment.theta, moment.psi)
         if not np.isfinite(axes).all():
             return
         canvas, flat = self._canvas, axes @ PROJECTION * LENGTH  # body axes in the picture, (3, 2)
-        middle = self._at(place)
+        middle = self._at(position)
         for side in (flat[1], flat[2]):
             ends = [middle + FIN_PLACE * flat[0] + sign * FIN_SPAN * side for sign in (-1.0, 1.0)]
             canvas.lines(ends, FIN, 2.5)
@@ -138,9 +138,9 @@ class View:
         along, radius = OUTLINE[:, 0], np.maximum(OUTLINE[:, 1], 0.0)
         # Seen end on the hull is a disc, whose radius is that amidships.
         canvas.dots([middle], 0.1 * LENGTH, HULL)
-        one = middle + along[:, None] * flat[0] + radius[:, None] * across
-        other = middle + along[:, None] * flat[0] - radius[:, None] * across
-        outline = np.concatenate([one, other[::-1]])
+        right = middle + along[:, None] * flat[0] + radius[:, None] * across
+        left = middle + along[:, None] * flat[0] - radius[:, None] * across
+        outline = np.concatenate([right, left[::-1]])
         canvas.polygon(outline, HULL)
         canvas.lines(np.concatenate([outline, outline[:1]]), FIN, 1.0)
 
@@ -174,20 +174,20 @@ def _points(columns: dict[str, np.ndarray], prefix: str) -> np.ndarray:
     return np.stack([columns[f"{prefix}{name}"] for name in ("x", "y", "depth")], axis=-1)
 
 
-def _part_in_view(path: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _part_in_view(path: np.ndarray, visited: np.ndarray) -> np.ndarray:
     """A path's points; of a single straight line those from where the vehicle was to some way ahead of it."""
     if len(path) > 2:
         return path
     piece = path[1] - path[0]
-    along = (seen - path[0]) @ piece / (piece @ piece) if len(seen) else np.zeros(1)
-    places = np.linspace(along.min(), along.max() + 2.0 / np.linalg.norm(piece), 100)
-    return path[0] + places[:, None] * piece
+    along = (visited - path[0]) @ piece / (piece @ piece) if len(visited) else np.zeros(1)
+    distances = np.linspace(along.min(), along.max() + 2.0 / np.linalg.norm(piece), 100)
+    return path[0] + distances[:, None] * piece
 
 
 def _runs(points: np.ndarray) -> list[np.ndarray]:
     """Stretches of points (K, 3) that are all numbers."""
-    there = np.isfinite(points).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate(((False,), there, (False,)))))
+    present = np.isfinite(points).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(((False,), present, (False,)))))
     return [points[start:stop] for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 

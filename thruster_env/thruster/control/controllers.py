@@ -170,9 +170,9 @@ class PIController:
         if "thrust" not in plant.channels:
             raise ValueError(f"sensors must include the thrust, but the env has {', '.join(plant.channels)}")
         if proportional_gain is None or integral_gain is None:
-            found = lambda_gains(plant, operating_voltage, time_constant)
-            proportional_gain = found[0] if proportional_gain is None else proportional_gain
-            integral_gain = found[1] if integral_gain is None else integral_gain
+            gains = lambda_gains(plant, operating_voltage, time_constant)
+            proportional_gain = gains[0] if proportional_gain is None else proportional_gain
+            integral_gain = gains[1] if integral_gain is None else integral_gain
         return cls(
             plant,
             operating_points(plant),

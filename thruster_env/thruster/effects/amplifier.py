@@ -103,8 +103,8 @@ class DeadBand(Effect):
 
     def as_mapping(self) -> dict:
         """As plain data; without `astern` where the band is symmetric."""
-        found = super().as_mapping()
-        return {name: value for name, value in found.items() if value is not None}
+        mapping = super().as_mapping()
+        return {name: value for name, value in mapping.items() if value is not None}
 
 
 def dead_band_of(low: float, high: float) -> tuple[DeadBand, ...]:

@@ -45,10 +45,10 @@ def ramps(memory, b, target, rows, number, numbers, at, begin):
     """Add straight lines between levels that are drawn from an interval."""
     low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
     for j in range(memory.shape[2]):
-        place = (memory[b, STEP, j] + 1.0) / hold
-        part = math.floor(place)
+        position = (memory[b, STEP, j] + 1.0) / hold
+        part = math.floor(position)
         before, after = _uniform(memory, b, j, number, part), _uniform(memory, b, j, number, part + 1.0)
-        memory[b, target, j] += low + (high - low) * (before + (place - part) * (after - before))
+        memory[b, target, j] += low + (high - low) * (before + (position - part) * (after - before))
 
 
 @inlined

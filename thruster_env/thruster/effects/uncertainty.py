@@ -84,21 +84,21 @@ class LogNormal(_Distribution):
 DISTRIBUTIONS = {cls.name: cls for cls in (Uniform, LogNormal)}
 
 
-def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
+def make_uncertainty(uncertainty) -> dict[str, Uniform | LogNormal]:
     """Distributions by parameter from None or a mapping such as {"load_gain": {"name": "uniform", ...}}.
 
     Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
-    if given is None:
+    if uncertainty is None:
         return {}
-    if not isinstance(given, Mapping):
+    if not isinstance(uncertainty, Mapping):
         raise ValueError(
-            f"uncertainty must be a mapping from parameters to distributions, but got {short_repr(given)}"
+            f"uncertainty must be a mapping from parameters to distributions, but got {short_repr(uncertainty)}"
         )
-    made = {}
-    for parameter, distribution in given.items():
+    distributions = {}
+    for parameter, distribution in uncertainty.items():
         one_of("a name in uncertainty", parameter, UNCERTAIN)
-        made[parameter] = distribution
+        distributions[parameter] = distribution
         if isinstance(distribution, (Uniform, LogNormal)):
             continue
         names = ", ".join(DISTRIBUTIONS)
@@ -107,10 +107,10 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
             raise ValueError(f"{rule}, but got {short_repr(distribution)}")
         arguments = {key: value for key, value in distribution.items() if key != "name"}
         try:
-            made[parameter] = DISTRIBUTIONS[distribution["name"]](**arguments)
+            distributions[parameter] = DISTRIBUTIONS[distribution["name"]](**arguments)
         except TypeError:
             raise ValueError(f"{rule}, but got {short_repr(distribution)}") from None
-    return made
+    return distributions
 
 
 def drawn_parameters(nominal: ThrusterParameters, uncertainty: Mapping, keys: np.ndarray) -> ThrusterParameters:

@@ -50,10 +50,10 @@ class Copies(PlantCopies):
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
-        given = checked_options(options).get("state")
-        if given is None:
+        start = checked_options(options).get("state")
+        if start is None:
             return None
-        state = checked_state("the state of options", given)
+        state = checked_state("the state of options", start)
         return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
 
     def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:

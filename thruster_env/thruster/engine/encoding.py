@@ -83,8 +83,8 @@ def _program(plant: Plant, task: Task, context: ThrusterContext, numbers: np.nda
     for index, (section, effects, target) in enumerate(chains):
         # The reference draws from a stream of its own, so it begins with number 0 whatever disturbs the plant.
         first_number = 0 if section == 3 else index * _SPACING
-        code, taken = encoded(effects, known[section], target, at.FIXED_ROWS + rows, first_number, context)
+        code, row_count = encoded(effects, known[section], target, at.FIXED_ROWS + rows, first_number, context)
         numbers[at.SECTIONS + section] += len(effects)
         program += code
-        rows += taken
+        rows += row_count
     return program, rows

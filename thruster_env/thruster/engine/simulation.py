@@ -240,8 +240,8 @@ def _tell_time_and_end(memory, b, numbers):
     top_omega, top_flow = numbers[LIMITS], numbers[LIMITS + 1]
     for j in range(memory.shape[2]):
         memory[b, TIME, j] = memory[b, STEP, j] * numbers[SAMPLE_TIME]
-        kept = abs(memory[b, OMEGA, j]) < top_omega and abs(memory[b, FLOW, j]) < top_flow
-        memory[b, TERMINATED, j] = 0.0 if kept else 1.0
+        within_limits = abs(memory[b, OMEGA, j]) < top_omega and abs(memory[b, FLOW, j]) < top_flow
+        memory[b, TERMINATED, j] = 0.0 if within_limits else 1.0
         memory[b, LAST_COMMAND, j] = memory[b, COMMAND, j]
 
 

@@ -350,8 +350,8 @@ def _draw_bode(axes, frequencies, gain, eigenvalues, dt) -> None:
     magnitude.loglog(frequencies, np.abs(gain), color=BLUE)
     phase.semilogx(frequencies, np.rad2deg(np.unwrap(np.angle(gain))), color=BLUE)
     for axis in axes:
-        for place, value in enumerate(np.abs(eigenvalues)):
-            axis.axvline(value, color=DARK, linestyle=":", linewidth=1, label="" if place else "eigenvalues")
+        for index, value in enumerate(np.abs(eigenvalues)):
+            axis.axvline(value, color=DARK, linestyle=":", linewidth=1, label="" if index else "eigenvalues")
         axis.axvline(np.pi / dt, color=RUST, linestyle="--", linewidth=1, label=f"Nyquist, dt = {dt:g} s")
     magnitude.set_title("thrust over voltage", fontsize=10)
     magnitude.set_ylabel("magnitude [N/V]")

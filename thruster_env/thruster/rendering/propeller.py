@@ -50,10 +50,10 @@ class BlurredPicture:
         low, high = low - before, high - before
         return ((self._sum(high) - self._sum(low)) / (high - low) + 0.5).astype(np.uint8)
 
-    def _sum(self, place: float) -> np.ndarray:
-        rounds, place = divmod(place, TABLE)
-        k = min(int(place), TABLE - 1)
-        part = np.float32(place - k)
+    def _sum(self, position: float) -> np.ndarray:
+        rounds, position = divmod(position, TABLE)
+        k = min(int(position), TABLE - 1)
+        part = np.float32(position - k)
         return self._sums[-1] * np.float32(rounds) + (1 - part) * self._sums[k] + part * self._sums[k + 1]
 
 

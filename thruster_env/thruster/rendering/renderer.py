@@ -102,11 +102,11 @@ class Renderer(PlantRenderer):
     def _make_pictures(self) -> None:
         from thruster_env.thruster.rendering.scene import Gauges, Scene
 
-        canvas, given = self._canvas, self._made_with
-        scales = {name: given[name] for name in ("thrust_scale", "flow_scale")}
-        self._scene = Scene(canvas, diameter=given["diameter"], gear_ratio=self._gear_ratio, **scales)
-        self._charts = thruster_charts(canvas, dt=self._dt, speed_scale=given["speed_scale"], **scales)
-        self._gauges = Gauges(canvas, given["max_voltage"])
+        canvas, arguments = self._canvas, self._made_with
+        scales = {name: arguments[name] for name in ("thrust_scale", "flow_scale")}
+        self._scene = Scene(canvas, diameter=arguments["diameter"], gear_ratio=self._gear_ratio, **scales)
+        self._charts = thruster_charts(canvas, dt=self._dt, speed_scale=arguments["speed_scale"], **scales)
+        self._gauges = Gauges(canvas, arguments["max_voltage"])
 
     @property
     def blade_angle(self) -> float:
