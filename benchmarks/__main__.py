@@ -85,12 +85,12 @@ def command(
         resident = studies.resident_memory(seed, quick)
     seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
     facts = machine()
-    shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
+    speeds = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
     memory = [vectors.memory_line(), studies.memory_line(resident)]
     if page is not None:
         write_page(page, rows, facts, memory)
     emit(
-        [shown, *memory, *machine_lines(facts)],
+        [speeds, *memory, *machine_lines(facts)],
         {
             "rows": [row.as_json() for row in rows],
             "study_resident_megabytes": resident,

@@ -83,7 +83,7 @@ def measures(folder: Path, seed: int) -> tuple[Measure, Measure]:
 
     def measure(name: str) -> Measure:
         x = estimates[name] = np.zeros((STEPS, model.n))
-        arguments = [one.ctypes.data_as(ctypes.c_void_p) for one in (u, z)]
+        arguments = [array.ctypes.data_as(ctypes.c_void_p) for array in (u, z)]
         run = getattr(library, f"run_{name}")
 
         def measured() -> float:
@@ -93,22 +93,22 @@ def measures(folder: Path, seed: int) -> tuple[Measure, Measure]:
 
         return measured
 
-    found = measure("ours"), measure("peer")
-    for one in found:
-        one()
+    measures = measure("ours"), measure("peer")
+    for warm_up in measures:
+        warm_up()
     np.testing.assert_allclose(estimates["ours"], estimates["peer"], rtol=1e-9, atol=1e-9)
-    return found
+    return measures
 
 
 def _compiled(folder: Path, model: StateSpaceModel) -> Any:
     from casadi import CodeGenerator
 
-    made = c_filter(make_filter("ekf", model), "ours")
+    code = c_filter(make_filter("ekf", model), "ours")
     peer = casadi_step(model)
     runs = RUNS.replace("@WORK@", str(peer.sz_w())).replace("@WHOLE@", str(peer.sz_iw()))
     generator = CodeGenerator("peer.c")
     generator.add(peer)
-    texts = {"ours.h": made.header, "ours.c": made.source, "runs.c": runs, "peer.c": generator.dump()}
+    texts = {"ours.h": code.header, "ours.c": code.source, "runs.c": runs, "peer.c": generator.dump()}
     for name, text in texts.items():
         (folder / name).write_text(text)
     command = "gcc -std=c99 -O2 -march=native -fPIC -shared ours.c peer.c runs.c -lm -o both.so"
@@ -123,18 +123,21 @@ def casadi_step(model: StateSpaceModel) -> Any:
     """
     import casadi
 
-    x, p, u, z = (casadi.SX.sym(*one) for one in (("x", model.n), ("P", model.n, model.n), ("u", 1), ("z", 1)))
+    x, p, u, z = (
+        casadi.SX.sym(*declaration)
+        for declaration in (("x", model.n), ("P", model.n, model.n), ("u", 1), ("z", 1))
+    )
     mean, cov = x, p
     for _ in range(model.substeps):
         state = casadi.SX.sym("state", model.n)
-        moved = casadi.vertcat(*model.transition(tuple(casadi.vertsplit(state)), (u,), model.constants))
-        by = casadi.Function("by", [state, u], [moved, casadi.jacobian(moved, state)])
+        propagated = casadi.vertcat(*model.transition(tuple(casadi.vertsplit(state)), (u,), model.constants))
+        by = casadi.Function("by", [state, u], [propagated, casadi.jacobian(propagated, state)])
         mean, f = by(mean, u)
         cov = f @ cov @ f.T
     cov = cov + model.process_noise_cov
     state = casadi.SX.sym("state", model.n)
-    seen = casadi.vertcat(*model.observe(tuple(casadi.vertsplit(state)), model.constants))
-    expected, h = casadi.Function("seen", [state], [seen, casadi.jacobian(seen, state)])(mean)
+    observed = casadi.vertcat(*model.observe(tuple(casadi.vertsplit(state)), model.constants))
+    expected, h = casadi.Function("seen", [state], [observed, casadi.jacobian(observed, state)])(mean)
     v, s = z - expected, h @ cov @ h.T + model.measurement_noise_cov
     k = cov @ h.T / s
     a = casadi.SX.eye(model.n) - k @ h

@@ -27,20 +27,20 @@ ON_AFFINE = ("kf", "kf-steady", "fuzzy")  # they would approximate another model
 
 def lorenz_96(x, u, c):
     """One step of Euler's method; c = (step, forcing)."""
-    moved = np.empty(len(x))
+    after = np.empty(len(x))
     for i in range(len(x)):
-        moved[i] = x[i] + c[0] * ((x[(i + 1) % len(x)] - x[i - 2]) * x[i - 1] - x[i] + c[1])
-    return moved
+        after[i] = x[i] + c[0] * ((x[(i + 1) % len(x)] - x[i - 2]) * x[i - 1] - x[i] + c[1])
+    return after
 
 
 def first_states(count: int):
     """Return h(x) = the first `count` states."""
 
     def observe(x, c):
-        seen = np.empty(count)
+        observed = np.empty(count)
         for i in range(count):
-            seen[i] = x[i]
-        return seen
+            observed[i] = x[i]
+        return observed
 
     return observe
 

@@ -95,8 +95,8 @@ class Graph:
     def variables(self, array: np.ndarray) -> np.ndarray:
         """An array of numbers that are given, and not known before."""
         out = array.astype(object)
-        for place, value in np.ndenumerate(array):
-            out[place] = Counted(self, value, None, ())
+        for index, value in np.ndenumerate(array):
+            out[index] = Counted(self, value, None, ())
         self._variables += out.ravel().tolist()
         return out
 
@@ -115,13 +115,13 @@ class Graph:
         """Number of operations of each kind on which the numbers in arrays depend."""
         numbers = [x for array in arrays for x in array.ravel().tolist() if isinstance(x, Counted)]
         waiting = {id(x): x for x in numbers + self.results}
-        seen, count = set(waiting), Counter()
+        visited, count = set(waiting), Counter()
         while waiting:
             _, number = waiting.popitem()
             if number.kind is not None:
                 count[number.kind] += 1
-            waiting |= {id(x): x for x in number.operands if id(x) not in seen}
-            seen |= {id(x) for x in number.operands}
+            waiting |= {id(x): x for x in number.operands if id(x) not in visited}
+            visited |= {id(x) for x in number.operands}
         return count
 
 
@@ -164,5 +164,5 @@ def counting() -> Iterator[Graph]:
 def operations_of(function: Callable, *arguments) -> Counter[str]:
     """Operations of a function of vectors (tuples) that returns one; arguments that are arrays are variables."""
     with counting() as graph:
-        given = (tuple(graph.variables(a)) if isinstance(a, np.ndarray) else a for a in arguments)
-        return graph.operations(np.array(function(*given), dtype=object))
+        operands = (tuple(graph.variables(a)) if isinstance(a, np.ndarray) else a for a in arguments)
+        return graph.operations(np.array(function(*operands), dtype=object))

@@ -22,11 +22,11 @@ WITH_POSITION = ("navigation", "current")  # of which there is no steady state u
 
 def filter_of(name: str, states: str) -> Filter:
     """A filter on a model of the vehicle."""
-    own = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
+    arguments = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
     if MODELS[states].count > 8:
-        own |= FEW_RULES.get(name, {})
+        arguments |= FEW_RULES.get(name, {})
     sensors = "usbl" if name == "kf-steady" and states in WITH_POSITION else None
-    return make_filter(name, auv_model(states=states, sensors=sensors), **own)
+    return make_filter(name, auv_model(states=states, sensors=sensors), **arguments)
 
 
 def main() -> None:

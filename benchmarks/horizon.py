@@ -30,8 +30,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         return
     step, reset = do_mpc_step(thruster_model())
     voltages, measurements = recorded_episode(seed)
-    given = list(zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS, 0].tolist(), strict=True))
-    peer = seconds_a_call(step, given, reset)
+    recorded = list(zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS, 0].tolist(), strict=True))
+    peer = seconds_a_call(step, recorded, reset)
     yield Row(what, "do-mpc", side_by_side(ours, peer, 2 if quick else 10), ratio_goal=GOAL)
 
 
@@ -45,21 +45,21 @@ def do_mpc_step(model: StateSpaceModel) -> tuple[Callable[[float, float], np.nda
     logging.getLogger("do_mpc").setLevel(logging.ERROR)
     plant = do_mpc.model.Model("discrete", "SX")
     x, u = plant.set_variable("_x", "x", (model.n, 1)), plant.set_variable("_u", "u")
-    moved = tuple(casadi.vertsplit(x))
+    propagated = tuple(casadi.vertsplit(x))
     for _ in range(model.substeps):
-        moved = model.transition(moved, (u,), model.constants)
+        propagated = model.transition(propagated, (u,), model.constants)
     plant.set_meas(
         "z", casadi.vertcat(*model.observe(tuple(casadi.vertsplit(x)), model.constants)), meas_noise=True
     )
     plant.set_meas("given", u, meas_noise=False)
-    plant.set_rhs("x", casadi.vertcat(*moved), process_noise=True)
+    plant.set_rhs("x", casadi.vertcat(*propagated), process_noise=True)
     plant.setup()
     estimator = do_mpc.estimator.MHE(plant, [])
     estimator.settings.n_horizon, estimator.settings.t_step = HORIZON, 1.0
     estimator.settings.meas_from_data = True
     estimator.settings.supress_ipopt_output()
     weights = (
-        np.linalg.inv(one) for one in (model.prior_cov, model.measurement_noise_cov, model.process_noise_cov)
+        np.linalg.inv(cov) for cov in (model.prior_cov, model.measurement_noise_cov, model.process_noise_cov)
     )
     prior, noise, disturbance = weights
     estimator.set_default_objective(P_x=prior, P_v=noise, P_w=disturbance)

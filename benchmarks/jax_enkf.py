@@ -66,8 +66,8 @@ def array_filter(plant: Plant, arrays, repeat: Callable = repeat) -> ArrayFilter
     (r,) = np.ravel(plant.measurement_noise_cov)
 
     def on_components(function, x):
-        found = function(tuple(Operand(arrays, component) for component in x))
-        return arrays.stack([component.values for component in found])
+        results = function(tuple(Operand(arrays, component) for component in x))
+        return arrays.stack([component.values for component in results])
 
     def correlated(root, normals):
         return arrays.stack([root[0, 0] * normals[0], root[1, 0] * normals[0] + root[1, 1] * normals[1]])
@@ -122,8 +122,8 @@ def jax_filter(plant: Plant, size: int, seed: int, devices: int = 1) -> Callable
     def draw(key):
         return jax.random.normal(key, (NORMALS, size))
 
-    def advance(members, given):
-        voltage, z, key = given
+    def advance(members, scanned):
+        voltage, z, key = scanned
         members = filter_.step(members, voltage, draw(key), z)
         return members, filter_.moments(members)
 
@@ -140,7 +140,7 @@ def jax_filter(plant: Plant, size: int, seed: int, devices: int = 1) -> Callable
 
     def estimate(voltages, measurements):
         keys = jax.random.split(jax.random.key(seed), len(voltages))
-        given = (jax.device_put(part, shared) for part in (keys, voltages, measurements))
-        return tuple(np.asarray(part) for part in batch(*given))
+        sharded = (jax.device_put(part, shared) for part in (keys, voltages, measurements))
+        return tuple(np.asarray(part) for part in batch(*sharded))
 
     return estimate

@@ -15,11 +15,15 @@ def network_limit(setup: TrainingConfiguration) -> float:
     """Seconds a step of PPO's products with its networks' weights, at torch's rate in one thread."""
     from tuning.policies.environments import make_environments
 
-    envs, given = make_environments(setup, [0]), dict(setup.hyperparameters)
-    layers = [envs.observation_space.shape[0], *given["policy_kwargs"]["net_arch"], envs.action_space.shape[0]]
+    envs, parameters = make_environments(setup, [0]), dict(setup.hyperparameters)
+    layers = [
+        envs.observation_space.shape[0],
+        *parameters["policy_kwargs"]["net_arch"],
+        envs.action_space.shape[0],
+    ]
     weights = NETWORKS * sum(a * b for a, b in pairwise(layers))
-    rate = seconds_a_product(given["batch_size"], max(layers))
-    return weights * (1 + PASSES * given["n_epochs"]) * rate
+    rate = seconds_a_product(parameters["batch_size"], max(layers))
+    return weights * (1 + PASSES * parameters["n_epochs"]) * rate
 
 
 def seconds_a_product(rows: int, width: int) -> float:

@@ -39,14 +39,14 @@ def arithmetic_limit(count: Counter[str], *, cores: int = 1) -> float:
     if not count:
         return 0.0
     rate = rates(cores)
-    beside = IN_A_ROUND * count[PRODUCT]
+    within_rounds = IN_A_ROUND * count[PRODUCT]
     return (
         max(count[ADD], count[MULTIPLY]) * rate[FUSED]
         + count[DIVIDE] * rate[DIVIDE]
         + count[ROOT] * rate[ROOT]
         + count[RECIPROCAL_ROOT] * rate[RECIPROCAL_ROOT]
         + count[PRODUCT] * rate[ROUND]
-        + max(count[INTEGER] - beside, 0.0) * rate[INTEGER]
+        + max(count[INTEGER] - within_rounds, 0.0) * rate[INTEGER]
     )
 
 
@@ -142,7 +142,7 @@ def rates(cores: int) -> dict[str, float]:
 def measure_again() -> None:
     """Measure the rates once more and keep the better ones: others may have used the machine before, or do now."""
     for cores in {1, all_cores()}:
-        rates(cores).update({kind: min(rates(cores)[kind], one) for kind, one in _measured(cores).items()})
+        rates(cores).update({kind: min(rates(cores)[kind], rate) for kind, rate in _measured(cores).items()})
 
 
 def _measured(cores: int) -> dict[str, float]:

@@ -54,8 +54,8 @@ def drag(page: Page, knob: str = "#knob-R") -> list[float]:
 
 def thread_time(devtools: CDPSession) -> float:
     """Processor time [ms] of the page's thread so far."""
-    found = {one["name"]: one["value"] for one in devtools.send("Performance.getMetrics")["metrics"]}
-    return 1e3 * found["TaskDuration"]
+    metrics = {metric["name"]: metric["value"] for metric in devtools.send("Performance.getMetrics")["metrics"]}
+    return 1e3 * metrics["TaskDuration"]
 
 
 def main() -> None:
@@ -72,12 +72,12 @@ def main() -> None:
         devtools = page.context.new_cdp_session(page)
         devtools.send("Performance.setTimeDomain", {"timeDomain": "threadTicks"})
         devtools.send("Performance.enable")
-        for place in range(ROUNDS):
+        for number in range(ROUNDS):
             before = thread_time(devtools)
             times = drag(page)
             spent = (thread_time(devtools) - before) / len(times)
-            print(_line("first" if place == 0 else str(place), times, spent), flush=True)
-            if place:
+            print(_line("first" if number == 0 else str(number), times, spent), flush=True)
+            if number:
                 everything += times
                 of_thread.append(spent)
         browser.close()
@@ -86,8 +86,8 @@ def main() -> None:
 
 def _line(name: str, times: list[float], spent: float) -> str:
     median, late = np.percentile(times, [50, 95])
-    told = f"{name:>5}: {len(times)} moves, median {median:.0f} ms, 95th percentile {late:.0f} ms"
-    return f"{told}, {spent:.0f} ms of the page's thread each; load {os.getloadavg()[0]:.1f}"
+    text = f"{name:>5}: {len(times)} moves, median {median:.0f} ms, 95th percentile {late:.0f} ms"
+    return f"{text}, {spent:.0f} ms of the page's thread each; load {os.getloadavg()[0]:.1f}"
 
 
 if __name__ == "__main__":

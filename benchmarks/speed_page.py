@@ -19,10 +19,10 @@ MARK, END = "<!-- table speed: ", "<!-- end -->"
 def check_page(path: Path) -> None:
     """Raise ValueError unless a page has a place for the table, before minutes of measuring."""
     try:
-        found = path.read_text()
+        page = path.read_text()
     except (OSError, UnicodeDecodeError):
         raise ValueError(f"--page must be a page that can be read, but got {short_repr(str(path))}") from None
-    if MARK not in found:
+    if MARK not in page:
         raise ValueError(f"--page must be a page with {MARK}PROCESSOR, N cores -->, but {path} has none")
 
 
@@ -31,7 +31,7 @@ def write_page(path: Path, rows: Sequence[Row], facts: dict, memory: Sequence[st
     page, name = path.read_text(), f"speed: {machine_name(facts)}"
     mark = f"<!-- table {name} -->"
     if mark not in page:
-        last = [found.end() for found in re.finditer(f"{MARK}.*?{END}", page, flags=re.DOTALL)][-1]
+        last = [match.end() for match in re.finditer(f"{MARK}.*?{END}", page, flags=re.DOTALL)][-1]
         page = f"{page[:last]}\n\n{mark}\n{END}{page[last:]}"
     write_whole(path, with_tables(page, {name: lambda: machine_section(rows, facts, memory)}))
 

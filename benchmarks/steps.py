@@ -54,8 +54,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     wrapped = EstimateState(gym.make("BowThruster-v0"), filter="ukf")
     points = wrapped.filter.alpha, wrapped.filter.beta, wrapped.filter.kappa
     step = UnscentedStep(plant, points, python_model)
-    given = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
-    peer = seconds_a_call(step, given, step.reset)
+    recorded = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
+    peer = seconds_a_call(step, recorded, step.reset)
     timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 100)
     limit = arithmetic_limit(step_of_filtered(wrapped))
     yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10, limit=limit)
@@ -85,5 +85,5 @@ def peer_ensemble(plant: Plant, model, voltages, measurements, seed: int) -> Mea
     """A measure of one predict and update of FilterPy's ensemble Kalman filter."""
     np.random.seed(seed)  # FilterPy draws from the global generator
     step = EnsembleStep(plant, ENSEMBLE_SIZE, model)
-    given = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
-    return seconds_a_call(step, given, step.reset)
+    recorded = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
+    return seconds_a_call(step, recorded, step.reset)

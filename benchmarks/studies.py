@@ -54,12 +54,12 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     count = _trials(quick)
     plan = Plan("enkf", (find_scenario("nominal"),), seed)
     _study(plan, min(WARM_UP, count))  # compiles
-    total, own, result = _timed(plan, count)
+    total, in_filters, result = _timed(plan, count)
     what = f"study, {count} trials of an EnKF"
     peer, limit = filterpy_seconds(plan.scenarios[0], result), filters_limit(plan.scenarios[0], result)
     timing = Timing(total, peer, total / peer)
     yield Row(what, "FilterPy's runs, extrapolated", timing, ratio_goal=RUNS_GOAL, limit=limit)
-    rest = total - own
+    rest = total - in_filters
     timing = Timing(rest, total, rest / total)
     yield Row("of it outside filters and scores", "the whole", timing, ratio_goal=OUTSIDE_GOAL)
     total, _, result = _timed(plan._replace(prune=False), count)
@@ -97,9 +97,10 @@ def _study(plan: Plan, count: int) -> StudyResult:
 
 
 def _timed(plan: Plan, count: int) -> tuple[float, float, StudyResult]:
-    """Seconds of a study, seconds of it in our filters and scores, and what it found.
+    """Seconds of a study, its seconds in filters and scores, and its result.
 
-    Filters run in trials, in the search of the likeliest Q and R, and where the ensemble's size is chosen.
+    Filters run in trials, in the search for the maximum-likelihood Q and R, and in the choice of the ensemble's
+    size.
     """
     spent = [0.0]
 
@@ -146,5 +147,5 @@ def filters_limit(scenario: Scenario, result: StudyResult) -> float:
 
 def _runs(result: StudyResult) -> list[tuple[int, int]]:
     """Seeds and members of each trial, then of each size among which the study chose: training and fresh seeds."""
-    tried = [(len(one.intermediate_values) or TRAINING_SEEDS, one.params["N"]) for one in result.trials]
+    tried = [(len(trial.intermediate_values) or TRAINING_SEEDS, trial.params["N"]) for trial in result.trials]
     return tried + [(TRAINING_SEEDS + row.seeds, row.size) for row in result.sizes]

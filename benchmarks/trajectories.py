@@ -49,10 +49,10 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     if find_spec("jax") is None:
         yield Row(what, "JAX is not installed", alone(ours, rounds), limit=limit)
         return
-    given = data.inputs[..., 0], data.measurements[..., 0]
+    arrays = data.inputs[..., 0], data.measurements[..., 0]
     parts = gcd(cores(), count)
     for devices, name, goal in ((1, "JAX", 1 / 7), (parts, f"JAX, {parts} devices", None)):
-        estimate = partial(jax_filter(scenario.plant, ENSEMBLE_SIZE, seed, devices), *given)
+        estimate = partial(jax_filter(scenario.plant, ENSEMBLE_SIZE, seed, devices), *arrays)
         check_agreement(estimates(filter_, data), estimate()[0], data.states)
         peer = shared(estimate, steps * ENSEMBLE_SIZE)
         yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal, limit=limit)

@@ -38,19 +38,19 @@ def measures() -> tuple[dict[str, Measure], dict[str, float]]:
     """Measures of a step by name (of an ensemble, of a member's), and a number that tells each filter's result."""
     scenario, vehicles = find_scenario("nominal"), find_vehicles("auv:motion")
     data, on_vehicles = scenario.data(training_seeds(0, SEEDS)), vehicles.data(training_seeds(0, 2))
-    found, results = dict(floor_measures(scenario.plant, scenario.steps)), {}
+    measure_of, results = dict(floor_measures(scenario.plant, scenario.steps)), {}
     for name, size in FILTERS.items():
         choice = oracle_choice(name.lower(), scenario)
         filter_ = (choice.with_size(size) if size else choice).filter(scenario)
         label = f"{name} batch" + (f", N = {size}" if size else "")
-        found[label] = shared(partial(estimates, filter_, data), SEEDS * scenario.steps * (size or 1))
+        measure_of[label] = shared(partial(estimates, filter_, data), SEEDS * scenario.steps * (size or 1))
         results[label] = float(np.sum(np.abs(estimates(filter_, data))))
-    found["vector env, 8192 copies"] = vector_steps("BowThruster-v0", 0)
-    found["vehicle's Runge-Kutta step"] = member_steps()
+    measure_of["vector env, 8192 copies"] = vector_steps("BowThruster-v0", 0)
+    measure_of["vehicle's Runge-Kutta step"] = member_steps()
     filter_ = oracle_choice("enkf", vehicles).with_size(100).filter(vehicles)
     count = 2 * vehicles.steps * 100
-    found["vehicle's EnKF batch, N = 100"] = shared(partial(estimates, filter_, on_vehicles), count)
-    return found, results
+    measure_of["vehicle's EnKF batch, N = 100"] = shared(partial(estimates, filter_, on_vehicles), count)
+    return measure_of, results
 
 
 def measured(width: int, folder: str) -> tuple[dict[str, float], dict[str, float]]:
@@ -71,8 +71,8 @@ def main() -> None:
     """Print the table, or measurements."""
     if len(sys.argv) > 1:
         optimising.WIDE = f'"prefer-vector-width"="{int(sys.argv[1])}"'
-        found, results = measures()
-        times = {name: 1e9 * min(measure() for _ in range(REPEATS)) for name, measure in found.items()}
+        by_name, results = measures()
+        times = {name: 1e9 * min(measure() for _ in range(REPEATS)) for name, measure in by_name.items()}
         print(json.dumps((times, results)))
         return
     times: dict[int, list[dict[str, float]]] = {256: [], 512: []}
@@ -80,15 +80,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(ROUNDS):
             for width, rounds in times.items():
-                found, result = measured(width, folder)
-                rounds.append(found)
+                by_name, result = measured(width, folder)
+                rounds.append(by_name)
                 results.append(result)
     for name, value in results[0].items():
         if any(abs(other[name] / value - 1.0) > AGREEMENT for other in results):
             raise ValueError(f"both widths must give the same estimates, but those of {name} differ")
     print("| a step | 256 bits | 512 bits | ratio |\n| --- | --- | --- | --- |")
     for name in times[256][0]:
-        narrow, wide = (min(one[name] for one in times[width]) for width in (256, 512))
+        narrow, wide = (min(round_times[name] for round_times in times[width]) for width in (256, 512))
         print(f"| {name} | {narrow:.3g} ns | {wide:.3g} ns | {wide / narrow:.2f} |")
 
 

@@ -66,8 +66,8 @@ def normals(count: int) -> Counter[str]:
     """Operations of so many standard normals."""
     with counting() as graph:
         (block,) = graph.variables(np.arange(1))
-        made = np.array(normal_block(block, 1, FILTER_PROCESS, 2, 3), dtype=object)
-    return times(graph.operations(made), count / NORMALS)
+        drawn = np.array(normal_block(block, 1, FILTER_PROCESS, 2, 3), dtype=object)
+    return times(graph.operations(drawn), count / NORMALS)
 
 
 def times(count: Counter[str], factor: float) -> Counter[str]:

@@ -130,16 +130,16 @@ u, recorded = record(1000)
 z = recorded.measurements
 with torch.no_grad():
     of_network = learned.run(u, z)
-found = {
+estimates = {
     "the model": run(make_filter("ukf", model), None, u, z),
     "with more noise": run(make_filter("ukf", more_noise), None, u, z),
     "with a network": of_network,
     "the true equation": run(make_filter("ukf", truth), None, u, z),
 }
-for name, one in found.items():
-    errors = np.asarray(one.means) - recorded.states
+for name, result in estimates.items():
+    errors = np.asarray(result.means) - recorded.states
     speed, flow = np.sqrt((errors**2).mean(axis=(0, 1)))
-    level = float(one.log_likelihoods.mean())
+    level = float(result.log_likelihoods.mean())
     print(f"{name:18} {level:7.2f}   {speed:5.2f} rad/s   {flow:.4f} m/s")
 
 # %%

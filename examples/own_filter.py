@@ -51,9 +51,9 @@ SEEDS = 100
 
 
 def update(model, x, P, z):
-    seen = present(z)  # channels that are NaN are missing
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    measured = present(z)  # channels that are NaN are missing
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     L, M, K = root(P), root(R), divide(P @ H.T, S)
     for _ in range(3):
@@ -63,7 +63,7 @@ def update(model, x, P, z):
         )
         K = divide(spread @ H.T, sym(H @ spread @ H.T) + noise)
     x = wrap(x + K @ v, model.state_angles)
-    return x, joseph(P, K, H, R), v, S, log_density(v, S, seen)
+    return x, joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 def weights(model, e):

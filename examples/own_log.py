@@ -66,9 +66,9 @@ before
 # ``identify`` finds the maximum-likelihood parameters with standard errors, and reports which of them the runs do
 # not determine.
 
-found = tuning.identify(runs[:3], ["voltage_gain"], preset="tunnel_physical")
+identified = tuning.identify(runs[:3], ["voltage_gain"], preset="tunnel_physical")
 print(f"true voltage gain {TRUE_GAIN:.4g}")
-found
+identified
 
 # %%
 # Q and R
@@ -80,7 +80,7 @@ found
 # Without a true state the study maximises the likelihood of the innovations over Q and R, with their NIS
 # kept in its band, and evaluates the result on other runs: every third run is :term:`held-out`.
 
-mine = found.save(Path(tempfile.mkdtemp()) / "mine.toml")
+mine = identified.save(Path(tempfile.mkdtemp()) / "mine.toml")
 study = tuning.tune((mine, runs[:3]), filter="ekf", trials=TRIALS)
 study
 

@@ -122,15 +122,18 @@ def main(arguments=None):
     parser.add_argument(
         "--out", help="where to save: OUT.zip, and OUT.pkl with the normalisation"
     )
-    given = parser.parse_args(arguments)
-    model, venv = learn(given.steps, given.copies, given.seed)
+    options = parser.parse_args(arguments)
+    model, venv = learn(options.steps, options.copies, options.seed)
     returns = [
-        episode_return(model, venv, 1_000_000 + seed) for seed in range(given.episodes)
+        episode_return(model, venv, 1_000_000 + seed)
+        for seed in range(options.episodes)
     ]
-    print(f"mean return of {given.episodes} held-out episodes: {np.mean(returns):.3f}")
-    if given.out:
-        model.save(given.out)
-        venv.save(f"{given.out}.pkl")
+    print(
+        f"mean return of {options.episodes} held-out episodes: {np.mean(returns):.3f}"
+    )
+    if options.out:
+        model.save(options.out)
+        venv.save(f"{options.out}.pkl")
     return returns
 
 

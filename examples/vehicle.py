@@ -59,19 +59,19 @@ print(
 
 time = 0.05 * np.arange(1, len(truth) + 1)
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
-for axis, place in zip(axes, (6, 9, 11), strict=True):
-    band = 1.96 * deviation[:, place]
+for axis, i in zip(axes, (6, 9, 11), strict=True):
+    band = 1.96 * deviation[:, i]
     axis.fill_between(
         time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band"
     )
     axis.plot(
         time,
-        estimate[:, place] - truth[:, place],
+        estimate[:, i] - truth[:, i],
         color="tab:red",
         linewidth=0.8,
         label="error",
     )
-    axis.set(title=f"{states[place].name} [{states[place].unit}]", xlabel="time [s]")
+    axis.set(title=f"{states[i].name} [{states[i].unit}]", xlabel="time [s]")
 axes[0].legend()
 
 # %%

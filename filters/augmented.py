@@ -11,7 +11,7 @@ import numpy as np
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.checks import finite, positive
 from thruster_env.core.compiled import inlined
-from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Source, assembled, entrywise, joiner, tuple_of, vector_part, written_out
 from thruster_env.model.quantities import Output, Quantity
@@ -178,7 +178,7 @@ def _augmented_functions(
 
     def jacobian(name, function, analytic, size, arguments, angles, identity):
         spreads = tuple_of(f"c[{count + q}]" for q in range(added))
-        lines = [*begin, f"far = stretch(t, {spreads})", f"a = analytic(s, {arguments}fill(t, c))"]
+        lines = [*begin, f"far = step_growth(t, {spreads})", f"a = analytic(s, {arguments}fill(t, c))"]
         for q in range(added):
             lines.append(f"step{q} = step_of(t[{q}], c[{count + q}], far)")
             for side, sign in (("above", "+"), ("below", "-")):
@@ -191,7 +191,7 @@ def _augmented_functions(
             lines.append(f"slope{q} = difference(above{q}, below{q}, step{q})")
         tools: dict[str, Any] = {
             "step_of": step_of,
-            "stretch": stretch(added),
+            "step_growth": step_growth(added),
             "difference": _difference_quotient(size, angles),
             "one": entrywise("one", "", (1, 1), lambda i, j: "1.0"),
             "whole": assembled(

@@ -9,7 +9,7 @@ import numpy as np
 from filters.wrapped import wrapped_variances
 from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.matrices import multiplier, quadratic_form
 from thruster_env.core.progress import with_progress
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
@@ -275,5 +275,5 @@ def _from_mean(n: int, by_differences: bool):
         return f"({apart} if abs({apart}) > {noise} else 0.0)"
 
     source = Source("less_mean", "f, means, b, k, x, s", result=(n, n), f=(n, n), x=(n,), s=(n,))
-    source.line("far = stretch(x, s)")
-    return source.function(source.entries((n, n), entry), step_of=step_of, stretch=stretch(n))
+    source.line("far = step_growth(x, s)")
+    return source.function(source.entries((n, n), entry), step_of=step_of, step_growth=step_growth(n))

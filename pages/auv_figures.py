@@ -45,16 +45,16 @@ def returns() -> str:
     """Mean return of an episode: PD on measurements, on the true state, and planes held still."""
     tasks = [("Path", {"path": name}) for name in MANOEUVRES] + [("Depth", {})]
     rows = []
-    for task, given in tasks:
+    for task, arguments in tasks:
         name = f"SegorogeniAUV{task}-v0"
-        env = gym.make_vec(name, EPISODES, **given)
-        true = ObserveStateVector(gym.make_vec(name, EPISODES, **given))
+        env = gym.make_vec(name, EPISODES, **arguments)
+        true = ObserveStateVector(gym.make_vec(name, EPISODES, **arguments))
         scores = (
             mean_return(env, DepthAndCourse.for_env(env)),
             mean_return(true, DepthAndCourse.for_env(true, "navigation")),
             mean_return(env, None),
         )
-        rows.append([f"path {given['path']}" if given else "depth", *(digits(score) for score in scores)])
+        rows.append([f"path {arguments['path']}" if arguments else "depth", *(digits(score) for score in scores)])
     return markdown_table(["task", "PD on measurements", "PD on the true state", "planes still, 2.845 N"], rows)
 
 

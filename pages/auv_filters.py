@@ -123,22 +123,22 @@ def filters_drag() -> str:
 
 def filters_current() -> str:
     """RMSE in a current, of a filter that does not know of it and of one with two states for it."""
-    shown = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
+    symbols = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
     lines, units = [], {}
     for name in ("auv:current", "auv:estimated_current"):
         (row,) = rows_of(name, [EKF], RUNS)
-        found = row.evaluation
-        errors = {one.symbol: error for one, error in zip(found.states, found.rmse, strict=True)}
-        units |= {one.symbol: one.unit for one in found.states}
-        known = [digits(errors[symbol].value, 2) if symbol in errors else "" for symbol in shown]
-        lines.append([f"`{name}`, {len(errors)} states", *known, f"{about(found.nees)} of {len(errors)}"])
-    return markdown_table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in shown), "NEES"], lines)
+        evaluation = row.evaluation
+        errors = {state.symbol: error for state, error in zip(evaluation.states, evaluation.rmse, strict=True)}
+        units |= {state.symbol: state.unit for state in evaluation.states}
+        known = [digits(errors[symbol].value, 2) if symbol in errors else "" for symbol in symbols]
+        lines.append([f"`{name}`, {len(errors)} states", *known, f"{about(evaluation.nees)} of {len(errors)}"])
+    return markdown_table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in symbols), "NEES"], lines)
 
 
 def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -> list[Row]:
     """Filters on a scenario's held-out seeds."""
-    one = find_scenario(scenario) if isinstance(scenario, str) else scenario
-    (board,), interrupted = compare(filters, [one], held_out_seeds(0, runs))
+    problem = find_scenario(scenario) if isinstance(scenario, str) else scenario
+    (board,), interrupted = compare(filters, [problem], held_out_seeds(0, runs))
     if interrupted:
         raise KeyboardInterrupt
     return board.rows
@@ -157,13 +157,13 @@ def of_rows(rows: Sequence[Row]) -> str:
 
 def cells(row: Row) -> list[str]:
     """Score, paired ratio, NEES and NIS beside what is right."""
-    found = row.evaluation
+    evaluation = row.evaluation
     return [
         row.label,
-        plain(found.score.value),
+        plain(evaluation.score.value),
         about(row.score_ratio, 3),
-        f"{about(found.nees)} of {len(found.states)}",
-        f"{about(found.nis)} of {digits(found.expected_nis)}",
+        f"{about(evaluation.nees)} of {len(evaluation.states)}",
+        f"{about(evaluation.nis)} of {digits(evaluation.expected_nis)}",
     ]
 
 
@@ -181,8 +181,8 @@ def plain(value: float) -> str:
 
 
 TABLES: Mapping[str, Callable[[], str]] = {
-    made.__name__: made
-    for made in (
+    table.__name__: table
+    for table in (
         filters_motion,
         filters_navigation,
         filters_current,

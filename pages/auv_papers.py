@@ -70,22 +70,22 @@ def other_world() -> str:
 
 def paths() -> str:
     """Every printed row of the five paths beside ours."""
-    found, rows = findings("ngatini2017", results("ngatini2017")), []
-    for one in found:
-        if one.label not in (MEASUREMENTS, "EKF8", ENKF, FKF):
+    entries, rows = findings("ngatini2017", results("ngatini2017")), []
+    for entry in entries:
+        if entry.label not in (MEASUREMENTS, "EKF8", ENKF, FKF):
             continue
-        names = list(ngatini2017.PATHS[one.path].enkf.rmse)
-        places = [POSE.index(name) for name in names]
-        errors = [_row(one.scores.rmse(field)[places]) for field in ("planar", "planar_both", "full")]
-        printed = one.printed
+        names = list(ngatini2017.PATHS[entry.path].enkf.rmse)
+        indices = [POSE.index(name) for name in names]
+        errors = [_row(entry.scores.rmse(field)[indices]) for field in ("planar", "planar_both", "full")]
+        printed = entry.printed
         rows.append(
             [
-                f"{one.path} ({', '.join(names)})",
-                one.label,
+                f"{entry.path} ({', '.join(names)})",
+                entry.label,
                 _row(printed.rmse.values()) if printed else "",
                 *errors,
                 f"{printed.seconds:.3g}" if printed else "",
-                one.why,
+                entry.why,
             ]
         )
     columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published"]
@@ -98,10 +98,12 @@ def ends() -> str:
     for result in _of_vehicle():
         for label, printed in zip((ENKF, FKF), ngatini2017.PATHS[result.path][:2], strict=True):
             names = list(printed.final_percent)
-            places = [POSE.index(name) for name in names]
+            columns = [POSE.index(name) for name in names]
             ours = [
                 _row(
-                    100 * getattr(result.scores[label], field)[:, places].mean(axis=0) / np.abs(result.end[places])
+                    100
+                    * getattr(result.scores[label], field)[:, columns].mean(axis=0)
+                    / np.abs(result.end[columns])
                 )
                 for field in ("planar_end", "full_end")
             ]
@@ -113,15 +115,15 @@ def ends() -> str:
 
 def outside() -> str:
     """Time outside the bounds of the fuzzy filter."""
-    rows = [[one.path, *(f"{100 * share:.0f}" for share in one.outside)] for one in _of_vehicle()]
+    rows = [[result.path, *(f"{100 * share:.0f}" for share in result.outside)] for result in _of_vehicle()]
     return markdown_table(["path", *"uvwpqr", "any"], rows)
 
 
-def said() -> str:
-    """What the runs of both papers say, as lists."""
+def paper_sentences() -> str:
+    """Lists of statements on the results of both papers."""
     blocks = []
     for paper in RUNS:
-        lines = "\n".join(f"- {one}" for one in statements(paper, results(paper)))
+        lines = "\n".join(f"- {sentence}" for sentence in statements(paper, results(paper)))
         blocks.append(f"{paper}:\n\n{lines}")
     return "\n" + "\n\n".join(blocks)
 
@@ -153,7 +155,9 @@ def _of_vehicle() -> list[PathResult]:
 
 
 def _printed(paper: str, path: str, label: str) -> PrintedRow | None:
-    return next(one.printed for one in findings(paper, results(paper)) if (one.path, one.label) == (path, label))
+    return next(
+        entry.printed for entry in findings(paper, results(paper)) if (entry.path, entry.label) == (path, label)
+    )
 
 
 def _row(values: Iterable[float]) -> str:
@@ -173,7 +177,7 @@ TABLES = {
     "papers_ends": ends,
     "papers_outside": outside,
     "papers_world": other_world,
-    "papers_said": said,
+    "papers_said": paper_sentences,
 }
 
 

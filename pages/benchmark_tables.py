@@ -40,8 +40,12 @@ def inflation() -> str:
     rows = []
     for name in ("enkf", "etkf", "denkf"):
         choice, score = tune_inflation(name, lorenz63, TRIALS, RUNS)
-        found = choice.numbers
-        numbers = [f"{found['ensemble_size']}", f"{found['inflation']:.3f}", f"{found['relaxation']:.3f}"]
+        parameters = choice.numbers
+        numbers = [
+            f"{parameters['ensemble_size']}",
+            f"{parameters['inflation']:.3f}",
+            f"{parameters['relaxation']:.3f}",
+        ]
         rows.append([name, *numbers, f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"])
     return markdown_table(["filter", "N", "inflation", "relaxation", "rmse.a on held-out seeds"], rows)
 
@@ -54,10 +58,19 @@ def pendulum_errors() -> str:
         plan = Plan(name, (pendulum,))
         choice = run_study(open_study("pendulum", plan, None), plan, TRIALS).choice
         comparison = evaluate_held_out(choice, pendulum, 0)
-        for word, one in (("rule of thumb", comparison.untuned), ("tuned", comparison.tuned)):
+        for word, evaluation in (("rule of thumb", comparison.untuned), ("tuned", comparison.tuned)):
             sigma = choice.model["sigma"] if word == "tuned" else pendulum.untuned["sigma"]
-            errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in one.rmse]
-            rows.append([name, word, f"{sigma:.3f}", *errors, f"{one.nees.value:.2f}", f"{one.nis.value:.2f}"])
+            errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in evaluation.rmse]
+            rows.append(
+                [
+                    name,
+                    word,
+                    f"{sigma:.3f}",
+                    *errors,
+                    f"{evaluation.nees.value:.2f}",
+                    f"{evaluation.nis.value:.2f}",
+                ]
+            )
     header = ["filter", "", "sigma [rad/s]", "theta [rad]", "omega [rad/s]", "mean NEES", "mean NIS"]
     return markdown_table(header, rows)
 
@@ -74,9 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m pages.benchmark_tables", description=__doc__.splitlines()[0])
     parser.add_argument("page", nargs="?", type=Path, default=DOCS / "benchmarks.md", metavar="PAGE")
     parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
-    given = parser.parse_args(arguments)
-    for name in given.table or TABLES:  # written one by one, so that what is done stays
-        write_whole(given.page, with_tables(given.page.read_text(), {name: TABLES[name]}))
+    options = parser.parse_args(arguments)
+    for name in options.table or TABLES:  # written one by one, so that what is done stays
+        write_whole(options.page, with_tables(options.page.read_text(), {name: TABLES[name]}))
 
 
 if __name__ == "__main__":

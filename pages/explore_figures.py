@@ -28,16 +28,16 @@ def draw(scene: Scene, path: Path) -> Path:
     figure = new_figure((9.6, 5.8))
     axes = figure.subplots(3, 2, sharex=True, sharey="row", height_ratios=(4, 3, 3))
     bench = scene.bench()
-    place = [state.symbol for state in bench.states].index(scene.state)
-    state, channel = bench.states[place], bench.measurements[0]
+    index = [state.symbol for state in bench.states].index(scene.state)
+    state, channel = bench.states[index], bench.measurements[0]
     for number, (step, column) in enumerate(zip(scene.steps, axes.T, strict=True)):
         view = scene.view(number)
         assert view.truth is not None  # scenes are of plants
-        time, truth, estimate = view.time[0, SPAN], view.truth[0, SPAN, place], view.estimate[0, SPAN, place]
+        time, truth, estimate = view.time[0, SPAN], view.truth[0, SPAN, index], view.estimate[0, SPAN, index]
         column[0].plot(time, truth, color=DARK, linewidth=1.0, label="truth")
         column[0].plot(time, estimate, color=BLUE, linewidth=1.2, label="estimate")
         column[0].set_title(f"{step.label}\n{_figures(view, scene.state)}", fontsize=9)
-        _band(column[1], time, view.deviation[0, SPAN, place])
+        _band(column[1], time, view.deviation[0, SPAN, index])
         column[1].plot(time, estimate - truth, color=BLUE, linewidth=1.0)
         _band(column[2], time, view.innovation_deviation[0, SPAN, 0])
         column[2].plot(time, view.innovation[0, SPAN, 0], ".", color=RUST, markersize=2.5)
@@ -57,26 +57,26 @@ def _band(axis, time: np.ndarray, deviation: np.ndarray) -> None:
 
 def _handles(axes) -> tuple[list, list]:
     """Lines of the first panel and the band of the second, with their labels."""
-    found = [one.get_legend_handles_labels() for one in axes[:2, 0]]
-    return [*found[0][0], *found[1][0]], [*found[0][1], *found[1][1]]
+    legends = [axis.get_legend_handles_labels() for axis in axes[:2, 0]]
+    return [*legends[0][0], *legends[1][0]], [*legends[0][1], *legends[1][1]]
 
 
 def _figures(view: View, symbol: str) -> str:
     names = (f"RMSE {symbol}", *SHOWN)
-    told = [f"{name.split()[0]} {digits(view.figures[name].value)} {view.figures[name].unit}" for name in names]
-    return ", ".join(one.removesuffix(" -") for one in told)
+    texts = [f"{name.split()[0]} {digits(view.figures[name].value)} {view.figures[name].unit}" for name in names]
+    return ", ".join(text.removesuffix(" -") for text in texts)
 
 
 def figures_of(scene: Scene) -> str:
     """A table of a scene's figures at each of its steps, on eight seeds."""
     views = [scene.view(number) for number in range(len(scene.steps))]
     rows = [
-        [step.label, *(digits(one.value) for name, one in view.figures.items() if name != "restarts")]
+        [step.label, *(digits(figure.value) for name, figure in view.figures.items() if name != "restarts")]
         for step, view in zip(scene.steps, views, strict=True)
     ]
     heads = [
-        f"{name} [{one.unit}]" if one.unit != "-" else name
-        for name, one in views[0].figures.items()
+        f"{name} [{figure.unit}]" if figure.unit != "-" else name
+        for name, figure in views[0].figures.items()
         if name != "restarts"
     ]
     return markdown_table(["", *heads], rows)
@@ -95,7 +95,7 @@ def halved() -> str:
 
 
 def _score(view: View) -> float:
-    return next(one.value for name, one in view.figures.items() if name.startswith("score"))
+    return next(figure.value for name, figure in view.figures.items() if name.startswith("score"))
 
 
 def _consistency(view: View) -> list[str]:

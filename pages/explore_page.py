@@ -24,7 +24,7 @@ PATIENCE = 180_000  # [ms]
 MOVED = 5.5  # R [N^2], where it stood at the 0.25 of the sensor's data sheet
 
 
-def taken(page: Page, url: str) -> bytes:
+def screenshot(page: Page, url: str) -> bytes:
     """What one sees after the start was held, R was raised and a study has run."""
     page.set_default_timeout(PATIENCE)
     page.goto(url)
@@ -50,7 +50,7 @@ def main(folder: Path) -> None:
     server = Server(page_of(Bench(find_problem("outliers"), "ekf")), ends_when_left=False).start()
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        picture = Image.open(io.BytesIO(taken(browser.new_page(viewport=WIDE), server.url)))
+        picture = Image.open(io.BytesIO(screenshot(browser.new_page(viewport=WIDE), server.url)))
         browser.close()
     server.stop()
     picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(folder / "explore.png", optimize=True)

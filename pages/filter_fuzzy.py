@@ -35,12 +35,12 @@ def picture(path: Path) -> Path:
     figure = new_figure((9.6, 3.8))
     left, right = figure.subplots(1, 2, width_ratios=(2, 3))
     tidy((left, right))
-    looks = {f"fuzzy, {one}": look for one, look in BLENDING_LOOKS.items()}
+    looks = {f"fuzzy, {blending}": look for blending, look in BLENDING_LOOKS.items()}
     looks |= {name: STYLES[name] for name in ("kf", "ekf")}
     errors = {label: [] for label in looks}
     for width in WIDTHS:
         model, runs = _about_the_centre(width, 20)
-        filters = {f"fuzzy, {one}": _fuzzy(model, width, blending=one) for one in BLENDINGS}
+        filters = {f"fuzzy, {blending}": _fuzzy(model, width, blending=blending) for blending in BLENDINGS}
         filters |= {name: make_filter(name, model) for name in ("kf", "ekf")}
         for label, filter_ in filters.items():
             errors[label].append(errors_of(filter_, runs)[1])
@@ -68,11 +68,11 @@ def fuzzy() -> str:
     for width in TABLE_WIDTHS:
         model, runs = _about_the_centre(width)
         low, high = CENTRE - width / 2, CENTRE + width / 2
-        filters = {f"`{one}`": _fuzzy(model, width, blending=one) for one in BLENDINGS}
+        filters = {f"`{blending}`": _fuzzy(model, width, blending=blending) for blending in BLENDINGS}
         filters["`weights`, no offsets"] = _fuzzy(model, width, blending="weights", offsets=False)
         rows += _rows(f"{low:g} to {high:g} V", model, runs, filters)
     model, runs = thruster_model(), held_runs()
-    filters = {f"`{one}`": FuzzyKalmanFilter(model=model, blending=one) for one in BLENDINGS}
+    filters = {f"`{blending}`": FuzzyKalmanFilter(model=model, blending=blending) for blending in BLENDINGS}
     filters["`weights`, no offsets"] = FuzzyKalmanFilter(model=model, offsets=False)
     rows += _rows("-12 to 12 V", model, runs, filters)
     over = "over `weights`"

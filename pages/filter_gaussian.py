@@ -149,11 +149,11 @@ def smoothers(path: Path) -> Path:
     left.legend(fontsize=8, frameon=False)
     gap, window = runs.measurements[:1].copy(), slice(230, 331)
     gap[:, 260:300] = np.nan
-    given = runs.keys[:1], runs.inputs[:1], gap
+    arguments = runs.keys[:1], runs.inputs[:1], gap
     filter_ = ExtendedKalmanFilter(model=model)
-    shown = {"filter": (run(filter_, *given), BLUE), "smoother": (smooth(filter_, *given), RUST)}
+    drawn = {"filter": (run(filter_, *arguments), BLUE), "smoother": (smooth(filter_, *arguments), RUST)}
     truth, time = runs.states[0, window, 1], times(501)[window]
-    for label, (estimates, colour) in shown.items():
+    for label, (estimates, colour) in drawn.items():
         error, spread = estimates.means[0, window, 1] - truth, deviations(estimates, 1)[0, window]
         right.plot(time, error, color=colour, label=label)
         for edge in (-1.96 * spread, 1.96 * spread):

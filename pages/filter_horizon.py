@@ -17,7 +17,7 @@ RUNS, LENGTHS = 50, (1, 2, 5, 10, 20, 30)
 
 def reactor(path: Path) -> Path:
     """The pressure that is not measured in one batch, and its error over the horizon."""
-    given, states = batches(RUNS)
+    arguments, states = batches(RUNS)
     figure = new_figure((9.6, 3.6))
     left, right = figure.subplots(1, 2)
     tidy((left, right))
@@ -28,14 +28,14 @@ def reactor(path: Path) -> Path:
         "mhe, bounded": ("mhe", make_filter("mhe", within)),
     }
     for label, (name, filter_) in filters.items():
-        left.plot(run(filter_, *given).means[0, :, 0], label=label, **STYLES[name])
+        left.plot(run(filter_, *arguments).means[0, :, 0], label=label, **STYLES[name])
     left.plot(states[0, :, 0], label="truth", **STYLES["truth"])
     left.set_xlabel("step")
     left.set_ylabel("pressure of A")
 
     def error(filter_) -> float:
-        found = run(filter_, *given).means[:, SETTLED:, 0] - states[:, SETTLED:, 0]
-        return float(np.sqrt(np.square(found).mean()))
+        errors = run(filter_, *arguments).means[:, SETTLED:, 0] - states[:, SETTLED:, 0]
+        return float(np.sqrt(np.square(errors).mean()))
 
     by_length = [error(make_filter("mhe", within, horizon=length)) for length in LENGTHS]
     right.plot(LENGTHS, by_length, **STYLES["mhe"])

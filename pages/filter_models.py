@@ -24,19 +24,19 @@ def half_lost(model: StateSpaceModel) -> StateSpaceModel:
     )
 
 
-def run_that_switches(whole: StateSpaceModel, seed: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def run_that_switches(intact: StateSpaceModel, seed: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States (K + 1, 2), thrusts (K + 1, 1), voltages (K, 1) of a run that loses half of its thrust."""
     generator, steps = np.random.default_rng(seed), np.arange(STEPS + 1)
     inputs = np.repeat(generator.uniform(-LEVEL, LEVEL, STEPS // 25), 25)[:, None]
     is_lost = (steps >= LOST_FROM) & (steps < LOST_TO)
-    return *followed([whole, half_lost(whole)], is_lost.astype(int), inputs, generator), inputs
+    return *followed([intact, half_lost(intact)], is_lost.astype(int), inputs, generator), inputs
 
 
 def followed(
     models: Sequence[StateSpaceModel], modes: np.ndarray, inputs: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """States (K + 1, n) and measurements (K + 1, m) of a plant that is models[modes[k]] at step k."""
-    first, states, seen = models[modes[0]], [], []
+    first, states, measured = models[modes[0]], [], []
     x = generator.multivariate_normal(first.prior_mean, first.prior_cov)
     for k, mode in enumerate(modes):
         model = models[mode]
@@ -44,25 +44,25 @@ def followed(
             for _ in range(model.substeps):
                 x = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants))
             x = x + generator.multivariate_normal(np.zeros(len(x)), model.process_noise_cov)
-        seen.append(
+        measured.append(
             generator.multivariate_normal(model.observe(tuple(x), model.constants), model.measurement_noise_cov)
         )
         states.append(x)
-    return np.array(states), np.array(seen)
+    return np.array(states), np.array(measured)
 
 
 def several(path: Path) -> Path:
     """The probability of a mode, and errors with and without it."""
-    whole = thruster_model()
-    states, seen, inputs = run_that_switches(whole)
-    imm = InteractingMultipleModelFilter(model=whole, modes=[whole, half_lost(whole)], stay=0.98)
+    intact = thruster_model()
+    states, measured, inputs = run_that_switches(intact)
+    imm = InteractingMultipleModelFilter(model=intact, modes=[intact, half_lost(intact)], stay=0.98)
     figure = new_figure((9.6, 3.6))
     left, right = figure.subplots(1, 2)
     tidy((left, right))
     probabilities = []
-    for filter_ in (imm, make_filter("ekf", whole)):
+    for filter_ in (imm, make_filter("ekf", intact)):
         belief, means = filter_.init(), []
-        for k, z in enumerate(seen):
+        for k, z in enumerate(measured):
             belief, _ = filter_.update(filter_.predict(belief, inputs[k - 1]) if k else belief, z)
             means.append(belief.mean)
             if filter_ is imm:
@@ -108,26 +108,32 @@ def weighted(path: Path) -> Path:
     )
 
     def errors(filter_: Filter) -> tuple[np.ndarray, float]:
-        found = run(filter_, None, np.repeat(inputs, len(states), axis=0), states[..., :1]).means - states
+        differences = run(filter_, None, np.repeat(inputs, len(states), axis=0), states[..., :1]).means - states
         by_noise = run(filter_, None, inputs, noise).means
-        return np.sqrt(np.mean(found[:, 2000:, 0] ** 2, axis=1)), float(by_noise[0, 2000:, 0].std())
+        return np.sqrt(np.mean(differences[:, 2000:, 0] ** 2, axis=1)), float(by_noise[0, 2000:, 0].std())
 
     families = {
         "kf": [make_filter("kf", model)],
-        "fading": [make_filter("fading", model, fading=one) for one in (1.02, 1.05, 1.1, 1.15, 1.2)],
+        "fading": [make_filter("fading", model, fading=a) for a in (1.02, 1.05, 1.1, 1.15, 1.2)],
         "h-infinity": [
-            make_filter("h-infinity", model, theta=one, scale=[1.0, 1e6]) for one in (0.05, 0.1, 0.2, 0.3, 0.4)
+            make_filter("h-infinity", model, theta=theta, scale=[1.0, 1e6]) for theta in (0.05, 0.1, 0.2, 0.3, 0.4)
         ],
     }
     figure = new_figure((9.6, 3.6))
     left, right = figure.subplots(1, 2)
     tidy((left, right))
     for name, filters in families.items():
-        found = [errors(one) for one in filters]
-        shown = min(3, len(filters) - 1)
+        points = [errors(filter_) for filter_ in filters]
+        index = min(3, len(filters) - 1)
         label = {"fading": "fading, a = 1.15", "h-infinity": "h-infinity, theta = 0.3"}.get(name, name)
-        left.plot(frequencies, found[shown][0], label=label, **STYLES[name])
-        right.plot([one for _, one in found], [one.max() for one, _ in found], marker="o", ms=4, **STYLES[name])
+        left.plot(frequencies, points[index][0], label=label, **STYLES[name])
+        right.plot(
+            [noise for _, noise in points],
+            [errors.max() for errors, _ in points],
+            marker="o",
+            ms=4,
+            **STYLES[name],
+        )
     left.set_xscale("log")
     left.set_xlabel("frequency of the acceleration [rad/step]")
     left.set_ylabel("RMS error of the position")

@@ -48,10 +48,10 @@ def adaptive(path: Path) -> Path:
     tidy((left, right))
     left.plot(times(501), stds, label="truth", **STYLES["truth"])
     for filter_ in (VariationalBayesFilter(model=model), SageHusaFilter(model=model)):
-        found = np.sqrt([_learnt_noise(filter_, runs, run_) for run_ in range(len(runs.keys))])
-        left.plot(times(501), found.mean(axis=0), label=filter_.name, **STYLES[filter_.name])
+        learnt = np.sqrt([_learnt_noise(filter_, runs, run_) for run_ in range(len(runs.keys))])
+        left.plot(times(501), learnt.mean(axis=0), label=filter_.name, **STYLES[filter_.name])
         left.fill_between(
-            times(501), *np.quantile(found, (0.1, 0.9), axis=0), alpha=0.2, color=STYLES[filter_.name]["color"]
+            times(501), *np.quantile(learnt, (0.1, 0.9), axis=0), alpha=0.2, color=STYLES[filter_.name]["color"]
         )
     left.set_xlabel("time [s]")
     left.set_ylabel("std of the sensor's noise [N]")
@@ -153,8 +153,8 @@ def varying(path: Path) -> Path:
         dropout = [{"name": "dropout", "probability": share, "mean_length": 20.0}] if share else []
         runs = held_runs(sensors={"thrust": dropout})
         filled = runs._replace(measurements=_held(runs.measurements))
-        given = ((ExtendedKalmanFilter, runs), (ExtendedKalmanFilter, filled))
-        for values, (kind, data) in zip(errors.values(), given, strict=False):
+        cases = ((ExtendedKalmanFilter, runs), (ExtendedKalmanFilter, filled))
+        for values, (kind, data) in zip(errors.values(), cases, strict=False):
             values.append(errors_of(kind(model=model), data)[1])
         errors["open loop"].append(errors_of(make_filter("open-loop", model), runs)[1])
     looks = ((BLUE, "-"), (RUST, "--"), (MUSTARD, ":"))
@@ -169,17 +169,17 @@ def varying(path: Path) -> Path:
 
 def _learnt_noise(filter_, runs: Runs, number: int) -> list[float]:
     """R that a filter estimates after each measurement of a run."""
-    belief, found = filter_.init(), []
+    belief, noises = filter_.init(), []
     inputs = [None, *runs.inputs[number]]
     for u, z in zip(inputs, runs.measurements[number], strict=True):
         belief, _ = filter_.update(belief if u is None else filter_.predict(belief, u), z)
-        found.append(filter_.estimated_noise(belief)[0, 0])
-    return found
+        noises.append(filter_.estimated_noise(belief)[0, 0])
+    return noises
 
 
 def _held(measurements: np.ndarray) -> np.ndarray:
     """Measurements (B, K + 1, 1) with the last valid one, 0 at first, where one is missing."""
-    there = ~np.isnan(measurements)
-    last = np.maximum.accumulate(np.where(there, np.arange(measurements.shape[1])[None, :, None], -1), axis=1)
+    measured = ~np.isnan(measurements)
+    last = np.maximum.accumulate(np.where(measured, np.arange(measurements.shape[1])[None, :, None], -1), axis=1)
     values = np.take_along_axis(measurements, np.maximum(last, 0), axis=1)
     return np.where(last < 0, 0.0, values)

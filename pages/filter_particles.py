@@ -37,8 +37,8 @@ def kinds(path: Path) -> Path:
         data, model = problem.data(range(RUNS)), problem.model()
 
         def error(filter_, data=data) -> float:
-            found = run(filter_, data.filter_keys, data.inputs, data.measurements)
-            return float(np.sqrt(np.square((found.means - data.states)[:, data.late, 0]).mean()))
+            estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+            return float(np.sqrt(np.square((estimates.means - data.states)[:, data.late, 0]).mean()))
 
         for label, (name, numbers, look) in KINDS.items():
             errors = [error(make_filter(name, model, ensemble_size=size, **numbers)) for size in SIZES]

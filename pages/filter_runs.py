@@ -66,8 +66,8 @@ def nees(estimates: Estimates, runs: Runs) -> float:
     """Mean NEES of (omega_m, U_a) from step 50 on; 2 is right. NaN without a covariance."""
     errors = (estimates.means[..., :2] - runs.states)[:, FIRST_SCORED_STEP:]
     squares = normalized_squares(errors, estimates.covs[:, FIRST_SCORED_STEP:, :2, :2])
-    there = squares[~np.isnan(squares)]  # singular covariances are left out
-    return float(there.mean()) if there.size else float("nan")
+    regular = squares[~np.isnan(squares)]  # singular covariances are left out
+    return float(regular.mean()) if regular.size else float("nan")
 
 
 def errors_of(filter_: Filter, runs: Runs) -> tuple[float, float, float]:

@@ -44,9 +44,9 @@ def ensembles(path: Path) -> Path:
         points = [errors_of(make_filter("enkf", model, ensemble_size=8, **{control: v}), runs)[1:] for v in values]
         axes[2].plot(*zip(*points, strict=True), marks, color=colour, markersize=4, linewidth=1.2, label=control)
         for value, (x, y) in zip(values, points, strict=True):
-            place, side = ((5, 3), "left") if control == "inflation" else ((-6, -3), "right")
+            offset, side = ((5, 3), "left") if control == "inflation" else ((-6, -3), "right")
             text = {"textcoords": "offset points", "fontsize": 7, "color": colour, "ha": side}
-            axes[2].annotate(f"{value:g}", (x, y), place, **text)
+            axes[2].annotate(f"{value:g}", (x, y), offset, **text)
     for axis, label in zip(axes, ("RMSE of $U_a$ [m/s]", "mean NEES [-]"), strict=False):
         log_ticks(axis.xaxis, (5, 10, 20, 50, 100, 200, 400))
         axis.set_xlabel("members N")

@@ -137,10 +137,10 @@ def advice() -> str:
     rows = []
     for situation in situations():
         runs = situation.runs()
-        for place, (label, filter_) in enumerate(situation.filters.items()):
+        for number, (label, filter_) in enumerate(situation.filters.items()):
             motor, flow, squares = errors_of(filter_, runs)
             honesty = "" if np.isnan(squares) else digits(squares) if squares < 1000 else "> 1000"
-            rows.append(["" if place else situation.name, label, digits(motor), digits(flow), honesty])
+            rows.append(["" if number else situation.name, label, digits(motor), digits(flow), honesty])
     return markdown_table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)
 
 

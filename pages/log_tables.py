@@ -21,19 +21,19 @@ def hidden_truth(
     """Score of filters tuned on logs over that of the same ones tuned with the truth."""
     rows = []
     for scenario, name in cases:
-        found = [hide_truth(name, find_problem(scenario), trials, runs=count) for count in runs]
-        sizes = ", ".join(filter(None, [_size(found[-1].seen), _size(found[-1].blind)]))
-        states = ", ".join(f"{ratio:.3f}" for ratio in found[-1].rmse_ratios)
-        rows.append([f"`{scenario}`", f"`{name}`", *map(_ratio, found), states, sizes])
+        comparisons = [hide_truth(name, find_problem(scenario), trials, runs=count) for count in runs]
+        sizes = ", ".join(filter(None, [_size(comparisons[-1].seen), _size(comparisons[-1].blind)]))
+        states = ", ".join(f"{ratio:.3f}" for ratio in comparisons[-1].rmse_ratios)
+        rows.append([f"`{scenario}`", f"`{name}`", *map(_ratio, comparisons), states, sizes])
     counts = [f"{count} logs" for count in runs]
     return markdown_table(
         ["scenario", "filter", *counts, f"RMSE of each state, {counts[-1]}", "N, seen and hidden"], rows
     )
 
 
-def _ratio(found: Hidden) -> str:
-    one = found.ratio
-    return f"{one.value:.3f} ({one.low:.3f} to {one.high:.3f})"
+def _ratio(comparison: Hidden) -> str:
+    ratio = comparison.ratio
+    return f"{ratio.value:.3f} ({ratio.low:.3f} to {ratio.high:.3f})"
 
 
 def _size(choice) -> str:

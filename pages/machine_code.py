@@ -38,7 +38,7 @@ def slowed(x, u, c):
     return (x[0] - 0.1 * (c[0] * x[0] * abs(x[0]) - u[0]),)
 
 
-def seen(x, c):
+def speed(x, c):
     """Its speed."""
     return (x[0],)
 
@@ -47,7 +47,7 @@ def body() -> StateSpaceModel:
     """The body."""
     return StateSpaceModel(
         transition=slowed,
-        observe=seen,
+        observe=speed,
         constants=(0.5,),
         process_noise_cov=[0.01],
         measurement_noise_cov=[0.1],
@@ -73,51 +73,51 @@ def block(text: str, language: str = "python") -> str:
 def page() -> str:
     """The filter as it stands in a textbook."""
     functions = extended.propagate, extended.add_process_noise, extended.update
-    return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
+    return block("\n\n\n".join(inspect.getsource(function).rstrip() for function in functions))
 
 
-def said(wanted: Sequence[Matrix], names: dict[Matrix, str]) -> list[str]:
+def operation_lines(wanted: Sequence[Matrix], names: dict[Matrix, str]) -> list[str]:
     """What operations some matrices are made of, a line each."""
     lines = []
-    for one in in_order(wanted):
-        if one in names:
+    for matrix in in_order(wanted):
+        if matrix in names:
             continue
-        if isinstance(one.operation, Place):
-            names[one] = str(one.operation)
+        if isinstance(matrix.operation, Place):
+            names[matrix] = str(matrix.operation)
             continue
-        names[one] = f"m{sum(name.startswith('m') for name in names.values())}"
-        arguments = ", ".join(names[a] if isinstance(a, Matrix) else repr(a) for a in one.arguments)
-        lines.append(f"{names[one]} = {one.operation.name.strip('_')}({arguments})")
+        names[matrix] = f"m{sum(name.startswith('m') for name in names.values())}"
+        arguments = ", ".join(names[a] if isinstance(a, Matrix) else repr(a) for a in matrix.arguments)
+        lines.append(f"{names[matrix]} = {matrix.operation.name.strip('_')}({arguments})")
     return lines
 
 
 def names_of(memory: Memory) -> dict[Matrix, str]:
     """The matrices that are given, by the page's names."""
-    given = {memory.x: "x", memory.P: "P", memory.u: "u", memory.z: "z", memory.Q: "Q", memory.R: "R"}
-    given |= {memory.scales: "s", memory.constants: "c", memory.constants_slope: "dc", memory.size: "size"}
-    return given | {slope: f"d{given[one]}" for one, slope in memory.moves.items()}
+    names = {memory.x: "x", memory.P: "P", memory.u: "u", memory.z: "z", memory.Q: "Q", memory.R: "R"}
+    names |= {memory.scales: "s", memory.constants: "c", memory.constants_slope: "dc", memory.size: "size"}
+    return names | {slope: f"d{names[matrix]}" for matrix, slope in memory.moves.items()}
 
 
 def graph() -> str:
     """The update as a graph of matrices."""
-    made, memory = stages()
-    return block("\n".join(said(list(made[2].values.values()), names_of(memory))), "text")
+    parts, memory = stages()
+    return block("\n".join(operation_lines(list(parts[2].values.values()), names_of(memory))), "text")
 
 
 def slopes() -> str:
     """The prediction's derivatives, beside what they share with its values."""
-    made, memory = stages()
+    parts, memory = stages()
     names = names_of(memory)
-    values = said(list(made[0].values.values()), names)
-    derived = said(list(made[0].slopes.values()), names)
+    values = operation_lines(list(parts[0].values.values()), names)
+    derived = operation_lines(list(parts[0].slopes.values()), names)
     return block("\n".join([*values, "", *derived]), "text")
 
 
 def numbers() -> str:
     """The prediction as programs: its values, and their derivatives."""
-    made, memory = stages()
-    both = as_programs(made[0], memory.length, MOST)
-    texts = ("\n".join(_lines(one)) for one in (both.values, both.slopes))
+    parts, memory = stages()
+    both = as_programs(parts[0], memory.length, MOST)
+    texts = ("\n".join(_lines(program)) for program in (both.values, both.slopes))
     return block(
         "\n\n".join(f"# {title}\n{text}" for title, text in zip(("values", "slopes"), texts, strict=True))
     )
@@ -135,13 +135,15 @@ def program() -> str:
 def members() -> str:
     """The ensemble Kalman filter as it stands in a textbook."""
     functions = steps.propagate, steps.add_process_noise, steps.compare, stochastic.update_stochastic
-    return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
+    return block("\n\n\n".join(inspect.getsource(function).rstrip() for function in functions))
 
 
 def particles() -> str:
     """The bootstrap particle filter's update as it stands in a textbook."""
     return block(
-        "\n\n\n".join(inspect.getsource(one).rstrip() for one in (weighted.expect, weighted.fit, particle.update))
+        "\n\n\n".join(
+            inspect.getsource(function).rstrip() for function in (weighted.expect, weighted.fit, particle.update)
+        )
     )
 
 
@@ -151,20 +153,20 @@ def loops() -> str:
     memory = MembersMemory(model.shape, kind.page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     update = as_programs(stages_of_members(kind.page, memory, equations)["analyse"], 0, MOST).values
-    ordered = [*(one for _, one in update.reads), *update.works]
-    names = {one.place: f"t{k}" for k, one in enumerate(ordered)}
+    ordered = [*(node for _, node in update.reads), *update.works]
+    names = {node.place: f"t{k}" for k, node in enumerate(ordered)}
     texts = dict(line.split(" = ", 1) for line in _lines(update) if line.startswith("t"))
     parts = cut(update, model.n)
-    lines = [f"{names[one.place]} = {place}" for place, one in parts.reads]
+    lines = [f"{names[node.place]} = {source}" for source, node in parts.reads]
     for turn in parts.turns:
-        once = (names[one.place] for one in turn.works if one.operation != "sum")
+        once = (names[node.place] for node in turn.works if node.operation != "sum")
         lines += [f"{name} = {texts[name]}" for name in once]
         for loop in turn.bodies:
             lines.append("for each member:")
-            inside = [f"{names[one.place]} = {place}" for place, one in loop.reads]
-            inside += [f"{names[one.place]} = {texts[names[one.place]]}" for one in loop.works]
-            inside += [f"{place} = {names[one.place]}" for place, one in loop.stores]
-            inside += [f"{names[one.place]} += {names[one.of[0].place]}" for one in loop.sums]
+            inside = [f"{names[node.place]} = {source}" for source, node in loop.reads]
+            inside += [f"{names[node.place]} = {texts[names[node.place]]}" for node in loop.works]
+            inside += [f"{target} = {names[node.place]}" for target, node in loop.stores]
+            inside += [f"{names[node.place]} += {names[node.of[0].place]}" for node in loop.sums]
             lines += [f"    {line}" for line in inside]
     return block("\n".join(lines), "text")
 

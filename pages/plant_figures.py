@@ -73,7 +73,7 @@ def steady_states(path: Path) -> Path:
     figure = new_figure((9.6, 3.6))
     axes = figure.subplots(1, 3)
     tidy(axes)
-    for place, (name, (colour, dashes)) in enumerate(STYLES.items()):
+    for number, (name, (colour, dashes)) in enumerate(STYLES.items()):
         p = PRESETS[name]
         voltages = np.linspace(-1, 1, 81) * FULL_VOLTAGE[name]
         points = np.array([steady_state(p, voltage) for voltage in voltages])
@@ -82,7 +82,7 @@ def steady_states(path: Path) -> Path:
         axes[1].plot(voltages, points[:, 0], **look)
         for shift, fill, voltage in ((-0.12, colour, 1.0), (0.12, "white", -1.0)):
             look = {"color": colour, "markerfacecolor": fill, "markersize": 7}
-            axes[2].plot(place + shift, thrust_coefficient(p, voltage), "o", **look)
+            axes[2].plot(number + shift, thrust_coefficient(p, voltage), "o", **look)
     axes[2].axhspan(0.18, 0.46, color=DARK, alpha=0.12, linewidth=0, label="measured small thrusters")
     axes[2].plot([], [], "o", color=DARK, label="ahead")
     axes[2].plot([], [], "o", color=DARK, markerfacecolor="white", label="astern")
@@ -155,18 +155,20 @@ def amplifier_effects(path: Path) -> Path:
     }
     voltages = np.where(time < 1.0, 12.0 * np.sin(2 * math.pi * time), np.where(time < 1.5, 12.0, -12.0))
     plain = make_plant("t200", max_voltage=FULL_VOLTAGE["t200"], **QUIET)
-    plants = {title: plain._replace(amplifier=AMPLIFIER_EFFECTS.make(one)) for title, one in examples.items()}
+    plants = {
+        title: plain._replace(amplifier=AMPLIFIER_EFFECTS.make(effect)) for title, effect in examples.items()
+    }
     return _signals(path, plants, plain, voltages, (VOLTAGE, "voltage [V]"))
 
 
 def references(path: Path) -> Path:
     """The reference generators, with their defaults where they have any, and a sum of two."""
-    given = {
+    arguments = {
         "constant": {"level": 0.5},
         "prbs": {"hold_time": 0.25},
         "recorded": {"values": [0, 30, 30, 10, 40, 5], "sample_time": 1.0},
     }
-    examples = {name: [{"name": name, **given.get(name, {})}] for name in REFERENCE_SIGNALS.effects}
+    examples = {name: [{"name": name, **arguments.get(name, {})}] for name in REFERENCE_SIGNALS.effects}
     examples["ramps + multi-sine"] = [
         {"name": "ramps"},
         {"name": "multi-sine", "offset": 0.0, "amplitude": 0.03, "periods": [0.3, 0.2]},

@@ -132,12 +132,12 @@ def returns() -> str:
     rows = []
     for task in TASKS:
         env = gym.make_vec(task, num_envs=EPISODES)
-        seen = ObserveStateVector(env)
+        with_state = ObserveStateVector(env)
         policies = [
             (env, None),
             (env, PIController.for_env(env, proportional_gain=0.0, integral_gain=0.0)),
             (env, PIController.for_env(env)),
-            (seen, LQRController.for_env(seen)),
+            (with_state, LQRController.for_env(with_state)),
         ]
         rows.append([f"`{task}`", *(_mean_return(*policy) for policy in policies)])
     return markdown_table(["", "0 V", "feed-forward alone", "PI with feed-forward", "LQR on the true state"], rows)

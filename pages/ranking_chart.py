@@ -47,8 +47,8 @@ OTHERWISE = Step("Otherwise", ("ekf",), "the least cost, gradients, C code")
 def as_text() -> str:
     """The same as a numbered list, which a phone shows in letters large enough."""
     return "\n".join(
-        f"{place}. {step.question} {', '.join(f'`{name}`' for name in step.filters)}: {step.why}."
-        for place, step in enumerate((*STEPS, OTHERWISE), 1)
+        f"{number}. {step.question} {', '.join(f'`{name}`' for name in step.filters)}: {step.why}."
+        for number, step in enumerate((*STEPS, OTHERWISE), 1)
     )
 
 

@@ -71,9 +71,9 @@ def network_elsewhere() -> str:
     rows = []
     for name in ELSEWHERE:
         networks = {pair: _network(pair[1], pair[0])._replace(label=" ".join(pair)) for pair in pairs}
-        some = [one for pair, one in networks.items() if pair[0] == "gru" or name != "mismatch"]
-        _, *found = leaderboard(find_scenario(name), [contender("ekf"), *some]).rows
-        cells = {row.label: ratio_cell(row) for row in found}
+        accepted = [network for pair, network in networks.items() if pair[0] == "gru" or name != "mismatch"]
+        _, *scored = leaderboard(find_scenario(name), [contender("ekf"), *accepted]).rows
+        cells = {row.label: ratio_cell(row) for row in scored}
         rows.append([f"`{name}`", *(cells.get(" ".join(pair), "-") for pair in pairs)])
     return markdown_table(["scenario", *(f"{kind}, trained on `{name}`" for kind, name in pairs)], rows)
 
@@ -88,12 +88,12 @@ def network_further() -> str:
         filters = {"ekf, tuned": _tuned("ekf", name).filter(problem)}
         filters |= {"ekf-robust, oracle": contender("ekf-robust").filter(problem)}
         filters |= {kind: _network(name, kind).filter(problem) for kind in TRAININGS}
-        first, *others = standings(filters, problem, held_out_seeds(0, SEEDS))
-        for place, one in enumerate(others):
-            ratios = (one.ratio(first, runs) for runs in (HELD_OUT, LONGER, NOISIER))
-            nees = one.evaluations[HELD_OUT].nees.value
+        first, *further = standings(filters, problem, held_out_seeds(0, SEEDS))
+        for number, standing in enumerate(further):
+            ratios = (standing.ratio(first, runs) for runs in (HELD_OUT, LONGER, NOISIER))
+            nees = standing.evaluations[HELD_OUT].nees.value
             cells = [*map(marked, ratios), "" if np.isnan(nees) else digits(nees)]
-            rows.append(["" if place else f"`{name}`", one.label, *cells])
+            rows.append(["" if number else f"`{name}`", standing.label, *cells])
     return markdown_table(["scenario", "filter", HELD_OUT, LONGER, NOISIER, "NEES"], rows)
 
 
@@ -101,16 +101,18 @@ def network_papers() -> str:
     """The settings of the paper on KalmanNet: mean square errors in dB."""
     from tuning.experiments import kalmannet
 
-    own, rows = {"differentiable-enkf": {"steps": 100, "window": 20}}, []
+    settings_of, rows = {"differentiable-enkf": {"steps": 100, "window": 20}}, []
     for problem in (kalmannet.linear, kalmannet.lorenz):
         data = data_of(problem, problem.held_out_seeds(0, SEEDS))
         oracle_of = contender("ekf").filter(problem)
         filters = {"ekf, oracle": oracle_of} | {
-            kind: make_filter(_trained(kind, problem, PAPERS | own.get(kind, {})), problem.model())
+            kind: make_filter(_trained(kind, problem, PAPERS | settings_of.get(kind, {})), problem.model())
             for kind in TRAININGS
         }
-        found = [evaluate(one, data, problem.scale) for one in filters.values()]
-        rows.append([problem.name, *(digits(kalmannet.decibels(one.mean_squares)) for one in found)])
+        evaluations = [evaluate(filter_, data, problem.scale) for filter_ in filters.values()]
+        rows.append(
+            [problem.name, *(digits(kalmannet.decibels(evaluation.mean_squares)) for evaluation in evaluations)]
+        )
     return markdown_table(["setting", "ekf, oracle", *TRAININGS], rows)
 
 
@@ -129,11 +131,11 @@ def _problem_of_network(name: str) -> str:
     tuned = [
         Contender(f"{kind}, tuned", lambda problem, kind=kind: _tuned(kind, name)) for kind in ("ekf", "enkf")
     ]
-    others = [contender("ekf-robust"), contender("enkf", ensemble_size=100)]
-    oracles = [one._replace(label=f"{one.label}, oracle") for one in (contender("ekf"), *others)]
-    told = [RIGHT, LEARNING] if name == "mismatch" else []
+    alternatives = [contender("ekf-robust"), contender("enkf", ensemble_size=100)]
+    oracles = [filter_._replace(label=f"{filter_.label}, oracle") for filter_ in (contender("ekf"), *alternatives)]
+    informed = [RIGHT, LEARNING] if name == "mismatch" else []
     networks = [_network(name, kind) for kind in TRAININGS]
-    return table_of(leaderboard(find_scenario(name), [*oracles, *tuned, *told, *networks], SEEDS))
+    return table_of(leaderboard(find_scenario(name), [*oracles, *tuned, *informed, *networks], SEEDS))
 
 
 class _Made(NamedTuple):
@@ -175,13 +177,18 @@ def _trained(kind: str, problem: Problem, arguments: dict[str, Any]) -> str:
 
 
 def _nine_digits(row: Row) -> str:
-    found = row.evaluation
-    values = [*(one.value for one in found.rmse), found.nees.value, found.nis.value, found.log_likelihood]
+    evaluation = row.evaluation
+    values = [
+        *(interval.value for interval in evaluation.rmse),
+        evaluation.nees.value,
+        evaluation.nis.value,
+        evaluation.log_likelihood,
+    ]
     return " | ".join(f"{value:.9g}" for value in values)
 
 
 NETWORKS = network_mismatch, network_outliers, network_elsewhere, network_further, network_papers
-TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (*NETWORKS, filterpy)}
+TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (*NETWORKS, filterpy)}
 
 
 def run_main(arguments: Sequence[str] | None = None) -> None:

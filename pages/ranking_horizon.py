@@ -68,31 +68,31 @@ def batches(count: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.n
 
 def batch_reactor() -> str:
     """A batch reactor whose initial pressures are far from what the filters assume."""
-    given, states = batches(SEEDS)
+    arguments, states = batches(SEEDS)
     rows = []
     for label, filter_ in _of_reactor().items():
-        found = run(filter_, *given)
-        errors = found.means - states
+        estimates = run(filter_, *arguments)
+        errors = estimates.means - states
         rmse = np.sqrt(np.square(errors[:, SETTLED:]).mean(axis=(0, 1)))
         lost = (np.abs(errors[:, -1]).max(axis=1) > 0.5).sum()
-        row = [label, *map(digits, rmse), digits(found.means[:, 1:, 0].min()), f"{lost} of {SEEDS}"]
+        row = [label, *map(digits, rmse), digits(estimates.means[:, 1:, 0].min()), f"{lost} of {SEEDS}"]
         rows.append(row)
     return markdown_table(["filter", "p_A", "p_B", "least p_A", "lost"], rows)
 
 
 def _of_reactor() -> dict[str, Filter]:
     within = {by: assumed(bounds=POSITIVE, bounded_by=by) for by in ("truncation", "projection")}
-    found: dict[str, Filter] = {
+    filters: dict[str, Filter] = {
         name: make_filter(name, assumed(), **numbers)
         for name, numbers in (("ekf", {}), ("iekf", {}), ("ukf", {}), ("enkf", {"ensemble_size": 100}))
     }
-    for by, one in within.items():
-        found |= {f"{name}, bounded by {by}": make_filter(name, one) for name in ("ekf", "ukf")}
-    found["mhe without bounds"] = make_filter("mhe", assumed())
+    for by, model in within.items():
+        filters |= {f"{name}, bounded by {by}": make_filter(name, model) for name in ("ekf", "ukf")}
+    filters["mhe without bounds"] = make_filter("mhe", assumed())
     for length in (5, 10, 30):
-        found[f"mhe, L = {length}"] = make_filter("mhe", within["projection"], horizon=length)
-    found["mhe, L = 30, Student's loss"] = make_filter("mhe", within["projection"], horizon=30, loss=STUDENT)
-    return found
+        filters[f"mhe, L = {length}"] = make_filter("mhe", within["projection"], horizon=length)
+    filters["mhe, L = 30, Student's loss"] = make_filter("mhe", within["projection"], horizon=30, loss=STUDENT)
+    return filters
 
 
 def horizon() -> str:
@@ -103,13 +103,13 @@ def horizon() -> str:
         board = leaderboard(find_scenario(name), filters)
         for row in board.rows:
             first = row is board.rows[0]
-            errors = (digits(one.value) for one in row.evaluation.rmse)
+            errors = (digits(error.value) for error in row.evaluation.rmse)
             cells = [f"`{name}`" if first else "", row.label, *errors, "" if first else ratio_cell(row)]
             rows.append([*cells, digits(row.nees)])
     return markdown_table(["scenario", "filter", "omega_m [rad/s]", "U_a [m/s]", "score over ekf", "NEES"], rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (batch_reactor, horizon)}
+TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (batch_reactor, horizon)}
 
 
 if __name__ == "__main__":

@@ -63,22 +63,22 @@ def constants() -> str:
 def errors_of(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
     """RMSE by state, the median NEES and the log-likelihood, a row per filter."""
     data, model = problem.data(held_out_seeds(0, SEEDS)), problem.model()
-    symbols = [one.symbol for one in model.states]
+    symbols = [state.symbol for state in model.states]
     rows = []
     for name, numbers in filters:
-        found = run(make_filter(name, model, **numbers), data.filter_keys, data.inputs, data.measurements)
-        errors, covs = (found.means - data.states)[:, data.late], found.covs[:, data.late]
+        estimates = run(make_filter(name, model, **numbers), data.filter_keys, data.inputs, data.measurements)
+        errors, covs = (estimates.means - data.states)[:, data.late], estimates.covs[:, data.late]
         parts = rmse_intervals(np.square(errors).mean(axis=1))
         squares = np.square(whitened(errors, covs)).sum(axis=-1)
         nees = np.median(np.where(np.isnan(squares), np.inf, squares))  # of a singular P: no error is within it
-        level = found.log_likelihoods[:, data.late].sum(axis=1).mean()
-        label = " ".join([name, *(str(one) for key, one in numbers.items() if key != "resampling_threshold")])
+        level = estimates.log_likelihoods[:, data.late].sum(axis=1).mean()
+        label = " ".join([name, *(str(value) for key, value in numbers.items() if key != "resampling_threshold")])
         cells = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in parts]
         rows.append([label, *cells, f"{nees / chi2.median(model.n):.2f}", f"{level:.1f}"])
     return markdown_table(["filter", *symbols, "NEES", "log L"], rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {one.__name__: one for one in (conditional, accurate, constants)}
+TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (conditional, accurate, constants)}
 
 if __name__ == "__main__":
     main(None, TABLES, "pages.ranking_particles", __doc__, DOCS / "ranking.md")

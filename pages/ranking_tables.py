@@ -52,7 +52,7 @@ COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS"
 def speed() -> str:
     """|speed| at slow crossings and dwells."""
     by_speed = contender("gsf", component=0)  # the sum is split along omega_m
-    marginal = [contender("rbpf", sampled=(place,)) for place in (0, 1)]
+    marginal = [contender("rbpf", sampled=(component,)) for component in (0, 1)]
     filters = [EKF, UKF, by_speed, ENKF, RANKED, PF, MANY, *marginal]
     return table_of(leaderboard(find_scenario("speed_magnitude"), filters))
 
@@ -108,11 +108,11 @@ def scores() -> str:
     """Scores over that of the EKF, a row per scenario."""
     filters = [EKF, ROBUST, IMM, IEKF, UKF, ENKF, GSF, PF]
     boards = [leaderboard(scenario, filters) for scenario in SCENARIOS.values()]
-    labels = [one.label for one in filters[1:]]
+    labels = [filter_.label for filter_ in filters[1:]]
     lines = [f"| scenario | ekf: score | {' | '.join(labels)} |", "|---" * (len(labels) + 2) + "|"]
     for board in boards:
-        first, *others = board.rows
-        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(ratio_cell, others)]
+        first, *rest = board.rows
+        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(ratio_cell, rest)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -132,17 +132,17 @@ def by_default(name: str) -> Contender:
 
 def ratios_of(filters: Sequence[Contender], problems: Sequence[str]) -> str:
     """Scores and times over the EKF's, by problem and as a median; a dash where a filter refuses the model."""
-    cells: dict[str, list[str]] = {one.label: [] for one in (EKF, *filters)}
+    cells: dict[str, list[str]] = {filter_.label: [] for filter_ in (EKF, *filters)}
     times: dict[str, list[float]] = {label: [] for label in cells}
     for problem in map(find_problem, problems):
-        accepted = [one for one in filters if one.label != EKF.label and _accepts(one, problem)]
+        accepted = [filter_ for filter_ in filters if filter_.label != EKF.label and _accepts(filter_, problem)]
         seeds = VEHICLE_SEEDS if problem.name in VEHICLE else SEEDS
-        first, *others = leaderboard(problem, [EKF, *accepted], seeds).rows
-        found = {row.label: ratio_cell(row) for row in others}
-        found[first.label] = f"{first.evaluation.score.value:.2f}"
+        first, *rest = leaderboard(problem, [EKF, *accepted], seeds).rows
+        cell_of = {row.label: ratio_cell(row) for row in rest}
+        cell_of[first.label] = f"{first.evaluation.score.value:.2f}"
         for label, line in cells.items():
-            line.append(found.get(label, "-"))
-        for row in (first, *others):
+            line.append(cell_of.get(label, "-"))
+        for row in (first, *rest):
             times[row.label].append(row.microseconds / first.microseconds)
     header = ["filter", *(re.sub("[_:]", " ", name) for name in problems), "time"]
     return markdown_table(header, [[label, *line, _median_of(times[label])] for label, line in cells.items()])
@@ -152,9 +152,9 @@ def _median_of(ratios: Sequence[float]) -> str:
     return digits(np.median(ratios), 1) if ratios else "-"
 
 
-def _accepts(one: Contender, problem: Problem) -> bool:
+def _accepts(filter_: Contender, problem: Problem) -> bool:
     try:
-        one.filter(problem)
+        filter_.filter(problem)
     except ValueError:
         return False
     return True
@@ -163,11 +163,13 @@ def _accepts(one: Contender, problem: Problem) -> bool:
 def scenarios() -> str:
     """What each scenario is."""
     lines = ["| scenario | what it is | excitation | scale |", "|---|---|---|---|"]
-    for one in SCENARIOS.values():
-        arguments = [f"{key} {value}" for key, value in one.excitation.as_mapping().items() if key != "name"]
-        excitation = f"`{one.excitation.name}`: {', '.join(arguments)}"
-        speed_scale, flow_scale = one.scale
-        lines.append(f"| `{one.name}` | {one.about} | {excitation} | {speed_scale} rad/s, {flow_scale} m/s |")
+    for scenario in SCENARIOS.values():
+        arguments = [f"{key} {value}" for key, value in scenario.excitation.as_mapping().items() if key != "name"]
+        excitation = f"`{scenario.excitation.name}`: {', '.join(arguments)}"
+        speed_scale, flow_scale = scenario.scale
+        lines.append(
+            f"| `{scenario.name}` | {scenario.about} | {excitation} | {speed_scale} rad/s, {flow_scale} m/s |"
+        )
     return "\n".join(lines)
 
 
@@ -184,10 +186,10 @@ def table_of(board: Leaderboard) -> str:
     lines = [f"| filter | {' | '.join(COLUMNS).format(board.rows[0].label)} |", "|---" * 8 + "|"]
     for row in board.rows:
         cells = [row.label]
-        for rmse, above, ratio, places in zip(
+        for rmse, above, ratio, decimals in zip(
             row.evaluation.rmse, row.above_bound, row.ratios, (3, 4), strict=True
         ):
-            cells.append(f"{_about(rmse, places)} ({100 * above:+.0f} %)")
+            cells.append(f"{_about(rmse, decimals)} ({100 * above:+.0f} %)")
             cells.append("" if row is board.rows[0] else _about(ratio, 3))
         nees = f"{row.nees:.2f} (median)" if row.nees_is_median else unless_blank(row.nees, ".3g")
         cells += [nees, unless_blank(row.evaluation.nis.value, ".3g")]
@@ -240,9 +242,9 @@ def main(
     parser = argparse.ArgumentParser(prog=f"python -m {module}", description=about.splitlines()[0])
     parser.add_argument("page", nargs="?", type=Path, default=page, metavar="PAGE")
     parser.add_argument("--table", action="append", choices=list(tables), help="only this one; may be repeated")
-    given = parser.parse_args(arguments)
-    for name in given.table or tables:  # written one by one, so that what is done stays
-        write_whole(given.page, with_tables(given.page.read_text(), {name: tables[name]}))
+    options = parser.parse_args(arguments)
+    for name in options.table or tables:  # written one by one, so that what is done stays
+        write_whole(options.page, with_tables(options.page.read_text(), {name: tables[name]}))
 
 
 if __name__ == "__main__":

@@ -58,8 +58,8 @@ def tuned(path: Path, tuning: Tuning) -> Path:
     axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(3, 2))
     tidy(axes.flat)
     for (above, below), (title, filter_) in zip(axes.T, before_and_after(tuning).items(), strict=True):
-        found, truth = run(filter_, data.filter_keys, data.inputs, data.measurements), data.states[0, :, FLOW]
-        mean, band = found.means[0, :, FLOW], 1.96 * np.sqrt(found.covs[0, :, FLOW, FLOW])
+        estimates, truth = run(filter_, data.filter_keys, data.inputs, data.measurements), data.states[0, :, FLOW]
+        mean, band = estimates.means[0, :, FLOW], 1.96 * np.sqrt(estimates.covs[0, :, FLOW, FLOW])
         above.fill_between(time, mean - band, mean + band, color=BLUE, alpha=0.3, linewidth=0, label="95 % band")
         above.plot(time, truth, color=DARK, linewidth=2.4, label="truth")
         above.plot(time, mean, color=BLUE, linewidth=1.0, label="estimate")
@@ -98,8 +98,8 @@ def thruster(path: Path, tuning: Tuning) -> Path:
 def save_gif(path: Path, frames: Sequence[Image.Image], milliseconds: int) -> Path:
     """Pictures as one that moves, for ever, with one palette for all."""
     palette = frames[len(frames) // 2].quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
-    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    options = {"save_all": True, "append_images": others, "duration": milliseconds, "loop": 0, "optimize": True}
+    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    options = {"save_all": True, "append_images": rest, "duration": milliseconds, "loop": 0, "optimize": True}
     write_whole(path, lambda stream: first.save(stream, format="gif", **options))
     return path
 

@@ -30,21 +30,24 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
     runs = read_recordings(recordings)
     tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
     keep(tasks[Task(CHOSEN).name], [run.name for run in runs])
-    left_out, whole = estimates_of(runs, tasks), estimates_of(runs)
+    left_out, on_all = estimates_of(runs, tasks), estimates_of(runs)
 
     def regime() -> str:
         rows = [
-            [f"{one.factor:g}", f"{one.log_likelihood:.0f}", f"{one.nis:.2f}", f"{one.ratio:.3f}"]
-            for one in regimes(model(), runs)
+            [f"{row.factor:g}", f"{row.log_likelihood:.0f}", f"{row.nis:.2f}", f"{row.ratio:.3f}"]
+            for row in regimes(model(), runs)
         ]
         return markdown_table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
 
-    made = {name: (lambda one=one: markdown_table(*one)) for name, one in rows_of(runs, left_out, tasks).items()}
-    ratios = made["ratios"]
+    tables = {
+        name: (lambda table=table: markdown_table(*table))
+        for name, table in rows_of(runs, left_out, tasks).items()
+    }
+    ratios = tables["ratios"]
     return {
-        **made,
+        **tables,
         "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
-        "all_runs": lambda: markdown_table(*rows_of(runs, whole)["ratios"]),
+        "all_runs": lambda: markdown_table(*rows_of(runs, on_all)["ratios"]),
         "regime": regime,
     }
 
@@ -62,9 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--results", type=Path, default=Path("out") / "recordings.json")
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS)
-    given = parser.parse_intermixed_args(arguments)
-    page = given.folder / "real_data.md"
-    write_whole(page, with_tables(page.read_text(encoding="utf-8"), tables_of(given.recordings, given.results)))
+    options = parser.parse_intermixed_args(arguments)
+    page = options.folder / "real_data.md"
+    write_whole(
+        page, with_tables(page.read_text(encoding="utf-8"), tables_of(options.recordings, options.results))
+    )
 
 
 if __name__ == "__main__":

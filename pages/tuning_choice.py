@@ -329,20 +329,20 @@ def choice_size(time: float, heavy: bool, studies: int = SIZE_STUDIES) -> tuple[
     )
     rows = [_slow(log, time) if time else log for log in noise]
     blocks = np.concatenate([log.reshape(count, length, studies).sum(axis=1) for log in rows])
-    logs, plan, taken = np.repeat([0, 1], count), plan_of(False), np.zeros(4)
+    logs, plan, accepted = np.repeat([0, 1], count), plan_of(False), np.zeros(4)
     for values in blocks.T:
         zero = np.zeros_like(values)
         all_blocks = [measured_of(part, False) for part in (values, zero)]
         apart = [measured_of(part[2::3], False) for part in (values, zero)]
         trial, baseline = (measured_of(part[2::3], False, logs[2::3]) for part in (values, zero))
         choosing = Choosing(plan, {GIVEN: baseline}, {"0": trial})
-        taken += [
+        accepted += [
             is_significant(*all_blocks, False)[0],
             is_significant(*apart, False)[0],
             signed_rank(*apart, ratio=False) < 0.025 and apart[0].value < 0.0,
             choosing.wins("0"),
         ]
-    return tuple((100.0 * taken / studies).tolist())
+    return tuple((100.0 * accepted / studies).tolist())
 
 
 def _table(cases: Sequence[Case], truth: bool, studies: int) -> str:

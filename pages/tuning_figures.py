@@ -50,8 +50,10 @@ def ridge(path: Path) -> Path:
     """Score and mean NIS of an EKF over common factors on Q and on R."""
     scenario = find_scenario("nominal")
     data = Plan("ekf", (scenario,), SEED).training_data()[0]
-    found = [[_scaled(scenario, data, q, r) for q in FACTORS] for r in FACTORS]
-    scores, ratios = np.array([[(e.score.value, e.nis.value) for e in row] for row in found]).transpose(2, 0, 1)
+    evaluations = [[_scaled(scenario, data, q, r) for q in FACTORS] for r in FACTORS]
+    scores, ratios = np.array([[(e.score.value, e.nis.value) for e in row] for row in evaluations]).transpose(
+        2, 0, 1
+    )
     figure = new_figure((9.6, 4.0))
     plane, line = figure.subplots(1, 2, width_ratios=(3, 2))
     for axis in (plane.xaxis, plane.yaxis, line.xaxis, line.yaxis):
@@ -96,8 +98,11 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
         for kind in FILTERS:
             result = studied(kind, scenario, trials=trials)
             comparison = evaluate_held_out(result.choice, scenario, SEED)
-            found = comparison.ratios
-            ratios = [_about(found[one]) if one in found else "none" for one in (SCALED, RULE, ORACLE)]
+            ratio_of = comparison.ratios
+            ratios = [
+                _about(ratio_of[baseline]) if baseline in ratio_of else "none"
+                for baseline in (SCALED, RULE, ORACLE)
+            ]
             ratios.append(f"{result.choice.numbers['ensemble_size']}" if result.sizes else "")
             nees = comparison.tuned.nees.value
             honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{comparison.tuned.nis.value:.2f}"
@@ -114,7 +119,7 @@ def recovered() -> str:
         bad = bad_start("kf", scenario)
         comparison = evaluate_held_out(studied("kf", scenario, bad).choice, scenario, SEED)
         started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
-        ratios = (score_ratio(one, comparison.true) for one in (started, comparison.tuned))
+        ratios = (score_ratio(evaluation, comparison.true) for evaluation in (started, comparison.tuned))
         rows.append([f"`{name}`", *(_about(ratio, 4) for ratio in ratios)])
     return markdown_table(["scenario", "start over oracle", "tuned over oracle"], rows)
 
@@ -122,9 +127,9 @@ def recovered() -> str:
 def maximum_likelihood() -> str:
     """The maximum of the likelihood beside the true numbers."""
     scenario = find_scenario("nominal")
-    found = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
+    result = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
     true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
-    columns = zip(found.names, true, found.best.parameters, found.standard_errors, strict=True)
+    columns = zip(result.names, true, result.best.parameters, result.standard_errors, strict=True)
     rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
     return markdown_table(["", "true", "most likely", "standard error"], rows)
 
@@ -135,8 +140,8 @@ def aims() -> str:
     data = Plan("ekf", (scenario,), SEED).training_data()[0]
     rows = []
     for aim in (LIKELIHOOD, SCORE, MSE, LOG_SCORE):
-        found = tune_by_gradient("ekf", scenario, data, objective=aim)
-        rows.append(_proved(f"gradient of `{aim}`", found.choice, scenario, found.names, found.identified))
+        result = tune_by_gradient("ekf", scenario, data, objective=aim)
+        rows.append(_proved(f"gradient of `{aim}`", result.choice, scenario, result.names, result.identified))
     choice = studied("ekf", scenario).choice
     rows.append(_proved(f"study of `score`, {TRIALS} trials", choice, scenario))
     return markdown_table(["", "score over the scaled default", "NEES", "NIS", "not determined"], rows)
@@ -155,7 +160,7 @@ def _about(value: Interval, digits: int = 3) -> str:
 
 FIGURES: dict[str, Callable[[Path], Path]] = {"tuning_ridge.png": ridge}
 TABLES: dict[str, Callable[[], str]] = {
-    made.__name__: made for made in (earned, recovered, maximum_likelihood, aims)
+    table.__name__: table for table in (earned, recovered, maximum_likelihood, aims)
 }
 TABLES |= RECOVERY_TABLES | MASSES_TABLES
 

@@ -54,11 +54,11 @@ def many() -> str:
     plan = Plan("kf", (problem,))
     data = plan.training_data()
     study = run_study(open_study("page", plan, None), plan, TRIALS).or_interrupted()
-    rows, found = [], {f"study of diagonal Q and R, {TRIALS} trials": study.choice}
+    rows, choices = [], {f"study of diagonal Q and R, {TRIALS} trials": study.choice}
     for name, options in (("diagonal", {}), ("full", {"full_q": True, "full_r": True})):
         ended = tune_by_gradient("kf", problem, data, [1.0], "score", options)
-        found[f"gradient of the score, {name} Q and R, {len(ended.free)} numbers"] = ended.choice
-    for name, choice in found.items():
+        choices[f"gradient of the score, {name} Q and R, {len(ended.free)} numbers"] = ended.choice
+    for name, choice in choices.items():
         comparison = evaluate_held_out(choice, problem, plan.seed)
         if not rows:
             ratio = score_ratio(comparison.evaluations[NOISE], comparison.evaluations[GIVEN])

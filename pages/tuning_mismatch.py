@@ -100,7 +100,7 @@ def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[C
     data = plan.training_data()[0]
     space = distributions("ekf", scenario)
 
-    def made(trial) -> Filter:
+    def filter_of(trial) -> Filter:
         beliefs = {
             name: (
                 trial.suggest_float(f"{name} prior", *SPREADS, log=True),
@@ -111,8 +111,8 @@ def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[C
         return augmented(suggest(trial, "ekf", scenario, space), scenario, beliefs)
 
     def value(trial) -> float:
-        found = evaluate(made(trial), data, scenario.scale)
-        return penalised(found.score.value, found) + OUTSIDE * max(0.0, nis_violation(found))
+        evaluation = evaluate(filter_of(trial), data, scenario.scale)
+        return penalised(evaluation.score.value, evaluation) + OUTSIDE * max(0.0, nis_violation(evaluation))
 
     study = optuna.create_study(sampler=make_sampler("tpe", SEED, 0, {}, first=plan.first_ranges()))
     first = dict(zip(("prior", "walk"), START, strict=True))
@@ -120,7 +120,7 @@ def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[C
     for start in starts:
         study.enqueue_trial({**trial_parameters(start, space), **beliefs})
     study.optimize(value, n_trials=trials)
-    return made(optuna.trial.FixedTrial(study.best_params))
+    return filter_of(optuna.trial.FixedTrial(study.best_params))
 
 
 def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int = HELD_OUT_SEEDS) -> str:
@@ -136,19 +136,19 @@ def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int =
     held_out = scenario.data(scenario.held_out_seeds(SEED, seeds))
     default = scaled_default("ekf", scenario, SEED).choice
     known = scenario.replace(parameter_factors={})
-    made: dict[str, Callable[[], Filter]] = {
+    filters: dict[str, Callable[[], Filter]] = {
         name: lambda plan=plan: _studied(plan, trials).filter(scenario) for name, plan in plans().items()
     }
     starts = _studied(plans()["`ekf`, Q and R"], trials), default
-    made |= {
+    filters |= {
         f"`ekf` + {name}": lambda names=names: tuned_augmented(scenario, names, starts, 2 * trials)
         for name, names in UNKNOWNS.items()
     }
-    made[RIGHT] = lambda: scaled_default("ekf", known, SEED).choice.filter(known)
+    filters[RIGHT] = lambda: scaled_default("ekf", known, SEED).choice.filter(known)
     base = evaluate(default.filter(scenario), held_out, scenario.scale)
     lines = [_line("`ekf`, scaled default", base, base)]
-    for name in rows if rows is not None else made:
-        lines.append(_line(name, evaluate(made[name](), held_out, scenario.scale), base))
+    for name in rows if rows is not None else filters:
+        lines.append(_line(name, evaluate(filters[name](), held_out, scenario.scale), base))
     return markdown_table(COLUMNS, lines)
 
 
@@ -156,11 +156,11 @@ def _studied(plan: Plan, trials: int) -> Choice:
     return run_study(open_study("page", plan, None), plan, trials).choice
 
 
-def _line(name: str, found: Evaluation, base: Evaluation) -> list[str]:
-    ratio, (speed, flow) = score_ratio(found, base), found.rmse
+def _line(name: str, evaluation: Evaluation, base: Evaluation) -> list[str]:
+    ratio, (speed, flow) = score_ratio(evaluation, base), evaluation.rmse
     cells = f"{ratio.value:.3f} ± {(ratio.high - ratio.low) / 2:.3f}", f"{speed.value:.3f}", f"{flow.value:.4f}"
-    nees = found.nees.value
-    return [name, *cells, f"{nees:.3g}" if nees < 1000 else "> 1000", f"{found.nis.value:.2f}"]
+    nees = evaluation.nees.value
+    return [name, *cells, f"{nees:.3g}" if nees < 1000 else "> 1000", f"{evaluation.nis.value:.2f}"]
 
 
 TABLES: dict[str, Callable[[], str]] = {"bought": bought}

@@ -42,12 +42,12 @@ def pair(name: str, seed: int, trials: int = TRIALS) -> Pair:
     """Run a study of the score and one of the log score, of the same seed."""
     scenario = find_scenario(name)
     held_out = scenario.data(scenario.held_out_seeds(seed, HELD_OUT_SEEDS))
-    found = []
+    evaluations = []
     for objective in ("score", LOG_SCORE):
         plan = Plan(FILTER, (scenario,), seed, (objective,))
         choice = run_study(open_study("page", plan, None), plan, trials).choice
-        found.append(evaluate(choice.filter(scenario), held_out, scenario.scale))
-    return Pair(*found)
+        evaluations.append(evaluate(choice.filter(scenario), held_out, scenario.scale))
+    return Pair(*evaluations)
 
 
 def objectives() -> str:
@@ -56,11 +56,11 @@ def objectives() -> str:
     rows = []
     for name in SCENARIOS:
         pairs = [pair(name, seed) for seed in SEEDS]
-        ratios = [one.ratio.value for one in pairs]
+        ratios = [study_pair.ratio.value for study_pair in pairs]
         cells = [f"{np.median(ratios):.3f}", f"{min(ratios):.3f} to {max(ratios):.3f}"]
         for ratio in (nees_ratio, nis_ratio):
-            for place in range(2):
-                cells.append(f"{np.median([ratio(one[place]) for one in pairs]):.3g}")
+            for index in range(2):
+                cells.append(f"{np.median([ratio(study_pair[index]) for study_pair in pairs]):.3g}")
         rows.append([f"`{name}`", *cells])
     heads = ["scenario", "score, log score over score", "single studies", "NEES, by score", "by log score"]
     return markdown_table([*heads, "NIS, by score", "by log score"], rows)

@@ -46,26 +46,28 @@ class Pair(NamedTuple):
 
 def pair(kind: str, name: str, trials: int, seed: int) -> Pair:
     """Run a study of a filter on a scenario with pruning and without, and score again what was pruned."""
-    scenario, found = find_scenario(name), {}
+    scenario, results = find_scenario(name), {}
     for prune in (True, False):
         plan = Plan(kind, (scenario,), seed, prune=prune)
-        found[prune] = run_study(open_study("page", plan, None), plan, trials)
+        results[prune] = run_study(open_study("page", plan, None), plan, trials)
     held_out, training = scenario.data(scenario.held_out_seeds(seed, HELD_OUT_SEEDS)), plan.training_data()
     pruning, without = (
-        evaluate(found[prune].choice.filter(scenario), held_out, scenario.scale) for prune in (True, False)
+        evaluate(results[prune].choice.filter(scenario), held_out, scenario.scale) for prune in (True, False)
     )
     early = [
-        trial for trial in found[True].trials if trial.state == TrialState.PRUNED and trial.intermediate_values
+        trial for trial in results[True].trials if trial.state == TrialState.PRUNED and trial.intermediate_values
     ]
-    best = found[True].best_value
-    whole = [measure(choice_of(kind, trial.params, scenario), plan, training)[0].score.value for trial in early]
-    (chosen,) = measure(found[True].choice, plan, training)
+    best = results[True].best_value
+    full_scores = [
+        measure(choice_of(kind, trial.params, scenario), plan, training)[0].score.value for trial in early
+    ]
+    (chosen,) = measure(results[True].choice, plan, training)
     worst = np.sort(chosen.mean_squares, axis=0)[-TOP_RUNS:].sum(axis=0) / chosen.mean_squares.sum(axis=0)
     return Pair(
         score_ratio(pruning, without).value,
         len(early),
-        sum(value < best for value in whole),
-        min([1.0, *(value / best for value in whole)]),
+        sum(value < best for value in full_scores),
+        min([1.0, *(value / best for value in full_scores)]),
         sum(TRAINING_SEEDS - len(trial.intermediate_values) for trial in early) / (TRAINING_SEEDS * trials),
         float(worst.max()),
     )
@@ -84,19 +86,19 @@ def pruning() -> str:
     rows = []
     for name, kind in CASES:
         pairs = [pair(kind, name, TRIALS, seed) for seed in SEEDS]
-        ratios = [one.ratio for one in pairs]
+        ratios = [study_pair.ratio for study_pair in pairs]
         ratio = over_studies(ratios)
-        count = sum(one.pruned for one in pairs)
+        count = sum(study_pair.pruned for study_pair in pairs)
         rows.append(
             [
                 f"`{name}`",
                 f"`{kind}`",
-                f"{100 * np.mean([one.concentration for one in pairs]):.0f} %",
+                f"{100 * np.mean([study_pair.concentration for study_pair in pairs]):.0f} %",
                 f"{ratio.value:.4f} [{ratio.low:.4f}, {ratio.high:.4f}]",
                 f"{min(ratios):.3f} to {max(ratios):.3f}",
-                f"{sum(one.missed for one in pairs)} of {count}",
-                f"{100 * (1 - min(one.gain for one in pairs)):.2f} %",
-                f"{100 * np.mean([one.skipped for one in pairs]):.0f} %",
+                f"{sum(study_pair.missed for study_pair in pairs)} of {count}",
+                f"{100 * (1 - min(study_pair.gain for study_pair in pairs)):.2f} %",
+                f"{100 * np.mean([study_pair.skipped for study_pair in pairs]):.0f} %",
             ]
         )
     header = ["scenario", "filter", f"squares in {TOP_RUNS} of {TRAINING_SEEDS} runs", "with over without"]

@@ -52,7 +52,7 @@ def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS)
     """What studies with several seeds find from the bad start."""
     quiet_optuna()
     scenario = find_scenario(name)
-    true, found = parameters_of(oracle_choice(kind, scenario)), []
+    true, recovered = parameters_of(oracle_choice(kind, scenario)), []
     for seed in seeds:
         plan = Plan(kind, (scenario,), seed)
         study = open_study("page", plan, None, bad_start(kind, scenario))
@@ -60,22 +60,22 @@ def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS)
         comparison = evaluate_held_out(choice, scenario, seed)
         known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
         ratios = known.tuned / [true[number] for number in known.names]
-        found.append(Found(ratios, score_ratio(comparison.tuned, comparison.true), known))
-    return found
+        recovered.append(Found(ratios, score_ratio(comparison.tuned, comparison.true), known))
+    return recovered
 
 
 def numbers_found() -> str:
     """Numbers over the true ones, and what the innovations determine."""
     rows = []
     for kind, name, trials in STUDIES:
-        found = found_again(kind, name, trials)
+        recovered = found_again(kind, name, trials)
         title = f"`{name}`, `{kind}`, {trials} trials"
-        for i, number in enumerate(found[0].known.names):
-            ratios = [one.over_true[i] for one in found]
-            factors = [one.known.factors[i] for one in found if one.known.identified[i]]
+        for i, number in enumerate(recovered[0].known.names):
+            ratios = [study.over_true[i] for study in recovered]
+            factors = [study.known.factors[i] for study in recovered if study.known.identified[i]]
             span, start = f"{min(ratios):.2g} to {max(ratios):.2g}", f"{BAD_START[i]:g}"
             within = f"within a factor of {max(factors):.2f}" if factors else "no"
-            part = f" in {len(factors)} of {len(found)}" if 0 < len(factors) < len(found) else ""
+            part = f" in {len(factors)} of {len(recovered)}" if 0 < len(factors) < len(recovered) else ""
             rows.append(["" if i else title, number, start, span, within + part])
     return markdown_table(["study", "", "start over true", "found over true", "determined"], rows)
 
@@ -84,7 +84,7 @@ def scores_reached() -> str:
     """Excess of the score over the true filter's."""
     rows = []
     for kind, name, trials in STUDIES:
-        scores = sorted(one.score for one in found_again(kind, name, trials))
+        scores = sorted(study.score for study in found_again(kind, name, trials))
         median = np.median([score.value for score in scores])
         excess = [f"{100 * (value - 1):.2f} %" for value in (median, scores[-1].value)]
         worst = " to ".join(f"{100 * (end - 1):.2f}" for end in scores[-1][1:])
@@ -94,7 +94,7 @@ def scores_reached() -> str:
     return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {made.__name__: made for made in (numbers_found, scores_reached)}
+TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (numbers_found, scores_reached)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

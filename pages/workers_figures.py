@@ -39,11 +39,11 @@ def throughput(path: Path) -> Path:
     here, elsewhere = figure.subplots(1, 2)
     for storage, colour in COLOURS.items():
         for work, dashes, mark in zip(FILTERS, ("-", "--"), ("o", "s"), strict=True):
-            found = rates()[storage, work.name]
+            rate_of = rates()[storage, work.name]
             label = f"{work.name}, {storage}"
-            here.plot(found.keys(), found.values(), dashes, marker=mark, color=colour, label=label)
-        found = rates()[storage, WAITING.name]
-        elsewhere.plot(found.keys(), found.values(), "o", color=colour, label=f"measured, {storage}")
+            here.plot(rate_of.keys(), rate_of.values(), dashes, marker=mark, color=colour, label=label)
+        rate_of = rates()[storage, WAITING.name]
+        elsewhere.plot(rate_of.keys(), rate_of.values(), "o", color=colour, label=f"measured, {storage}")
         workers = np.geomspace(1, MOST, 200)
         expected = predicted(storage, WAITING.wait, workers)
         elsewhere.plot(workers, expected, color=colour, label=f"min(K / (t + s), r), {storage}")
@@ -66,8 +66,8 @@ def trials_a_second() -> str:
     rows = []
     for work in WORKS:
         for storage in STORAGES:
-            found = rates()[storage, work.name]
-            cells = [f"{found[count]:.3g}" if count in found else "" for count in COUNTS]
+            rate_of = rates()[storage, work.name]
+            cells = [f"{rate_of[count]:.3g}" if count in rate_of else "" for count in COUNTS]
             rows.append([work.name if storage == STORAGES[0] else "", storage, *cells])
     return markdown_table(["a trial", "storage", *map(str, COUNTS)], rows)
 

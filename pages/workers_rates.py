@@ -81,7 +81,7 @@ def rate(work: Work, storage: str, workers: int) -> float:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     ready = context.Barrier(workers + 1)
-    arguments = [(work, storage, workers, place, ready) for place in range(workers)]
+    arguments = [(work, storage, workers, worker, ready) for worker in range(workers)]
     crew = [context.Process(target=_work, args=each, daemon=True) for each in arguments]
     for process in crew:
         process.start()
@@ -102,12 +102,12 @@ def _plan(work: Work) -> Plan:
     return Plan(work.filter, (find_scenario("mismatch"),), prune=False)
 
 
-def _work(work: Work, storage: str, workers: int, place: int, ready) -> None:
+def _work(work: Work, storage: str, workers: int, worker: int, ready) -> None:
     """Run trials, as one of some workers, from when all are ready until the window is over."""
     quiet_optuna()
     take_share(workers)
     plan = _plan(work)
-    study = open_study("rates", plan, open_storage(storage), worker=place)
+    study = open_study("rates", plan, open_storage(storage), worker=worker)
     data = plan.training_data() if work.wait is None else []
     if data:
         measure(untuned_choice(plan.filter, plan.scenarios[0]), plan, data)  # loads what is compiled

@@ -22,7 +22,7 @@ from filters.algebra.points import root
 from filters.pages.page import NumbersMemory
 from filters.pages.traced import not_known, traced_model
 from thruster_env.core.angles import NAMES, short_way
-from thruster_env.core.derivatives import RELATIVE_STEP, step_of, stretch
+from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
 from thruster_env.core.sources import Source, entrywise, is_array, scaled_sum, tuple_of, vector_reader, written_out
 from thruster_env.model.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
 
@@ -38,7 +38,7 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
 
     y_c dc is a function of (x, scales, ..., c, dc, size), where size is the relative size of dc, and dY one of (x,
     scales, ..., c, dx, dc, size), without the last two if constants do not move. Far from zero steps grow with
-    `stretch`, because values are rounded more coarsely. If constants do not move, a large Jacobian F is
+    `step_growth`, because values are rounded more coarsely. If constants do not move, a large Jacobian F is
     differentiated by each component of x, because there are fewer components than directions: then two more
     functions follow, the derivative (columns, rows, columns) and its contraction with dx.
 
@@ -66,7 +66,7 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
 def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], inputs: str) -> Callable:
     sides = [inputs.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
     lines = (
-        f"h = {RELATIVE_STEP} * stretch(x, scales) / max(size, 1e-300)",
+        f"h = {RELATIVE_STEP} * step_growth(x, scales) / max(size, 1e-300)",
         f"above, below = {', '.join(f'value(x, {side})' for side in sides)}",
         "difference(above, below, h)",
     )
@@ -74,7 +74,7 @@ def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, 
         "value": value,
         "shift": _constants_shift(shape),
         "difference": difference_of_values(rows, angles),
-        "stretch": stretch(shape.n),
+        "step_growth": step_growth(shape.n),
     }
     return written_out("by_constants", f"x, scales, {inputs}, dc, size", *lines, **names)
 
@@ -113,11 +113,11 @@ def slope_of(
 def _step(count: int) -> Callable:
     """Return `step(x, scales, d, size)`: the step h along d, and along a relative change of constants."""
     source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
-    source.line("far = stretch(x, scales)")
+    source.line("far = step_growth(x, scales)")
     source.line("h = max(1e-300, size / far)")
     for i in source.range(count):
         source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}], far))")
-    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of, stretch=stretch(count))
+    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of, step_growth=step_growth(count))
 
 
 @cache
@@ -135,7 +135,7 @@ def _curvature(matrix: Callable, rows: int, columns: int, inputs: str) -> Callab
     """`curved(x, scales, ..., c)`: a Jacobian's derivative by each component of x, (columns, rows, columns)."""
     lines = (
         f"out, unit = np.empty(({columns}, {rows}, {columns})), np.zeros({columns})",
-        "far = stretch(x, scales)",
+        "far = step_growth(x, scales)",
         f"for k in range({columns}):",
         "    unit[k] = 1.0",
         "    h = step_of(x[k], scales[k], far)",

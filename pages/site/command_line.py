@@ -37,7 +37,7 @@ def commands() -> str:
     context = typer.Context(command, info_name="thruster")
     text = get_docs_for_click(obj=command, ctx=context, name="thruster", indent=1)
     helps = dict(_helps(command, context))
-    text = SUMMARY.sub(lambda found: f"{found[1]}{helps[found[2]]}", text)
+    text = SUMMARY.sub(lambda match: f"{match[1]}{helps[match[2]]}", text)
     text = EXAMPLES.sub(_copied, text)
     text = ITEM.sub(_in_capitals, text)
     return GIVEN_BY_NAME.sub(r"[default: \1", text)
@@ -51,17 +51,17 @@ def _helps(group, context: typer.Context):
         yield from _helps(command, context)
 
 
-def _copied(found: re.Match[str]) -> str:
+def _copied(match: re.Match[str]) -> str:
     """Lines of examples as one block, as a shell has them."""
-    lines = [line.removeprefix("Example: ") for line in found[0].split("\n\n")]
+    lines = [line.removeprefix("Example: ") for line in match[0].split("\n\n")]
     return "\n".join(["```console", *(f"$ {line}" for line in lines), "```"])
 
 
-def _in_capitals(found: re.Match[str]) -> str:
+def _in_capitals(match: re.Match[str]) -> str:
     """An option with what it takes, or an argument, without typer's name of the type."""
-    name, kind, folder = found.groups(default="")
-    taken = f" {'FOLDER' if folder else KINDS[kind]}" if name.startswith("-") else ""
-    return f"* `{name}{taken}`{folder}"
+    name, kind, folder = match.groups(default="")
+    metavar = f" {'FOLDER' if folder else KINDS[kind]}" if name.startswith("-") else ""
+    return f"* `{name}{metavar}`{folder}"
 
 
 def _append(app, name: str, source: list[str]) -> None:

@@ -19,20 +19,20 @@ NOT_OURS = ("Alias for field number", "dict() -> ")  # what namedtuple says of e
 
 def readable(lines: list[str]) -> list[str]:
     """Return a docstring's lines with its equations and its code as directives, and its prose escaped."""
-    out, prose, place = [], [], 0
+    out, prose, index = [], [], 0
     if any(line.startswith("## ") for line in lines):
         lines = _without_markdown(lines)
-    while place < len(lines):
-        after_blank = place > 1 and not lines[place - 1].strip() and not lines[place - 2].startswith(" ")
-        if lines[place].startswith("    ") and after_blank:
-            end = place
+    while index < len(lines):
+        after_blank = index > 1 and not lines[index - 1].strip() and not lines[index - 2].startswith(" ")
+        if lines[index].startswith("    ") and after_blank:
+            end = index
             while end < len(lines) and (lines[end].startswith("    ") or not lines[end].strip()):
                 end += 1
-            out += escaped(prose) + directive(lines[place:end])
-            prose, place = [], end
+            out += escaped(prose) + directive(lines[index:end])
+            prose, index = [], end
         else:
-            prose.append(lines[place])
-            place += 1
+            prose.append(lines[index])
+            index += 1
     return out + escaped(prose)
 
 
@@ -58,8 +58,8 @@ def _without_markdown(lines: list[str]) -> list[str]:
                 out += [".. list-table::", "    :header-rows: 1", ""]
             cells = [cell.strip() for cell in line.strip("| ").split(" | ")]
             out += [
-                f"    {'- ' if place else '* - '}{cell}".replace("    - ", "      - ")
-                for place, cell in enumerate(cells)
+                f"    {'- ' if column else '* - '}{cell}".replace("    - ", "      - ")
+                for column, cell in enumerate(cells)
             ]
         else:
             out.append(line)

@@ -50,24 +50,24 @@ def latex_of(block: str) -> str:
 
 
 def _row(line: str, labelled: bool) -> str:
-    found = LABEL.match(line)
-    if labelled and found:
-        return rf"\text{{{_plain(found['label'])}:}} & {inline(found['rest'])}"
+    label = LABEL.match(line)
+    if labelled and label:
+        return rf"\text{{{_plain(label['label'])}:}} & {inline(label['rest'])}"
     indent = r"\quad " if line.startswith(" ") and not labelled else ""
     return f"& {indent}{inline(line.strip())}"
 
 
 def inline(text: str) -> str:
     """Return the LaTeX of one line, without its alignment."""
-    tokens = [(found.lastgroup, found.group()) for found in TOKEN.finditer(_without_roots(text))]
-    latex = "".join(_set(tokens, place) for place in range(len(tokens)))
+    tokens = [(match.lastgroup, match.group()) for match in TOKEN.finditer(_without_roots(text))]
+    latex = "".join(_set(tokens, index) for index in range(len(tokens)))
     # Words side by side are one text.
     latex = re.sub(r"(?<=\\text{)([^{}]*)}(?:\\ \\text{([^{}]*)})+", _joined, latex)
     return latex.replace("\x01", r"\sqrt{").replace("\x02", "}")
 
 
-def _joined(found: re.Match) -> str:
-    return found.group().replace(r"}\ \text{", " ")
+def _joined(match: re.Match) -> str:
+    return match.group().replace(r"}\ \text{", " ")
 
 
 def _without_roots(text: str) -> str:
@@ -81,14 +81,14 @@ def _without_roots(text: str) -> str:
     return text
 
 
-def _set(tokens: list[tuple[str, str]], place: int) -> str:
-    kind, text = tokens[place]
+def _set(tokens: list[tuple[str, str]], index: int) -> str:
+    kind, text = tokens[index]
     if kind == "word":
-        return _name(tokens, place)
+        return _name(tokens, index)
     if kind == "space":
-        beside_sign = any(token in SPACED for _, token in tokens[place - 1 : place + 2])
+        beside_sign = any(token in SPACED for _, token in tokens[index - 1 : index + 2])
         return (
-            r"\quad " if len(text) > 1 else r"\ " if _near_words(tokens, place, any) and not beside_sign else " "
+            r"\quad " if len(text) > 1 else r"\ " if _near_words(tokens, index, any) and not beside_sign else " "
         )
     if kind == "code":
         return rf"\text{{{_plain(text[1:-1])}}}"
@@ -97,22 +97,22 @@ def _set(tokens: list[tuple[str, str]], place: int) -> str:
     if kind == "index":
         return f"_{{{_index(_unwrapped(text[1:]))}}}"
     if kind == "sign" and text == "'":
-        after_word = place and _is_word(tokens, place - 1)
+        after_word = index and _is_word(tokens, index - 1)
         return r"\text{’}" if after_word else "'"
     return SIGNS.get(text, text) if kind == "sign" else text
 
 
-def _name(tokens: list[tuple[str, str]], place: int) -> str:
+def _name(tokens: list[tuple[str, str]], index: int) -> str:
     """A variable, a function's name, or a word of English."""
-    text = tokens[place][1]
-    following = tokens[place + 1][1] if place + 1 < len(tokens) else ""
+    text = tokens[index][1]
+    following = tokens[index + 1][1] if index + 1 < len(tokens) else ""
     letters = text.rstrip("0123456789")
-    if text == "sum" and not _says(tokens, place + 1, "of", "over"):
+    if text == "sum" and not _says(tokens, index + 1, "of", "over"):
         return r"\sum "
     if text == "N" and following == "(":
         return r"\mathcal{N}"
     if letters in GREEK or letters in DIFFERENTIALS or len(letters) == 1:
-        if text in ("a", "I") and _near_words(tokens, place, all, step=2):
+        if text in ("a", "I") and _near_words(tokens, index, all, step=2):
             return rf"\text{{{text}}}"
         base = f"\\{letters} " if letters in GREEK else letters
         return base + (f"_{{{text[len(letters) :]}}}" if text != letters else "")
@@ -121,19 +121,19 @@ def _name(tokens: list[tuple[str, str]], place: int) -> str:
     return rf"\mathrm{{{text}}}" if following.startswith(("_", "(")) else rf"\text{{{text.replace(chr(39), '’')}}}"
 
 
-def _says(tokens: list[tuple[str, str]], place: int, *words: str) -> bool:
-    return any(text in words for _, text in tokens[place : place + 2])
+def _says(tokens: list[tuple[str, str]], index: int, *words: str) -> bool:
+    return any(text in words for _, text in tokens[index : index + 2])
 
 
-def _is_word(tokens: list[tuple[str, str]], place: int) -> bool:
-    if not 0 <= place < len(tokens) or tokens[place][0] not in ("word", "code"):
+def _is_word(tokens: list[tuple[str, str]], index: int) -> bool:
+    if not 0 <= index < len(tokens) or tokens[index][0] not in ("word", "code"):
         return False
-    text = tokens[place][1]
+    text = tokens[index][1]
     return len(text) > 1 and text.rstrip("0123456789") not in GREEK | DIFFERENTIALS and not text[1:].isdigit()
 
 
-def _near_words(tokens: list[tuple[str, str]], place: int, how, step: int = 1) -> bool:
-    return how(_is_word(tokens, there) for there in (place - step, place + step))
+def _near_words(tokens: list[tuple[str, str]], index: int, how, step: int = 1) -> bool:
+    return how(_is_word(tokens, neighbour) for neighbour in (index - step, index + step))
 
 
 def _index(text: str) -> str:

@@ -16,7 +16,7 @@ from filters.differentiated.runs import ModelSlopes
 from filters.sensitivity import sensitivity
 from tests.models import simulated
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.derivatives import jacobian, step_of, stretch
+from thruster_env.core.derivatives import jacobian, step_growth, step_of
 from thruster_env.model.affine import linearize
 
 DT = 0.1
@@ -194,7 +194,7 @@ def test_scales_of_states_without_variance():
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 def test_a_step_balances_rounding_and_curvature(size, scale):
     for x in (size, -size):
-        h = step_of(x, scale, stretch(1)((x,), (scale,)))
+        h = step_of(x, scale, step_growth(1)((x,), (scale,)))
         assert abs(x) < h or (x + h) - x == h == x - (x - h)  # exact
         wanted = (2.0**-52 * min(1e9, 1.0 + abs(x) / scale)) ** (1 / 3) * scale
         assert 0.4 < h / max(wanted, 2.0**-42 * abs(x)) < 1.1

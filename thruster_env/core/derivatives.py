@@ -37,7 +37,7 @@ def step_of(x, scale, far):
     Args:
         x: component of a vector.
         scale: s, of the component.
-        far: r^(1/3), with the largest magnitude r of all components in their scales; see `stretch`.
+        far: r^(1/3), with the largest magnitude r of all components in their scales; see `step_growth`.
     """
     size = scale if scale > 0.0 else abs(x) if x != 0.0 else 1.0
     h = max(RELATIVE_STEP * size * far, LEAST_STEP * abs(x))
@@ -45,12 +45,12 @@ def step_of(x, scale, far):
 
 
 @cache
-def stretch(count: int) -> Callable:
-    """Return `stretch(x, scales)`: the cube root of the largest 1 + |x_i|/s_i of `count` components.
+def step_growth(count: int) -> Callable:
+    """Return `step_growth(x, scales)`: the cube root of the largest 1 + |x_i|/s_i of `count` components.
 
     What is computed of a component far from zero is rounded as it is, whichever component moves.
     """
-    source = Source("stretch", "x, scales", x=(count,), scales=(count,))
+    source = Source("step_growth", "x, scales", x=(count,), scales=(count,))
     source.line("most = 1.0")
     for i in source.range(count):
         source.line(f"most = max(most, 1.0 + abs(x[{i}]) / max(scales[{i}], 1e-300))")
@@ -166,13 +166,13 @@ def _differences_in_loops(
     stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / width")
     body = f"h = step_of({size}, {scale}, far)", *sides, *stores
     start = (
-        "far = stretch(x, scales)",
+        "far = step_growth(x, scales)",
         f"out = np.empty(({rows}, {columns}))",
         *copies,
         f"for j in range({columns}):",
     )
     lines = *start, *(f"    {line}" for line in body)
-    names: dict[str, Any] = {"function": inlined(function), "stretch": stretch(columns), **TOOLS}
+    names: dict[str, Any] = {"function": inlined(function), "step_growth": step_growth(columns), **TOOLS}
     return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
@@ -203,7 +203,7 @@ def jacobian(
         return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
     if is_array(rows, columns) or is_array(columns):
         return _differences_in_loops(function, rows, columns, arguments, angles)
-    lines = ["far = stretch(x, scales)"]
+    lines = ["far = step_growth(x, scales)"]
     for j in range(columns):
         lines.append(f"h{j} = step_of(x[{j}], scales[{j}], far)")
         for name, sign in (("above", "+"), ("below", "-")):
@@ -214,5 +214,5 @@ def jacobian(
     def slope(i, j):
         return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / width{j}"
 
-    names: dict[str, Any] = {"function": inlined(function), "stretch": stretch(columns), **TOOLS}
+    names: dict[str, Any] = {"function": inlined(function), "step_growth": step_growth(columns), **TOOLS}
     return written_out("jacobian", signature, *lines, matrix_of(rows, columns, slope), **names)

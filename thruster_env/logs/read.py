@@ -293,13 +293,13 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
 
 
 def _offsets(
-    offset_of: Mapping[str, float], wanted: list[Wanted], found: Mapping, grid: Grid, file: str
+    offset_of: Mapping[str, float], wanted: list[Wanted], column_of: Mapping, grid: Grid, file: str
 ) -> dict[str, float]:
     offsets, length = {}, grid.dt * (grid.rows - 1)
     for name, seconds in offset_of.items():
         channel = find_wanted(name, wanted)
-        if channel is None or channel.key not in found:
-            known = ", ".join(channel.quantity.symbol for channel in wanted if channel.key in found)
+        if channel is None or channel.key not in column_of:
+            known = ", ".join(channel.quantity.symbol for channel in wanted if channel.key in column_of)
             raise ValueError(f"clock offsets must be of channels {known}, but got {short_repr(name)} ({file})")
         offsets[channel.key] = finite(f"the clock offset of {name}", seconds)
         if abs(offsets[channel.key]) >= length:  # nothing of the channel would be left

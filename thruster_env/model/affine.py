@@ -10,7 +10,7 @@ import numpy as np
 
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import covariance, vector
-from thruster_env.core.derivatives import step_of, stretch
+from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Source, as_value
 from thruster_env.model.shape import (
@@ -137,7 +137,7 @@ def affine_model(
 def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray) -> np.ndarray:
     """df/du of one application of f, (n, p), by central differences; inputs of zero have the scale 1."""
     of_inputs, c = np.where(u == 0, 1.0, np.abs(u)), model.given_constants
-    far = stretch(model.n + model.inputs)((*x, *u), (*scales, *of_inputs))
+    far = step_growth(model.n + model.inputs)((*x, *u), (*scales, *of_inputs))
     columns = np.zeros((model.inputs, model.n))
     for j, unit in enumerate(np.eye(model.inputs)):
         h = step_of(float(u[j]), float(of_inputs[j]), far)

@@ -38,7 +38,7 @@ class Opened:
     def read(self, number: int) -> np.ndarray:
         """An array of the file: numbers and dates as they are stored, others as texts."""
         answer = self._ask(str(number))
-        shape = tuple(int(one) for one in answer["shape"])
+        shape = tuple(int(side) for side in answer["shape"])
         if "texts" in answer:
             return np.array(answer["texts"], object).reshape(shape)
         kind = np.dtype(str(answer["dtype"]))
