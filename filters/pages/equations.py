@@ -149,7 +149,7 @@ def _curvature(matrix: Callable, rows: int, columns: int, inputs: str) -> Callab
         "out",
     )
     names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
-    names |= {"np": np, "step_of": step_of, "stretch": stretch(columns)}
+    names |= {"np": np, "step_of": step_of, "step_growth": step_growth(columns)}
     return written_out("curved", f"x, scales, {inputs}", *lines, _loops=True, **names)
 
 

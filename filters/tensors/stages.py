@@ -238,7 +238,7 @@ RULES: dict[Operation, Callable] = {
     points.outer: lambda a, b: a[..., :, None] * b[..., None, :],
     points.square: lambda a: a @ a.mT,
     points.first: lambda a: a[..., 0],
-    points.others: lambda a: a[..., 1:],
+    points.without_first: lambda a: a[..., 1:],
     scalars.choose: torch.where,
     scalars.exceeds: lambda a, value: a > value,
     scalars.is_number: lambda a: a == a,
