@@ -1,13 +1,13 @@
-"""Unbiased mixing: parts of a mixture that lack a state are completed by the parts that have it.
+"""Unbiased mixing: parts of a mixture that lack a state get its moments from the parts that have it.
 
-Each mode of a filter of several models has a row for all states; those that it lacks take no part in its filter.
+Each mode of a filter of several models has a row for all states; its filter ignores states that the mode lacks.
 With the weights w_i of the modes, before each mixture,
 
     m_s, P_s = mean and covariance of the states s in the mixture of the modes that have them, w_i/(sum of their w)
     a mode that lacks s:  mean (x, m_s),  covariance (P, 0; 0, P_s)
 
-so that the mixture's mean of s is m_s, whatever the weight of modes that say nothing of it. States that the same
-modes lack keep their covariances. Where modes that have s have no weight at all, s stays as it is.
+so that the mixture's mean of s is m_s, whatever the weight of modes that lack it. Covariances between states that
+the same modes lack are kept. If the modes that have s all have weight zero, s stays unchanged.
 
 Source: Yuan, Bar-Shalom, Willett, Mozeson, Pollak, Hardiman (2012), "A multiple IMM estimation approach with
 unbiased mixing for thrusting projectiles"; Granstrom, Willett, Bar-Shalom (2015), "Systematic approach to IMM
@@ -27,9 +27,9 @@ class Absent(NamedTuple):
     """States that some modes lack.
 
     Attributes:
-        states: their places.
-        modes: which modes lack them.
-        given: whether they have the prior's moments of these modes' models there, in place of the others'.
+        states: their indices.
+        modes: the modes that lack them.
+        given: whether they get the prior's moments of these modes' models, instead of moments of the other modes.
     """
 
     states: tuple[int, ...]
@@ -37,17 +37,19 @@ class Absent(NamedTuple):
     given: bool
 
 
-def absent_states(places: Sequence[tuple[int, ...]], n: int, given: Sequence[int]) -> tuple[Absent, ...]:
-    """What modes lack that have the states at some places, of n; states of the same modes together.
+def absent_states(
+    states_of_modes: Sequence[tuple[int, ...]], n: int, moments_known: Sequence[int]
+) -> tuple[Absent, ...]:
+    """The states, of n, that modes with `states_of_modes` lack, in groups that the same modes lack.
 
-    Those in `given` stand alone.
+    A state of `moments_known` is a group of its own.
     """
-    found: dict[tuple, list[int]] = {}
+    lacking: dict[tuple, list[int]] = {}
     for state in range(n):
-        modes = tuple(k for k, own in enumerate(places) if state not in own)
+        modes = tuple(k for k, states in enumerate(states_of_modes) if state not in states)
         if modes:
-            found.setdefault((modes, state if state in given else -1), []).append(state)
-    return tuple(Absent(tuple(states), modes, state >= 0) for (modes, state), states in found.items())
+            lacking.setdefault((modes, state if state in moments_known else -1), []).append(state)
+    return tuple(Absent(tuple(states), modes, state >= 0) for (modes, state), states in lacking.items())
 
 
 def completer(
@@ -58,31 +60,31 @@ def completer(
     priors: Sequence[tuple[int, int]],
     scratch: int,
 ) -> Callable:
-    """Return `complete(row, weights, numbers)`: give all parts all states; see this module.
+    """Return `complete(row, weights, numbers)`: fill in the states that parts lack; see this module.
 
-    Mean and covariance come first in each part. `priors` are the places of the prior mean and covariance of each
-    mode's model in the filter's numbers; from `scratch` on there is room for weights, a mean and a covariance.
+    Mean and covariance come first in each part. `priors` are the offsets of the prior mean and covariance of each
+    mode's model in the filter's numbers; from `scratch` on the row has room for weights, a mean and a covariance.
     """
     complete = nothing
-    for one in absent:
-        if one.given:
-            complete = _given(complete, one, parts, n, priors)
+    for group in absent:
+        if group.given:
+            complete = _given(complete, group, parts, n, priors)
         else:
-            complete = _of_others(complete, one, parts, n, blend, scratch)
+            complete = _of_others(complete, group, parts, n, blend, scratch)
     return complete
 
 
 def _given(before: Callable, absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]) -> Callable:
-    """A state with the moments of the modes' own models."""
+    """Fill in a state with the prior's moments of the modes' models."""
     (state,), (first, stride, _) = absent.states, parts
-    places = tuple(
+    offsets = tuple(
         (first + k * stride, priors[k][0] + state, priors[k][1] + state * (n + 1)) for k in absent.modes
     )
 
     @inlined
     def complete(row, weights, numbers):
         before(row, weights, numbers)
-        for part, mean, variance in places:
+        for part, mean, variance in offsets:
             row[part + state] = numbers[mean]
             for t in range(n):
                 row[part + n + state * n + t] = row[part + n + t * n + state] = 0.0
@@ -92,7 +94,7 @@ def _given(before: Callable, absent: Absent, parts: Parts, n: int, priors: Seque
 
 
 def _of_others(before: Callable, absent: Absent, parts: Parts, n: int, blend: Callable, scratch: int) -> Callable:
-    """States with the moments that they have in the mixture of the other modes."""
+    """Fill in states with their moments in the mixture of the other modes."""
     (states, modes, _), (first, stride, count), moments = absent, parts, scratch + parts.number
 
     @inlined

@@ -21,24 +21,24 @@ from thruster_env.core.checks import at_least, between, one_of, positive, vector
 
 
 def propagate(model, x, P, u):
-    """One of the model's substeps."""
+    """Propagate mean and covariance by one substep."""
     F = model.F(x, u)
     return wrap(model.f(x, u), model.state_angles), sym(F @ P @ F.T)
 
 
 def add_process_noise(model, x, P):
-    """The end of a step."""
+    """Add Q at the end of a step."""
     return x, sym(P + model.Q)
 
 
 def update(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    seen = present(z)
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z; NaN marks missing channels."""
+    measured = present(z)
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,8 +50,8 @@ class ExtendedKalmanFilter(PageFilter):
                  x += K v,  P = (I - K H) P (I - K H)' + K R K'  (Joseph)
 
     Attributes:
-        form: form of the recursion: "covariance" as above, "square-root" (`gaussian.square_root`) or "ud"
-            (`gaussian.ud`), which keep twice the digits of P. The estimates are equal to rounding.
+        form: form of the recursion: "covariance" as above, "square-root" or "ud" (`gaussian.forms`), which keep
+            twice the digits of P. The estimates are equal to rounding.
 
     Raises:
         ValueError: if the form is unknown.
@@ -69,25 +69,25 @@ class ExtendedKalmanFilter(PageFilter):
         one_of("form", self.form, self.known_forms)
 
 
-# The iterated extended Kalman filter: the measurement is linearised again where the update ends.
+# The iterated extended Kalman filter: each iteration linearises the measurement at the last estimate.
 
 
 MOST_ITERATIONS = 20
 
 
 def update_iterated(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    seen, R, at, told = present(z), uncorrelated(present(z), model.R), x, []
+    """Update with the measurement z, linearised again in each iteration; NaN marks missing channels."""
+    measured, R, at, innovations = present(z), uncorrelated(present(z), model.R), x, []
     for i in range(model.own.iterations):
-        H, y = only(seen, model.H(at)), model.h(at)
+        H, y = only(measured, model.H(at)), model.h(at)
         on_tangent = y + H @ (x - at) if i else y
-        v = only(seen, wrap(z - on_tangent, model.measurement_angles))
+        v = only(measured, wrap(z - on_tangent, model.measurement_angles))
         S = sym(H @ P @ H.T + R)
         K = divide(P @ H.T, S)
         at = x + K @ v
-        told.append((v, S))
-    v, S = told[0]
-    return wrap(at, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+        innovations.append((v, S))
+    v, S = innovations[0]
+    return wrap(at, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,9 +99,9 @@ class IteratedExtendedKalmanFilter(PageFilter):
                  x_{i+1} = x + K (z - h(x_i) - H (x - x_i)),
                  at last x = x_i,  P = (I - K H) P (I - K H)' + K R K'  (Joseph) with the last H and K
 
-    The first iteration is the extended filter's update. Innovation, its covariance and the likelihood are those of
-    the first, so that they assess the prediction. The number of iterations is fixed, without a line search: full
-    steps may overshoot where h is strongly nonlinear within the spread of the belief.
+    The first iteration is the extended filter's update. Innovation, its covariance and the likelihood come from
+    the first iteration, so that they assess the prediction. The number of iterations is fixed and there is no line
+    search: full steps may overshoot if h is strongly nonlinear within the spread of the belief.
 
     Attributes:
         iterations: how often the measurement is linearised, 1 to 20; 1 is the extended filter.
@@ -128,7 +128,7 @@ class IteratedExtendedKalmanFilter(PageFilter):
 
 
 def add_process_noise_fading(model, x, P):
-    """The end of a step."""
+    """Scale P by a^2 and add Q, at the end of a step."""
     return x, sym(P * model.own.fading * model.own.fading + model.Q)
 
 
@@ -138,8 +138,8 @@ class FadingMemoryFilter(PageFilter):
 
         predict: x = f(x, u),  P = a^2 F P F' + Q;  update: the extended filter's
 
-    A measurement k steps old counts a^-2k times as much as with a = 1. So the filter follows a model that drifts,
-    even without any Q. P is that of errors which are weighted in this way.
+    A measurement k steps old has a^-2k times the weight that it has with a = 1. So the filter follows a model that
+    drifts, even with Q = 0. P is the covariance of errors weighted in this way.
 
     Attributes:
         fading: a, from 1, the extended filter, to 10.
@@ -160,17 +160,17 @@ class FadingMemoryFilter(PageFilter):
         object.__setattr__(self, "fading", between("fading", self.fading, 1.0, 10.0))
 
 
-# The Schmidt-Kalman filter: states whose uncertainty counts, but which measurements do not correct.
+# The Schmidt-Kalman filter: measurements do not correct considered states, but their uncertainty enters P.
 
 
 def update_schmidt(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    seen = present(z)
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z; NaN marks missing channels."""
+    measured = present(z)
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     K = model.own.corrected @ divide(P @ H.T, S)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -181,14 +181,14 @@ class SchmidtKalmanFilter(PageFilter):
         update:  K = J P H' S^-1, where J is the identity without the considered states;
                  x += K v,  P = (I - K H) P (I - K H)' + K R K'
 
-    A bias that the measurements hardly tell, or tell wrongly, keeps its prior, and P says what that costs. Without
-    considered states this is the extended filter.
+    A considered bias, which measurements barely determine or determine wrongly, keeps its prior, and P includes
+    its uncertainty. Without considered states this is the extended filter.
 
     Attributes:
         considered: indices of these states; -1 is the last one.
 
     Raises:
-        ValueError: if an index is none of a state.
+        ValueError: if an index is not that of a state.
 
     Source: Schmidt (1966), "Application of state-space methods to navigation problems"; Simon (2006), Optimal
     State Estimation, section 10.1.
@@ -200,8 +200,8 @@ class SchmidtKalmanFilter(PageFilter):
 
     def __post_init__(self):
         """Check the indices; raise ValueError that states the rule and the value."""
-        places = places_of("considered", self.considered, self.model.n)
-        object.__setattr__(self, "considered", places)
+        considered = places_of("considered", self.considered, self.model.n)
+        object.__setattr__(self, "considered", considered)
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
@@ -209,11 +209,11 @@ class SchmidtKalmanFilter(PageFilter):
         return {"corrected": np.diag([float(i not in self.considered) for i in range(self.model.n)])}
 
 
-# The H-infinity filter: the least of the largest errors that any noise of some size can cause.
+# The H-infinity filter: it bounds the errors that the worst noise of a given size can cause.
 
 
 def add_process_noise_h_infinity(model, x, P):
-    """The end of a step."""
+    """Add Q and guard against the worst noise, at the end of a step."""
     W, P = model.own.weights, sym(P + model.Q)
     D = eye(x) - sym(W @ P @ W.T) * model.own.theta
     return x, sym(P + sym(divide(P @ W.T, D) @ (W @ P)) * model.own.theta)
@@ -226,15 +226,15 @@ class HInfinityFilter(PageFilter):
         predict: x = f(x, u),  P = F P F' + Q,  then P = (P^-1 - theta W'W)^-1
         update:  the extended filter's: P = (P^-1 + H' R^-1 H)^-1,  x += P H' R^-1 (z - h(x))
 
-    W = diag(1/scale). Of noise w and v and of first errors e_0 of any kind the sum of |W e|^2 is less than 1/theta
-    times the sum of e_0' P_0^-1 e_0, w' Q^-1 w and v' R^-1 v. With theta = 0 it is the extended filter; as theta
-    grows, P and the gain do. P is no covariance of random errors but larger, and its NEES below n. Where theta is
-    too large for P, as after many steps without a measurement, what is to be inverted is not positive: the filter
-    restarts, and that is counted. The prior is taken as it is.
+    W = diag(1/scale). For any noise w and v and any initial error e_0 the sum of |W e|^2 is less than 1/theta
+    times the sum of e_0' P_0^-1 e_0, w' Q^-1 w and v' R^-1 v. With theta = 0 it is the extended filter; P and the
+    gain grow with theta. P is larger than the covariance of random errors, so its NEES is below n. If theta is too
+    large for P, for instance after many steps without a measurement, P^-1 - theta W'W is not positive: the filter
+    restarts, and counts the restart. The prior is not changed.
 
     Attributes:
         theta: the bound, above 0.
-        scale: of the errors that matter, (n,), in units of the states; the prior's deviations if None.
+        scale: (n,), of the errors, in units of the states; the prior's standard deviations if None.
 
     Raises:
         ValueError: if a number is not positive.
@@ -253,7 +253,7 @@ class HInfinityFilter(PageFilter):
         object.__setattr__(self, "theta", positive("theta", self.theta))
         if self.scale is not None:
             scale = vector("scale", self.scale, self.model.n)
-            object.__setattr__(self, "scale", np.array([positive("scale", one) for one in scale]))
+            object.__setattr__(self, "scale", np.array([positive("scale", value) for value in scale]))
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
@@ -264,5 +264,5 @@ class HInfinityFilter(PageFilter):
 
     @property
     def follows_from(self) -> Mapping[str, tuple[str, ...]]:
-        """W, from the prior's deviations unless there is a scale."""
+        """W follows from the prior's standard deviations unless there is a scale."""
         return {"weights": ("prior_cov",)} if self.scale is None else {}

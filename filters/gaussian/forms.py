@@ -1,9 +1,11 @@
 """The square-root and the UD form of the extended Kalman filter, which keep twice the digits of P.
 
+The UD form is
+
     predict: U D U' = [F U, Q^(1/2)] diag(D, I) [F U, Q^(1/2)]',  by Gram and Schmidt's method with these weights
     update:  one channel of R^(-1/2) z after the other, each a scalar whose noise has variance one
 
-It has the digits of the square-root form. Both factors lie in one matrix, D on its diagonal.
+Both factors lie in one matrix, D on its diagonal.
 
 Source: Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter V; Thornton (1976),
 "Triangular covariance factorizations for Kalman filtering".
@@ -27,36 +29,36 @@ def initial_root(model):
 
 
 def represent_root(model, x, P):
-    """The mean and the root that is kept."""
+    """The mean and the root L of P."""
     return x, model.extras["L"]
 
 
 def propagate_root(model, x, L, u):
-    """One of the model's substeps."""
+    """Propagate mean and root by one substep."""
     return wrap(model.f(x, u), model.state_angles), model.F(x, u) @ L
 
 
 def add_process_noise_root(model, x, L):
-    """The end of a step."""
+    """Add Q at the end of a step."""
     L = triangle(hstack(L, model.Q_root))
     return x, square(L), {"L": L}
 
 
 def update_root(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    n, m, seen, L = len(x), len(z), present(z), model.extras["L"]
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z; NaN marks missing channels."""
+    n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     both = triangle(vstack(hstack(root(R), H @ L), hstack(zeros(L, n, m), L)))
-    return root_result(model, x, both, v, seen)
+    return root_result(model, x, both, v, measured)
 
 
-def root_result(model, x, both, v, seen):
-    """What an update returns, of the triangle [[S^(1/2), 0], [K S^(1/2), L]]."""
+def root_result(model, x, both, v, measured):
+    """The results of an update, from the triangle [[S^(1/2), 0], [K S^(1/2), L]]."""
     n, m = len(x), len(v)
     of_s, of_gain, L = part(both, 0, 0, m, m), part(both, m, 0, n, m), part(both, m, m, n, n)
     x = wrap(x + of_gain @ forward_quotient(of_s, v), model.state_angles)
-    return x, square(L), v, square(of_s), density(v, factor_of(of_s), seen), {"L": L}
+    return x, square(L), v, square(of_s), density(v, factor_of(of_s), measured), {"L": L}
 
 
 SQUARE_ROOT = Page(propagate_root, add_process_noise_root, update_root, represent_root, initial_root)
@@ -71,31 +73,31 @@ def initial_ud(model):
 
 
 def represent_ud(model, x, P):
-    """The mean and U; D stays where it is."""
+    """The mean and U; D is read from the extras."""
     return x, upper.unit_upper(model.extras["UD"])
 
 
 def propagate_ud(model, x, U, u):
-    """One of the model's substeps."""
+    """Propagate the mean and U by one substep."""
     return wrap(model.f(x, u), model.state_angles), model.F(x, u) @ U
 
 
 def add_process_noise_ud(model, x, U):
-    """The end of a step."""
+    """Add Q at the end of a step."""
     UD = upper.weighted_factors(hstack(U, model.Q_root), model.extras["UD"])
     return x, square(upper.upper_root(UD)), {"UD": UD}
 
 
 def update_ud(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    seen, UD = present(z), model.extras["UD"]
-    H, R_root = only(seen, model.H(x)), root(uncorrelated(seen, model.R))
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z; NaN marks missing channels."""
+    measured, UD = present(z), model.extras["UD"]
+    H, R_root = only(measured, model.H(x)), root(uncorrelated(measured, model.R))
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     white = forward_quotient(R_root, H)
     of_s = triangle(hstack(R_root, H @ upper.upper_root(UD)))
     x = wrap(x + upper.measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
     UD = upper.measured_factors(UD, white)
-    return x, square(upper.upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), seen), {"UD": UD}
+    return x, square(upper.upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), measured), {"UD": UD}
 
 
 UD = Page(propagate_ud, add_process_noise_ud, update_ud, represent_ud, initial_ud)

@@ -1,15 +1,17 @@
 """The Kalman filter: affine models, schedules of operating points, the information form, and the steady gain.
 
-    update: Y = P^-1 + H' R^-1 H,  P = Y^-1,  x += P H' R^-1 v
+The update of the information form is
 
-Every channel adds its own information H' R^-1 H, so many channels and few states are cheap; no gain and no
-inverse of S are needed, which is here for the likelihood only. P must be positive definite throughout. Inverses
+    Y = P^-1 + H' R^-1 H,  P = Y^-1,  x += P H' R^-1 v
+
+Every channel adds its own information H' R^-1 H, so many channels and few states are cheap. The update needs no
+gain and no inverse of S; S is only computed for the likelihood. P must be positive definite throughout. Inverses
 are products W' W of inverse Cholesky factors W, symmetric and positive by construction.
 
 Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
 
-The constants c of the model in use are linear in the input between the points of the schedule, and constant
-beyond them; they are those of the last input until the next, and at first those of u = 0.
+With a schedule the constants c of the affine model are linear in the last input between operating points, and
+constant beyond them; before the first input they are those of u = 0.
 """
 
 from __future__ import annotations
@@ -32,18 +34,16 @@ from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, covariance, one_of
 from thruster_env.model.affine import AffineModel, linearize
 
-# The information form of the Kalman filter: the update works on the inverse of the covariance.
-
 
 def update_information(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    seen = present(z)
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z, by the inverse of the covariance; NaN marks missing channels."""
+    measured = present(z)
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     W = divide(H.T, R)  # H' R^-1
     P = inverse_of(sym(inverse_of(P) + W @ H))
-    return wrap(x + P @ (W @ v), model.state_angles), P, v, S, log_density(v, S, seen)
+    return wrap(x + P @ (W @ v), model.state_angles), P, v, S, log_density(v, S, measured)
 
 
 INFORMATION = Page(propagate, add_process_noise, update_information)
@@ -58,25 +58,22 @@ def constants_at(model, u):
 
 
 def initial_scheduled(model):
-    """The model at u = 0."""
+    """The constants at u = 0, as an extra."""
     return {"c": constants_at(model, zeros(model.own.models, 1))}
 
 
 def propagate_scheduled(model, x, P, u):
-    """One of the model's substeps."""
+    """Propagate by one substep of the affine model at u."""
     c = constants_at(model, u)
     return *extended.propagate(model.at(c), x, P, u), {"c": c}
 
 
 def update_scheduled(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
+    """Update with the measurement z by the affine model of the last substep."""
     return extended.update(model.at(model.extras["c"]), x, P, z)
 
 
 SCHEDULED = Page(propagate_scheduled, extended.add_process_noise, update_scheduled, initial=initial_scheduled)
-
-
-# The Kalman filter, for affine models and for affine approximations of others.
 
 
 MOST_POINTS = 200  # of a schedule; programs are written out for them
@@ -86,7 +83,7 @@ MOST_POINTS = 200  # of a schedule; programs are written out for them
 class AffineFilter(PageFilter):
     """Base of filters that run on an affine model, or on the affine approximation of a model about one point."""
 
-    any_step: ClassVar[bool] = False  # A and B of a model are those of one sample time
+    any_step: ClassVar[bool] = False  # A and B hold for one sample time
 
     def __post_init__(self):
         """Raise ValueError if a nonlinear model comes without an operating point."""
@@ -119,8 +116,8 @@ class KalmanFilter(AffineFilter):
     `operating_points` and constant beyond them; at the first measurement they are those of u = 0.
 
     Attributes:
-        form: form of the recursion: "covariance" as above, "information" (`gaussian.information`), "square-root"
-            (`gaussian.square_root`) or "ud" (`gaussian.ud`). The estimates are equal to rounding.
+        form: form of the recursion: "covariance" as above, "information" (`update_information`), "square-root" or
+            "ud" (`gaussian.forms`). The estimates are equal to rounding.
         schedule: number of operating points, spread over the range of the input; 1 for the model's own point.
 
     Raises:
@@ -150,7 +147,7 @@ class KalmanFilter(AffineFilter):
                 f"but got schedule={self.schedule}, form={self.form!r}, "
                 f"operating_points={self.model.operating_points!r}"
             )
-        _ = self.own_parameters  # an operating point that does not exist shows here
+        _ = self.own_parameters  # raises ValueError for an operating point that does not exist
 
     @cached_property
     def parameters(self) -> dict[str, np.ndarray]:
@@ -180,16 +177,16 @@ class KalmanFilter(AffineFilter):
 # The steady-state Kalman filter: one gain for all steps, from Riccati's equation.
 
 
-STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
+STABLE = 1.0 - 1e-7  # upper limit of |eigenvalues| of A (I - K C): errors decay within ten million steps
 
 
 def update_steady(model, x, P, z):
-    """The measurement z; channels that are NaN are missing, and so are their columns of the gain."""
-    seen = present(z)
-    H, R, K = only(seen, model.H(x)), uncorrelated(seen, model.R), only(seen, model.own.gain.T).T
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    """Update with the measurement z; missing channels (NaN) have no innovation and no column of the gain."""
+    measured = present(z)
+    H, R, K = only(measured, model.H(x)), uncorrelated(measured, model.R), only(measured, model.own.gain.T).T
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -201,12 +198,12 @@ class SteadyStateKalmanFilter(AffineFilter):
         update:  mean += K (z - C mean - d), in missing channels without their columns of K
 
     Like "kf" it runs on an affine model, or on the affine approximation of a model about its operating point. It
-    equals "kf" where that starts from the solution P as its prior covariance.
+    equals "kf" if that starts from the solution P as its prior covariance.
 
-    The covariance of a belief is that of the errors which this gain leaves: from the prior on A P A' + Q and
-    (I - K C) P (I - K C)' + K R K' (Joseph's form), which holds for any gain. It tends to the solution of
-    Riccati's equation, stays consistent where measurements are missing, and has no influence on the estimate. The
-    gain belongs to one Q and R: a Q or R of a single step is refused.
+    The covariance of a belief is that of the errors with this gain, from the prior on: A P A' + Q in predictions,
+    and (I - K C) P (I - K C)' + K R K' (Joseph's form, valid for any gain) in updates. It converges to the
+    solution of Riccati's equation, stays consistent when measurements are missing, and does not influence the
+    estimate. The gain holds for one Q and R: the filter refuses Q or R of a single step.
 
     Attributes:
         gain: K, (n, m).
@@ -239,7 +236,7 @@ class SteadyStateKalmanFilter(AffineFilter):
     @cached_property
     def gain(self) -> np.ndarray:
         """The gain K (n, m)."""
-        from filters.bounds import steady_state  # which runs filters of this package
+        from filters.bounds import steady_state  # here, because that module imports filters
 
         model = self.kernel_model
         a, _, _, c, _ = model.matrices()
@@ -252,5 +249,5 @@ class SteadyStateKalmanFilter(AffineFilter):
 
     @property
     def follows_from(self) -> Mapping[str, tuple[str, ...]]:
-        """The gain, from all but the prior."""
+        """The gain follows from all numbers of the model except the prior."""
         return {"gain": ("process_noise_cov", "measurement_noise_cov", "constants")}

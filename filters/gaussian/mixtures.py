@@ -41,14 +41,12 @@ from thruster_env.core.sources import Source, lower_pairs
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import Functions, Shape
 
-# A mixture of Gaussians with weights w, each of whose parts is a row of numbers: sums over the parts.
-
 
 class Parts(NamedTuple):
-    """Where the parts of a mixture lie in a row."""
+    """The layout of the parts of a mixture of Gaussians in a row."""
 
     first: int
-    stride: int  # from one to the next
+    stride: int  # from one part to the next
     number: int
 
 
@@ -56,11 +54,11 @@ class Parts(NamedTuple):
 def blender(
     parts: Parts, size: int, x: int, p: int, angles: tuple[bool, ...], *, between: bool = True, wraps: bool = True
 ) -> Callable:
-    """Return `blend(row, weights, target)`: mean and covariance of a mixture, which lie from a place on.
+    """Return `blend(row, weights, target)`: write a mixture's mean and covariance from the offset `target` on.
 
-    In each part x and P begin at such places; the weights begin at one in the row. Angles of parts are put on one
-    branch (`thruster_env.core.angles`); if it `wraps`, those of the mean lie in (-pi, pi]. Without what lies
-    `between` the parts the covariance is the sum of w_k P_k.
+    `x` and `p` are the offsets of mean and covariance within each part, `weights` that of the weights in the row.
+    Angles of parts are put on one branch (`thruster_env.core.angles`); if it `wraps`, those of the mean lie in
+    (-pi, pi]. Without the covariance `between` the parts the result is the sum of w_k P_k.
     """
     source = Source("blend", "row, weights, target", result=(size, size))
     mean, cov, d = source.local("m", size), source.local("c", size, size), source.local("d", size)
@@ -69,7 +67,7 @@ def blender(
         source.line(
             " = ".join([*(mean[i] for i in range(size)), *(cov[i, j] for i, j in lower_pairs(size)), "0.0"])
         )
-    has_weight = "if row[weights + k] != 0.0:"  # 0 times the square of a part far away may be NaN
+    has_weight = "if row[weights + k] != 0.0:"  # 0 times the square of a distant part may be NaN
     for _ in source.inside(each[0]):
         source.line(each[1])
         for _ in source.inside(has_weight):
@@ -107,12 +105,12 @@ def blender(
 
 @cache
 def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `align(row, weights)`: put angles of a vector x of all parts on one branch, that of their mean."""
-    (_, stride, count), places = parts, places_of(angles, parts.first + x_place)
+    """Return `align(row, weights)`: put angles of the vector x of all parts on one branch, around their mean."""
+    (_, stride, count), angle_offsets = parts, places_of(angles, parts.first + x_place)
 
     @inlined
     def align(row, weights):
-        for i in places:
+        for i in angle_offsets:
             s = c = 0.0
             for k in range(count):
                 s += row[weights + k] * np.sin(row[i + k * stride])
@@ -126,9 +124,9 @@ def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callab
 
 @cache
 def weigher(parts: Parts, level: int) -> Callable:
-    """Return `weigh(row, weights)`: weights after a measurement, by log-likelihoods; the log of their sum.
+    """Return `weigh(row, weights)`: multiply weights by the parts' likelihoods; it returns the log of their sum.
 
-    It is for weights that each update begins with, none of which is zero.
+    The weights before must not be zero.
     """
     (_, stride, count), first = parts, parts.first + level
 
@@ -150,10 +148,10 @@ def weigher(parts: Parts, level: int) -> Callable:
 
 @cache
 def log_weigher(parts: Parts, level: int) -> Callable:
-    """Return `weigh(row, logs, weights)`: the same of weights that are carried on, by their logarithms.
+    """Return `weigh(row, logs, weights)`: `weigher` for weights that are carried from step to step as logarithms.
 
-    These lie from `logs` on; a weight of zero, -inf there, stays zero. A weight that is too small for a float64
-    keeps its logarithm, so that its part comes back as soon as measurements speak for it.
+    The logarithms begin at `logs`; a weight of zero, with the logarithm -inf, stays zero. A weight that is too
+    small for a float64 keeps its logarithm, so that its part regains weight as soon as measurements support it.
     """
     (_, stride, count), first = parts, parts.first + level
 
@@ -190,67 +188,67 @@ def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.nd
 
 
 @inlined
-def nothing(memory, given, numbers):
-    """What comes before the first of several functions."""
-
-
-# Filters that run a page on each part of a mixture, as kernels of the engine.
+def nothing(memory, inputs, numbers):
+    """Do nothing: the function before the first of several."""
 
 
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
 
 
 class MixturePage(NamedTuple):
-    """What a filter does with the parts of a mixture; `own` is what a part has by itself.
+    """The functions of a filter with a mixture; `own` are a part's parameters.
 
-    With `predict` each part is predicted, and its weight is what the belief before says. Without it the belief is
-    predicted, by the extended filter, and an update splits it and multiplies the weights by likelihoods.
+    With `predict` each part is predicted, with a weight that follows from the belief before. Without it the
+    extended filter predicts the belief, and an update splits it and multiplies the weights by likelihoods.
     """
 
-    represent: (
-        Callable  # represent(model, x, P), of the belief: the weights of all parts, and what else they share
-    )
+    represent: Callable  # represent(model, x, P): the weights of all parts, and further matrices that they share
     update: Callable  # update(model, own, *shared, x, P, z), of a part
     predict: Callable | None = None  # predict(model, own, *shared, x, P, u), of a part
-    afresh: bool = True  # whether parts then begin with the belief, and not with what they were
-    between: bool = True  # whether what lies between the parts counts in the covariance
-    fixed: tuple[tuple[str, Any], ...] = ()  # what stands in `model.own` besides parameters
+    afresh: bool = True  # whether each prediction of a part begins with the belief, not with the part's last state
+    between: bool = True  # whether the covariance includes differences between the parts' means
+    fixed: tuple[tuple[str, Any], ...] = ()  # constants in `model.own` besides parameters
 
 
 @lru_cache(maxsize=64)
 def mixture_kernels(
-    page: MixturePage, functions: Functions, shape: Shape, parameters: Shapes, count: int, own: tuple[int, ...]
+    page: MixturePage,
+    functions: Functions,
+    shape: Shape,
+    parameters: Shapes,
+    count: int,
+    own_shape: tuple[int, ...],
 ) -> Kernels:
-    """Kernels for `count` parts, each with numbers of its own in the shape `own`, behind the parameters of all.
+    """Kernels for `count` parts, each with parameters in the shape `own_shape`, after the parameters of all parts.
 
     Extras: mean, covariance, innovation, its covariance and log-likelihood of each part; then the weights.
     """
-    n, m, places, prior = shape.n, shape.m, memory_places(shape.n, shape.m), prior_start(shape)
-    belief, length, wide = n + n * n, prod(own), max(shape.inputs, m)
+    n, m, layout, prior = shape.n, shape.m, memory_places(shape.n, shape.m), prior_start(shape)
+    belief, length, wide = n + n * n, prod(own_shape), max(shape.inputs, m)
     level = belief + m + m * m
-    parts = Parts(places.extras, level + 1, count)
+    parts = Parts(layout.extras, level + 1, count)
     first, stride, _ = parts
     weights = first + count * stride
-    given = weights + count  # u or z, what a part has of its own, what all share
+    inputs_offset = weights + count  # of u or z, a part's parameters, and the matrices that all parts share
     plain = ExtendedKalmanFilter.page._replace(own=parameters, fixed=page.fixed)
     memory = RowMemory(shape, plain)
-    memory.end = given + wide + length
+    memory.end = inputs_offset + wide + length
     begun = as_tuple(page.represent(PagedModel(memory), memory.x, memory.P))
-    shared = [memory.another(one) for one in begun[1:]]
-    told = (places.innovation, m), (places.innovation_cov, m, m)
-    v, S = (memory.read("rows", *one) for one in told)
+    shared = [memory.another(matrix) for matrix in begun[1:]]
+    outputs = (layout.innovation, m), (layout.innovation_cov, m, m)
+    v, S = (memory.read("rows", *output) for output in outputs)
     begin, density = works_of(
         stored(begun, (weights, *shared)),
-        stored((log_density(v, S, present(memory.z)),), (places.log_likelihood,)),
+        stored((log_density(v, S, present(memory.z)),), (layout.log_likelihood,)),
     )
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
         x, P = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
-        u, z, of_part = memory.u, memory.z, [memory.read("given", wide, *own)]
-        of_part += [memory.read("given", one.operation.at - given, *one.shape) for one in shared]
-        moved = page.predict(model, *of_part, x, P, u) if page.predict else ()
-        found, told = page.update(model, *of_part, x, P, z), (x, P, belief, belief + m, level)
-        return [stored(moved, (x, P)[: len(moved)]), stored(found, told[: len(found)])]
+        u, z, of_part = memory.u, memory.z, [memory.read("given", wide, *own_shape)]
+        of_part += [memory.read("given", matrix.operation.at - inputs_offset, *matrix.shape) for matrix in shared]
+        predicted = page.predict(model, *of_part, x, P, u) if page.predict else ()
+        updated, offsets = page.update(model, *of_part, x, P, z), (x, P, belief, belief + m, level)
+        return [stored(predicted, (x, P)[: len(predicted)]), stored(updated, offsets[: len(updated)])]
 
     predict_part, update_part = programs_of(plain, functions, shape, stages).works
     of_states = blender(parts, n, 0, n, shape.state_angles, between=page.between)
@@ -258,7 +256,7 @@ def mixture_kernels(
         *(parts, m, belief, belief + m, shape.measurement_angles), between=page.between, wraps=False
     )
     weigh, of_belief = weigher(parts, level), page_kernels(ExtendedKalmanFilter.page, functions, shape)
-    step_place, innovation_place, likelihood_place = places.step, places.innovation, places.log_likelihood
+    step_place, innovation_place, likelihood_place = layout.step, layout.innovation, layout.log_likelihood
     own_first, end, afresh = own_place(shape) + plain.own_size, memory.end, page.afresh
 
     @inlined
@@ -271,11 +269,11 @@ def mixture_kernels(
         @inlined
         def run(row, values, numbers):
             for i in range(values.shape[0]):
-                row[given + i] = values[i]
+                row[inputs_offset + i] = values[i]
             for k in range(count):
                 for i in range(length):
-                    row[given + wide + i] = numbers[own_first + k * length + i]
-                work(row[first + k * stride : first + (k + 1) * stride], row[given:end], numbers)
+                    row[inputs_offset + wide + i] = numbers[own_first + k * length + i]
+                work(row[first + k * stride : first + (k + 1) * stride], row[inputs_offset:end], numbers)
 
         return run
 
@@ -325,10 +323,9 @@ def mixture_kernels(
             of_states(row, weights, 0)
 
     works = (start_parts, predict, update) if page.predict else (start, of_belief.predict, split_and_update)
-    return Kernels(*(n, m, n, 0, *works, nothing_to_summarise), extras=given - first, scratch=end - given)
-
-
-# A filter that runs a page on each part of a mixture: a class with its parameters.
+    return Kernels(
+        *(n, m, n, 0, *works, nothing_to_summarise), extras=inputs_offset - first, scratch=end - inputs_offset
+    )
 
 
 __all__ = ["MixtureFilter", "MixturePage"]
@@ -339,44 +336,44 @@ class MixtureFilter(Filter):
     """Base of filters that have a page for the parts of a mixture.
 
     Attributes:
-        page: its functions.
+        page: the functions.
     """
 
     page: ClassVar[MixturePage]
 
     @cached_property
     def parameters(self) -> Mapping[str, Any]:
-        """Numbers and arrays that the page finds in `model.own`."""
+        """Numbers and arrays that the page reads from `model.own`."""
         raise NotImplementedError
 
     @cached_property
     def of_parts(self) -> np.ndarray:
-        """What each part has of its own, (parts,) or (parts, length)."""
+        """The parameters of each part, (parts,) or (parts, length)."""
         raise NotImplementedError
 
     @property
     def written_page(self) -> MixturePage:
-        """The page, with what the fields say of it."""
+        """The page, adapted to the filter's fields."""
         return self.page
 
     @cached_property
     def own_parameters(self) -> tuple[float, ...]:
-        """The parameters, then what each part has of its own."""
+        """The parameters of all parts, then those of each part."""
         arrays = *self.parameters.values(), self.of_parts
-        return tuple(float(number) for one in arrays for number in np.ravel(one))
+        return tuple(float(number) for array in arrays for number in np.ravel(array))
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        model, shapes = self.kernel_model, tuple((name, np.shape(one)) for name, one in self.parameters.items())
-        count, *own = np.shape(self.of_parts)
-        return mixture_kernels(self.written_page, model.functions, model.shape, shapes, count, tuple(own))
+        model, shapes = (
+            self.kernel_model,
+            tuple((name, np.shape(array)) for name, array in self.parameters.items()),
+        )
+        count, *own_shape = np.shape(self.of_parts)
+        return mixture_kernels(self.written_page, model.functions, model.shape, shapes, count, tuple(own_shape))
 
     def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (parts, n), covariances (parts, n, n) and weights (parts,) of the parts of a belief."""
         return parts_of(belief.extras, len(self.of_parts), self.model.n)
-
-
-# A Gaussian sum filter: each update splits the belief, so that it may have several modes, and merges it again.
 
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
@@ -401,20 +398,20 @@ class GaussianSumFilter(MixtureFilter):
     """Gaussian sum filter: an extended filter whose belief is a sum of Gaussians within each update.
 
         predict: the extended filter's
-        split:   along g = P e_i/sqrt(P_ii), the way in which the state goes with its component i, into parts
-                 N(mean + t_k g, P - (1 - s^2) g g') of weight a_k; nodes t_k, weights a_k and s < 1 are those of a
-                 sum of N(t_k, s^2) with mean 0 and variance 1, so that mean and covariance stay the belief's
+        split:   along g = P e_i/sqrt(P_ii), the regression of the state on its component i, into parts
+                 N(mean + t_k g, P - (1 - s^2) g g') of weight a_k; the sum of a_k N(t_k, s^2), s < 1, has mean 0
+                 and variance 1, so that mean and covariance of the belief are unchanged
         update:  each part by the extended filter, with h and H at its own mean;
                  its weight becomes a_k N(z; h(x_k), S_k)/L,  L = sum of a_k N(z; h(x_k), S_k)
         merge:   mean and P of the weighted parts: P within the parts and between them
 
-    A measurement may thus have several solutions in component i; one linearisation at the mean finds only one. The
-    log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine model
-    this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than a
-    Gaussian.
+    So a measurement may have several solutions in component i; a single linearisation at the mean finds only one.
+    The log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine
+    model the estimate differs from the Kalman filter's by some thousandths of a standard deviation, because the
+    sum has thinner tails than a Gaussian.
 
-    `Belief.extras` holds what the last update made of each part: mean, covariance, innovation, its covariance and
-    its log-likelihood; then the weights. `part_estimates` takes it apart.
+    `Belief.extras` holds the results of the last update for each part: mean, covariance, innovation, its
+    covariance and its log-likelihood; then the weights. `part_estimates` returns them.
 
     Attributes:
         parts: number of Gaussians, at least 7.
@@ -471,12 +468,12 @@ def initial_weights(model, x, P):
 
 
 def predict_fuzzy(model, c, x, P, u):
-    """The Kalman filter of a rule, whose affine model has the constants c."""
+    """Predict by the Kalman filter of a rule, whose affine model has the constants c."""
     return extended.add_process_noise(model, *extended.propagate(model.at(c), x, P, u))
 
 
 def update_fuzzy(model, c, x, P, z):
-    """The measurement z, by a rule."""
+    """Update with the measurement z by the Kalman filter of a rule."""
     return extended.update(model.at(c), x, P, z)[:-1]  # memberships, not likelihoods, are the weights
 
 
@@ -487,20 +484,20 @@ class FuzzyKalmanFilter(MixtureFilter):
         rule r:  if each of these states is low or high, as the bits of r say, then x' = A_r x + B_r u + a_r + w,
                  z = C_r x + d_r + v: the model linearised at that corner, Q and R the model's
         w_r:     product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i), each within
-                 0 and 1, of the last estimate x (`rules.memberships`)
+                 0 and 1, of the last estimate x (`sigma_points.memberships`)
         predict: mean_r = A_r mean + B_r u + a_r,  P_r = A_r P A_r' + Q, from the common mean and P
         update:  the Kalman filter's of each rule, from its mean_r and P_r, with a gain of its own (Joseph's form)
         blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r: the belief after each of the two
 
-    `blending` "weights" is this, the recursion of the sources. It ignores the differences between the rules'
-    means, so P is too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'):
-    the first-order generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models'
-    probabilities. "output" has autonomous filters: each rule continues from its own mean_r and P_r, which are
-    blended, by moments, for output only. Innovation and S are blended as mean and P are. With equal rules, as an
-    affine model has them, all three are the Kalman filter.
+    These are the equations of `blending` "weights", the recursion of the sources. It ignores the differences
+    between the rules' means, so P is too small. "moments" has P = sum of w_r (P_r + (mean_r - mean)(mean_r -
+    mean)'): the first-order generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models'
+    probabilities. With "output" each rule continues from its own mean_r and P_r, which are blended, by moments,
+    for output only. Innovation and S are blended like mean and P. If all rules are equal, as for an affine model,
+    each blending is the Kalman filter.
 
     A blend of linearisations at the corners approximates a model only if the range is narrow: on the thruster the
-    extended filter, which linearises at the estimate, is far better. `rule_estimates` takes a belief apart.
+    extended filter, which linearises at the estimate, is far better. `rule_estimates` returns the rules' moments.
 
     Attributes:
         low: the smallest states (n,); the model's `state_low` if None.
@@ -508,7 +505,7 @@ class FuzzyKalmanFilter(MixtureFilter):
         blending: "weights", "moments" or "output", see above.
         premises: indices of the states that the rules depend on, at most 8; if None, all of up to 8 states, or the
             first state of a larger affine model. Rules are linearised at the middle of the range of other states.
-        offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
+        offsets: whether rules have the offset a_r that makes them exact at their corners; the sources have none.
 
     Raises:
         ValueError: if the range of the states is unknown or empty, or a choice is not one of those above.

@@ -1,6 +1,6 @@
-"""Several models at once: the interacting multiple model filter, and static model probabilities.
+"""Filters of several models: the interacting multiple model filter, and static model probabilities.
 
-How the filters of the modes are mixed, run and merged is in `filters.gaussian.multiple_models`.
+Each mode has a filter with its own model; all lie in one row of numbers and are mixed, run, weighed and merged.
 """
 
 from __future__ import annotations
@@ -28,14 +28,11 @@ from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Shape, number_places, starts_of
 from thruster_env.model.state_space import StateSpaceModel
 
-# Several filters in one row of numbers, each with a model of its own: they are mixed, run, weighed and merged.
-
-
-LOST = 700.0  # what the log-likelihood of a mode whose filter begins anew is below the least of the others
+LOST = 700.0  # log-likelihood of a mode whose filter restarts: this much below the least of the other modes
 
 
 class Mode(NamedTuple):
-    """The filter of a mode, and how many numbers it and its model are."""
+    """The filter of a mode, and how many numbers it and its model have."""
 
     kernels: Kernels
     length: int
@@ -45,26 +42,29 @@ class Mode(NamedTuple):
 def mode_kernels(
     modes: tuple[Mode, ...], shape: Shape, absent: tuple[Absent, ...] = (), mixing: Callable | None = None
 ) -> Kernels:
-    """Kernels for filters of the same states, inputs and measurements as `shape`, some of which modes may lack.
+    """Kernels for filters with the states, inputs and measurements of `shape`; modes may lack states (`absent`).
 
-    The filter's own numbers are p (K,), Pi (K, K) by columns, and those of each mode. Extras: the memory of each
-    mode's filter, then the logarithms of the probabilities. `mixing(p, mu)` gives for a column of Pi the weights
-    of all modes with which one begins a step, and its probability; without it each filter runs by itself.
+    The filter's parameters are p (K,), Pi (K, K) by columns, and the numbers of each mode. Extras: the memory of
+    each mode's filter, then the logarithms of the probabilities. For a column of Pi `mixing(p, mu)` returns the
+    weights of all modes in the mixture with which one mode begins a step, and its probability; without `mixing`
+    the filters do not mix.
     """
     n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
-    at, own = memory_places(n, m), own_place(shape)
-    first, stride = at.extras, at.extras + max(one.kernels.extras + one.kernels.scratch for one in modes)
+    at, first_parameter = memory_places(n, m), own_place(shape)
+    first, stride = at.extras, at.extras + max(mode.kernels.extras + mode.kernels.scratch for mode in modes)
     parts, logs = Parts(first, stride, count), first + count * stride
-    probabilities = logs + count  # what follows is scratch
-    completing = probabilities + count * (3 + belief)  # behind what `_mixer` needs
+    probabilities = logs + count  # scratch from here on
+    completing = probabilities + count * (3 + belief)  # after the scratch of `_mixer`
     end = completing + (count + belief) * bool(absent)
     of_states = blender(parts, n, at.mean, at.cov, shape.state_angles)
     of_innovations = blender(parts, m, at.innovation, at.innovation_cov, shape.measurement_angles, wraps=False)
     innovation, level, step, lost = at.innovation, at.log_likelihood, at.step, at.divergences
-    of_modes = [own + count + count * count + start for start in starts_of(*(one.length for one in modes))]
+    of_modes = [
+        first_parameter + count + count * count + start for start in starts_of(*(mode.length for mode in modes))
+    ]
     start_all, predict_all, update_all = _of_all(modes, parts, of_modes)
     model = number_places(n, m)
-    priors = [(place + model.prior_mean, place + model.prior_cov) for place in of_modes[:-1]]
+    priors = [(offset + model.prior_mean, offset + model.prior_cov) for offset in of_modes[:-1]]
     complete = completer(absent, parts, n, of_states, priors, completing)
     weigh = log_weigher(parts, level)
 
@@ -73,7 +73,7 @@ def mode_kernels(
         complete(row, weights, numbers)
         of_states(row, weights, target)
 
-    mix = nothing if mixing is None else _mixer(mixing, parts, belief, logs, own + count, blend)
+    mix = nothing if mixing is None else _mixer(mixing, parts, belief, logs, first_parameter + count, blend)
 
     @inlined
     def recall(row):
@@ -86,7 +86,7 @@ def mode_kernels(
         for i in range(first, end):
             row[i] = 0.0
         for j in range(count):
-            row[logs + j] = logarithm(numbers[own + j])
+            row[logs + j] = logarithm(numbers[first_parameter + j])
         recall(row)
         start_all(memory, numbers, numbers)
         blend(row, probabilities, numbers, 0)
@@ -120,23 +120,23 @@ def mode_kernels(
                     least = min(least, row[part + level])
             for j in range(count):
                 part = first + j * stride
-                if row[part + lost] > 0.0:  # it has begun anew: it says nothing of this measurement
+                if row[part + lost] > 0.0:  # it has restarted: its likelihood is not that of this measurement
                     row[part + lost], row[part + level] = 0.0, least - LOST if least < math.inf else -math.inf
             row[level] = weigh(row, logs, probabilities)
         if begun > 0.0 and least < math.inf:
-            row[lost] += 1.0  # modes begin anew: of all of them the likelihood is 0, and the whole belief restarts
+            row[lost] += 1.0  # some modes restart; if all do, the likelihood is 0 and the whole belief restarts
         blend(row, probabilities, numbers, 0)
 
-    kept = probabilities - first
+    extras = probabilities - first
     return Kernels(
-        n, m, n, 0, start, predict, update, nothing_to_summarise, extras=kept, scratch=end - first - kept
+        n, m, n, 0, start, predict, update, nothing_to_summarise, extras=extras, scratch=end - first - extras
     )
 
 
 def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: int, blend: Callable) -> Callable:
-    """Return `mix(memory, u, numbers)`: the belief with which each filter begins is a mixture of all.
+    """Return `mix(memory, u, numbers)`: each filter begins a step with a mixture of all beliefs.
 
-    Of the probabilities mu a column has the ratios to the largest that leads to its mode, which is as good.
+    To avoid underflow `mixing` gets, for each column of Pi, mu divided by the largest one that leads to its mode.
     """
     first, stride, count = parts
     ratios, foreseen, shares, mixed = (logs + k * count for k in (1, 2, 3, 4))
@@ -156,7 +156,7 @@ def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: 
                     row[ratios + i] = math.exp(row[logs + i] - top) if numbers[column + i] > 0.0 else 0.0
                 share(row, row[foreseen + j :], numbers[column:])
                 row[foreseen + j] = top + logarithm(row[foreseen + j])
-            else:  # no mode leads to this one: its filter goes on
+            else:  # no mode leads to this one: its filter continues unmixed
                 row[foreseen + j] = -math.inf
                 for i in range(count):
                     row[shares + i] = 1.0 if i == j else 0.0
@@ -172,46 +172,43 @@ def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: 
 def _of_all(modes: tuple[Mode, ...], parts: Parts, numbers: Sequence[int]) -> tuple[Callable, ...]:
     """Functions (memory, given, numbers) that start, predict and update the filters of all modes."""
     at: dict[Kernels, list[tuple[int, int, int]]] = {}
-    for j, one in enumerate(modes):
-        at.setdefault(one.kernels, []).append((parts.first + j * parts.stride, numbers[j], numbers[j + 1]))
+    for j, mode in enumerate(modes):
+        at.setdefault(mode.kernels, []).append((parts.first + j * parts.stride, numbers[j], numbers[j + 1]))
     works: tuple[Callable, ...] = nothing, nothing, nothing
-    for kernels, places in at.items():
-        works = _then(works, kernels, tuple(places), parts.stride)
+    for kernels, offsets in at.items():
+        works = _then(works, kernels, tuple(offsets), parts.stride)
     return works
 
 
-def _then(before: tuple, kernels: Kernels, places: tuple, stride: int) -> tuple[Callable, ...]:
-    """The same with some modes more, which have the same kernels, by the places of their rows and numbers."""
+def _then(before: tuple, kernels: Kernels, offsets: tuple, stride: int) -> tuple[Callable, ...]:
+    """Functions that run those of `before`, then modes with equal kernels, by offsets of rows and numbers."""
     start_others, predict_others, update_others = before
     begin, move, correct, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
 
     @inlined
-    def start(memory, given, numbers):
-        start_others(memory, given, numbers)
+    def start(memory, inputs, numbers):
+        start_others(memory, inputs, numbers)
         row, table, draws = memory
-        for place, first, last in places:
-            begin((row[place : place + stride], table, draws), numbers[first:last], 0)
+        for offset, first, last in offsets:
+            begin((row[offset : offset + stride], table, draws), numbers[first:last], 0)
 
     @inlined
     def predict(memory, u, numbers):
         predict_others(memory, u, numbers)
         row, table, draws = memory
-        for place, first, last in places:
-            move((row[place : place + stride], table, draws), u, numbers[first:last], 0)
+        for offset, first, last in offsets:
+            move((row[offset : offset + stride], table, draws), u, numbers[first:last], 0)
 
     @inlined
     def update(memory, z, numbers):
         update_others(memory, z, numbers)
         row, table, draws = memory
-        for place, first, last in places:
-            mode, of_mode = (row[place : place + stride], table, draws), numbers[first:last]
+        for offset, first, last in offsets:
+            mode, of_mode = (row[offset : offset + stride], table, draws), numbers[first:last]
             correct(mode, z, of_mode, 0)
             restart(mode, of_mode, 0)
 
     return start, predict, update
-
-
-# What filters that run a filter for each of several models share: the models, and their probabilities.
 
 
 MOST_MODES = 32
@@ -226,16 +223,16 @@ class MultipleModelFilter(Filter):
         modes: K models with the inputs and measurements of `model` and its states, or some of them by their
             symbols, or changes of it, as `StateSpaceModel.replace` takes them; `usual_modes` if None.
         mode_filter: name of a Gaussian filter for all modes, such as "kf", "ekf" or "ukf", or one for each.
-        probabilities: p (K,), of the modes at first; `usual_probabilities` if None.
-        absent: mean and variance of a state, by symbol, in modes that lack it; without these it has there the
-            moments of the modes that have it (`filters.gaussian.absent`).
+        probabilities: initial probabilities p (K,) of the modes; `usual_probabilities` if None.
+        absent: mean and variance of a state, by symbol, in modes that lack it; by default modes that lack a state
+            get the moments of the modes that have it (`filters.gaussian.absent`).
     """
 
     one_model: ClassVar[bool] = False
     any_step: ClassVar[bool] = False
     gaussian_likelihood: ClassVar[bool] = False
     varying_noise: ClassVar[bool] = False  # each mode has Q and R of its own
-    mixing: ClassVar[Callable | None] = None  # see `modes.mode_kernels`
+    mixing: ClassVar[Callable | None] = None  # see `mode_kernels`
     modes: Any = None
     mode_filter: Any = "ekf"
     probabilities: Any = None
@@ -247,12 +244,12 @@ class MultipleModelFilter(Filter):
 
     @property
     def usual_modes(self) -> Sequence[Mapping[str, Any]]:
-        """Changes of the model where no modes are given."""
+        """Changes of the model, the default of `modes`."""
         raise NotImplementedError
 
     @property
     def usual_probabilities(self) -> Sequence[float] | np.ndarray:
-        """Probabilities of the modes at first, where none are given: all equal."""
+        """Initial probabilities of the modes, the default of `probabilities`: all equal."""
         return np.full(len(self.mode_filters), 1.0 / len(self.mode_filters))
 
     @property
@@ -262,14 +259,14 @@ class MultipleModelFilter(Filter):
 
     @property
     def p(self) -> np.ndarray:
-        """Probabilities (K,) of the modes at first."""
-        given = self.usual_probabilities if self.probabilities is None else self.probabilities
-        return probabilities_of("probabilities", given, (len(self.mode_filters),))
+        """Initial probabilities (K,) of the modes."""
+        probabilities = self.usual_probabilities if self.probabilities is None else self.probabilities
+        return probabilities_of("probabilities", probabilities, (len(self.mode_filters),))
 
     @cached_property
     def mode_filters(self) -> tuple[Filter, ...]:
         """The filter of each mode."""
-        from filters.registry import make_filter  # where this one is listed, too
+        from filters.registry import make_filter  # here, because that module imports this one
 
         models = self._models
         names = [self.mode_filter] * len(models) if isinstance(self.mode_filter, str) else self.mode_filter
@@ -277,15 +274,15 @@ class MultipleModelFilter(Filter):
             rule = f"mode_filter must be one name, or one for each of {len(models)} modes"
             raise ValueError(f"{rule}, but got {short_repr(names)}")
         free = (model.replace(bounds=()) if model.bounds else model for model in models)
-        found = tuple(make_filter(name, model) for name, model in zip(names, free, strict=True))
-        for one in found:
-            if not one.gaussian_likelihood or one.size or not one.has_covariance:
+        filters = tuple(make_filter(name, model) for name, model in zip(names, free, strict=True))
+        for filter_ in filters:
+            if not filter_.gaussian_likelihood or filter_.size or not filter_.has_covariance:
                 rule = "mode_filter must be a filter of one mean and covariance"
-                raise ValueError(f"{rule}, such as 'ekf', but got {one.name!r}")
-            if self.mixing is not None and not one.mixable:
+                raise ValueError(f"{rule}, such as 'ekf', but got {filter_.name!r}")
+            if self.mixing is not None and not filter_.mixable:
                 rule = f"mode_filter of {self.name!r}, which mixes estimates, must keep no window of steps"
-                raise ValueError(f"{rule}, but got {one.name!r}: 'mmae' takes it")
-        return found
+                raise ValueError(f"{rule}, but got {filter_.name!r}: 'mmae' takes it")
+        return filters
 
     @cached_property
     def _given(self) -> list[StateSpaceModel]:
@@ -293,48 +290,48 @@ class MultipleModelFilter(Filter):
         model, modes = self.model, self.usual_modes if self.modes is None else self.modes
         if not isinstance(modes, Sequence) or not 2 <= len(modes) <= MOST_MODES:
             raise ValueError(f"modes must be a list of 2 to {MOST_MODES} models, but got {short_repr(modes)}")
-        models = [self._changed(one) if isinstance(one, Mapping) else one for one in modes]
-        for one in models:
-            if not isinstance(one, StateSpaceModel):
-                raise ValueError(f"a mode must be a model, or changes of one, but got {short_repr(one)}")
-            if _sizes(one) != _sizes(model):
+        models = [self._changed(mode) if isinstance(mode, Mapping) else mode for mode in modes]
+        for mode in models:
+            if not isinstance(mode, StateSpaceModel):
+                raise ValueError(f"a mode must be a model, or changes of one, but got {short_repr(mode)}")
+            if _sizes(mode) != _sizes(model):
                 rule = "measurements, inputs and angles of a mode must be those of the model"
-                raise ValueError(f"{rule}, {_sizes(model)}, but got {_sizes(one)}")
+                raise ValueError(f"{rule}, {_sizes(model)}, but got {_sizes(mode)}")
         return models
 
     @cached_property
     def _places(self) -> list[tuple[int, ...]]:
-        """Places of the states of each mode among the model's."""
-        return [places_within(one.states, self.model.states) for one in self._given]
+        """Indices of each mode's states among the model's."""
+        return [places_within(mode.states, self.model.states) for mode in self._given]
 
     @cached_property
     def _models(self) -> list[StateSpaceModel]:
         """The models of the modes with all states."""
         every, moments = tuple(range(self.model.n)), self._moments
         return [
-            one if places == every else embedded_model(one, self.model, moments)
-            for one, places in zip(self._given, self._places, strict=True)
+            mode if indices == every else embedded_model(mode, self.model, moments)
+            for mode, indices in zip(self._given, self._places, strict=True)
         ]
 
     @cached_property
     def _moments(self) -> dict[int, tuple[float, float]]:
-        """Mean and variance of states in modes that lack them, by place, where these are given."""
-        given = {} if self.absent is None else self.absent
-        if not isinstance(given, Mapping):
-            raise ValueError(f"absent must map symbols to (mean, variance), but got {short_repr(given)}")
-        symbols = [one.symbol for one in self.model.states]
-        lacking = [name for i, name in enumerate(symbols) if not all(i in own for own in self._places)]
-        found = {}
-        if given and not lacking:
+        """Mean and variance of states in modes that lack them, by index, from the argument `absent`."""
+        moments = {} if self.absent is None else self.absent
+        if not isinstance(moments, Mapping):
+            raise ValueError(f"absent must map symbols to (mean, variance), but got {short_repr(moments)}")
+        symbols = [state.symbol for state in self.model.states]
+        lacking = [name for i, name in enumerate(symbols) if not all(i in indices for indices in self._places)]
+        moments_by_index = {}
+        if moments and not lacking:
             raise ValueError("absent needs a mode that lacks states, but all have all")
-        for name, value in given.items():
-            place = symbols.index(one_of("absent", name, lacking))
+        for name, value in moments.items():
+            index = symbols.index(one_of("absent", name, lacking))
             mean, variance = vector(f"absent[{name!r}]", value, 2).tolist()
-            found[place] = mean, positive(f"variance of absent[{name!r}]", variance, zero_allowed=True)
+            moments_by_index[index] = mean, positive(f"variance of absent[{name!r}]", variance, zero_allowed=True)
         for i, name in enumerate(symbols):
-            if i not in found and not any(i in own for own in self._places):
+            if i not in moments_by_index and not any(i in indices for indices in self._places):
                 raise ValueError(f"each state must be one of a mode's, or of absent, but {name!r} is of none")
-        return found
+        return moments_by_index
 
     @cached_property
     def absent_states(self) -> tuple[Absent, ...]:
@@ -342,7 +339,7 @@ class MultipleModelFilter(Filter):
         return absent_states(self._places, self.model.n, tuple(self._moments))
 
     def _changed(self, changes: Mapping[str, Any]) -> StateSpaceModel:
-        names = [one.name for one in dataclasses.fields(self.model) if one.init]
+        names = [field.name for field in dataclasses.fields(self.model) if field.init]
         return self.model.replace(
             **{one_of("a change of a mode", name, names): it for name, it in changes.items()}
         )
@@ -350,12 +347,12 @@ class MultipleModelFilter(Filter):
     @cached_property
     def own_parameters(self) -> tuple[float, ...]:
         """p, Pi by columns, and the numbers of all modes."""
-        of_modes = [one.numbers for one in self.mode_filters]
+        of_modes = [filter_.numbers for filter_ in self.mode_filters]
         return tuple(np.concatenate([self.p, self.transition_matrix.T.ravel(), *of_modes]).tolist())
 
     def kernels(self) -> Kernels:
         """Kernels for the modes; see `Filter.kernels`."""
-        modes = tuple(Mode(one.kernels(), len(one.numbers)) for one in self.mode_filters)
+        modes = tuple(Mode(filter_.kernels(), len(filter_.numbers)) for filter_ in self.mode_filters)
         return mode_kernels(modes, self.model.shape, self.absent_states, self.mixing)
 
     def mode_probabilities(self, belief: Belief) -> np.ndarray:
@@ -368,7 +365,7 @@ class MultipleModelFilter(Filter):
         return means, covs, np.exp(logs)
 
     def mode_moments(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with the logarithms of the probabilities, -inf of zero."""
+        """`mode_estimates` with the logarithms of the probabilities, -inf of zero."""
         return parts_of(belief.extras, len(self.mode_filters), self.model.n)
 
 
@@ -376,20 +373,17 @@ def _sizes(model: StateSpaceModel) -> tuple:
     return model.m, model.inputs, model.shape.measurement_angles
 
 
-def probabilities_of(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Probabilities, which sum to one over the last axis."""
+def probabilities_of(name: str, user_value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return probabilities as floats; raise ValueError unless they sum to one over the last axis."""
     try:
-        found = as_floats(given)
+        probabilities = as_floats(user_value)
     except ValueError:
-        found = np.empty(0)
-    fits = found.shape == shape and (found >= 0.0).all()
-    if not fits or not np.allclose(found.sum(axis=-1), 1.0, rtol=0.0, atol=SUM_TOLERANCE):
+        probabilities = np.empty(0)
+    fits = probabilities.shape == shape and (probabilities >= 0.0).all()
+    if not fits or not np.allclose(probabilities.sum(axis=-1), 1.0, rtol=0.0, atol=SUM_TOLERANCE):
         rule = f"{name} must be {' x '.join(map(str, shape))} numbers of at least 0 that sum to 1"
-        raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {short_repr(given)}")
-    return found
-
-
-# The interacting multiple model filter, for a plant that switches among several models.
+        raise ValueError(f"{rule}{' in each row' if len(shape) > 1 else ''}, but got {short_repr(user_value)}")
+    return probabilities
 
 
 def mixing(p, mu):
@@ -408,24 +402,24 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
         update:  each filter; L_j = N(v_j; 0, S_j),  mu_j = c_j L_j/L,  L = sum of c_j L_j
         merge:   mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
 
-    mu are the probabilities of the modes (`mode_probabilities`), Pi_ij that of mode j a step after mode i. Unless
-    it is given, Pi = stay I + (1 - stay) 1 p': a step keeps its mode with probability `stay`, and else draws one
-    with probabilities p, which are those of the first step, too. The log-likelihood is log L; innovation and S
-    are those of the mixture before the measurement.
+    mu are the probabilities of the modes (`mode_probabilities`), Pi_ij that of mode j a step after mode i. By
+    default Pi = stay I + (1 - stay) 1 p': the mode stays with probability `stay`; otherwise the step draws a mode
+    with the probabilities p of the first step. The log-likelihood is log L; innovation and S are those of the
+    mixture before the measurement.
 
-    Modes are models, or changes of `model`, such as `{"measurement_noise_cov": 100 * R}`. Without modes there are
-    two, the model and the same with R times `outlier_scale`, with probabilities 1 - `outlier_rate` and
-    `outlier_rate`: a filter for outliers. What a mode lacks of the model's states the others say (unbiased mixing,
-    `filters.gaussian.absent`), or `absent` does: moments with which such a state begins in the modes that have it.
+    Modes are models, or changes of `model`, such as `{"measurement_noise_cov": 100 * R}`. By default there are
+    two, the model and the model with R times `outlier_scale`, with probabilities 1 - `outlier_rate` and
+    `outlier_rate`: a filter for outliers. A mode that lacks one of the model's states gets its moments from the
+    modes that have it (unbiased mixing, `filters.gaussian.absent`), or from `absent`.
 
-    Probabilities are kept as logarithms, so that a mode whose probability is below the least float64 comes back if
-    measurements speak for it. `Belief.extras` holds the memory of the modes' filters, then these logarithms: see
-    `mode_estimates`.
+    Probabilities are kept as logarithms, so that a mode whose probability is below the least float64 regains
+    weight if measurements support it. `Belief.extras` holds the memory of the modes' filters, then these
+    logarithms: see `mode_estimates`.
 
     Attributes:
         stay: probability that a step keeps its mode without a draw, within 0 and 1.
         transition: Pi (K, K), whose rows sum to 1, in place of `stay`.
-        outlier_scale: factor on R in the second mode, where no modes are given.
+        outlier_scale: factor on R in the second mode of the default modes.
         outlier_rate: probability of that mode.
 
     Raises:
@@ -452,12 +446,12 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
 
     @property
     def usual_modes(self) -> Sequence[Mapping[str, Any]]:
-        """The model, and the same with a larger R."""
+        """The model, and the model with a larger R."""
         return {}, {"measurement_noise_cov": self.outlier_scale * self.model.measurement_noise_cov}
 
     @property
     def usual_probabilities(self) -> Sequence[float] | np.ndarray:
-        """As outliers come, where no modes are given; else all equal."""
+        """Those of outliers for the default modes; for others all equal."""
         return (
             super().usual_probabilities if self.modes is not None else (1.0 - self.outlier_rate, self.outlier_rate)
         )
@@ -465,9 +459,9 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
     @property
     def transition_matrix(self) -> np.ndarray:
         """Pi (K, K): the probability of mode j a step after mode i."""
-        count, given = len(self.mode_filters), self.transition
-        given = self.stay * np.eye(count) + (1.0 - self.stay) * self.p if given is None else given
-        return probabilities_of("transition", given, (count, count))
+        count, transition = len(self.mode_filters), self.transition
+        transition = self.stay * np.eye(count) + (1.0 - self.stay) * self.p if transition is None else transition
+        return probabilities_of("transition", transition, (count, count))
 
 
 # Multiple model adaptive estimation: which one of several models is right.
@@ -478,15 +472,15 @@ USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MultipleModelAdaptiveEstimator(MultipleModelFilter):
-    """Multiple model adaptive estimation (MMAE): one of K models is right at all times, and the data say which.
+    """Multiple model adaptive estimation (MMAE): one of K models is right at all times; the data determine which.
 
         mu_j is proportional to mu_j L_j,  L_j = N(v_j; 0, S_j); each filter runs by itself
         mean = sum of mu_j x_j,  P = sum of mu_j (P_j + (x_j - mean)(x_j - mean)')
 
-    Without modes these are the model with Q times 0.1, 1 and 10. The log-likelihood is that of the mixture, and so
-    are innovation and S; `mode_probabilities` and `mode_estimates` say more. Probabilities are kept as
-    logarithms: a model whose probability has come to nothing comes back if as much evidence speaks for it. All of
-    a run counts, so where the plant switches, take `imm`.
+    By default the modes are the model with Q times 0.1, 1 and 10. Log-likelihood, innovation and S are those of
+    the mixture; `mode_probabilities` and `mode_estimates` return those of the modes. Probabilities are kept as
+    logarithms: a model whose probability has vanished regains it if as much evidence supports it. Measurements of
+    the whole run have equal weight, so take `imm` if the plant switches between models.
 
     Raises:
         ValueError: if models are of other sizes, probabilities do not sum to 1, or a filter is no Gaussian one.

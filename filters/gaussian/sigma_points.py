@@ -22,7 +22,7 @@ from thruster_env.graphs.graphs import where
 from thruster_env.model.affine import AffineModel, linearize
 from thruster_env.model.state_space import StateSpaceModel
 
-# Sigma points of the scaled unscented transform, how they move, and moments of values at them.
+# Sigma points of the scaled unscented transform, and moments of values at them.
 
 
 def unscented_points(model, x, L):
@@ -31,27 +31,27 @@ def unscented_points(model, x, L):
 
 
 def unscented_moments(model, Y, angles):
-    """Mean and shift of values at the points, and their deviations."""
+    """Mean of values at the points, its shift s from the central value, and deviations from the central value."""
     D = wrap(without_first(Y) - outer(first(Y), ones(without_first(Y))), angles)
     s = (D @ ones(D)) * model.own.weight
     return first(Y) + s, s, D
 
 
 def scatter(model, D, s):
-    """The covariance of such deviations."""
+    """The covariance of deviations D with the shift s."""
     return square(D) * model.own.weight + outer(s, s) * model.own.shift_weight
 
 
 def propagate_points(model, X, u):
-    """One of the model's substeps, of each point."""
+    """Propagate each point by one substep."""
     return model.f(X, u)
 
 
-# The square-root form of the unscented filter: P, S and the gain follow from one triangle (`square_root`).
+# The square-root form of the unscented filter: P, S and the gain follow from one triangle (`forms.root_result`).
 
 
 def represent_unscented_root(model, x, P):
-    """The points of a belief, by the root that is kept."""
+    """The points of a belief, from the root L in the extras."""
     return unscented_points(model, x, model.extras["L"])
 
 
@@ -61,21 +61,21 @@ def deviations(model, D, s):
 
 
 def add_process_noise_unscented_root(model, X):
-    """The end of a step."""
+    """Mean and root of the points, with Q added, at the end of a step."""
     x, s, D = unscented_moments(model, X, model.state_angles)
     L = triangle(hstack(deviations(model, D, s), model.Q_root))
     return wrap(x, model.state_angles), square(L), {"L": L}
 
 
 def update_unscented_root(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    n, m, seen, L = len(x), len(z), present(z), model.extras["L"]
+    """Update with the measurement z; NaN marks missing channels."""
+    n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
-    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - y, model.measurement_angles))
+    s, D, R = only(measured, s), only(measured, D), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - y, model.measurement_angles))
     of_x = (L * model.own.spread) @ without_first(units(x)) * model.own.weight_root
     both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
-    return root_result(model, x, triangle(both), v, seen)
+    return root_result(model, x, triangle(both), v, measured)
 
 
 UNSCENTED_ROOT = Page(
@@ -96,23 +96,23 @@ def represent_unscented(model, x, P):
 
 
 def add_process_noise_unscented(model, X):
-    """The end of a step."""
+    """Mean and covariance of the points, with Q added, at the end of a step."""
     x, s, D = unscented_moments(model, X, model.state_angles)
     return wrap(x, model.state_angles), scatter(model, D, s) + model.Q
 
 
 def update_unscented(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
+    """Update with the measurement z; NaN marks missing channels."""
     g, w = model.own.spread, model.own.weight
-    L, U, seen = root(P), without_first(units(x)), present(z)
+    L, U, measured = root(P), without_first(units(x)), present(z)
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
-    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - y, model.measurement_angles))
+    s, D, R = only(measured, s), only(measured, D), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - y, model.measurement_angles))
     C = (L @ (U @ D.T)) * (w * g)
     S = scatter(model, D, s) + R
     K = divide(C, S)
     rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
-    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,15 +127,14 @@ class UnscentedKalmanFilter(PageFilter):
                  K = w g L U h(X)' S^-1,  x += K v,
                  P = w (g L U - K D) (g L U - K D)' + b K s (K s)' + K R K'
 
-    These are the moments of the usual weights, W_0 = 1 - n/g^2 for the mean, W_0 + 1 - alpha^2 + beta for the
-    covariance and W_i = w, with the point in the centre taken out of the sums: a negative weight, which alpha
-    below one gives the centre, is then in none of them. The last line equals P - K S K' and is for points what
-    Joseph's form is for matrices. Every covariance is symmetric by construction, and positive as long as
-    alpha^2 kappa + beta n is not negative, which is checked.
+    These are the moments with the usual weights, W_0 = 1 - n/g^2 for the mean, W_0 + 1 - alpha^2 + beta for the
+    covariance and W_i = w. The central point is taken out of the sums, because its weight is negative for alpha
+    below one. The last line, Joseph's form for points, equals P - K S K'. Every covariance is symmetric by
+    construction, and positive because the filter requires alpha^2 kappa + beta n >= 0.
 
     Attributes:
-        alpha: distance of the points; 1 puts them sqrt(n + kappa) standard deviations from the mean, where the
-            nonlinearity of f and h shows. With the common 0.001 the filter is hardly more than an extended one.
+        alpha: distance of the points from the mean, in units of sqrt(n + kappa) standard deviations. With 1 they
+            reach the nonlinearity of f and h; with the common 0.001 the filter is nearly the extended one.
         beta: prior knowledge of the distribution beyond its moments; 2 is best for Gaussian ones.
         kappa: moves the points further out and gives the centre a larger weight; above -n.
         form: "covariance" as above, or "square-root", which carries L and keeps twice the digits of P; beta must
@@ -177,12 +176,12 @@ class UnscentedKalmanFilter(PageFilter):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Where the points lie, and their weights."""
+        """The distance of the points, and their weights."""
         square, curvature = self.alpha**2 * (self.model.n + self.kappa), self.beta - self.alpha**2
-        found = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": curvature}
+        parameters = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": curvature}
         if self.form == "covariance":
-            return found
-        return found | {"weight_root": found["weight"] ** 0.5, "shift_root": curvature**0.5}
+            return parameters
+        return parameters | {"weight_root": parameters["weight"] ** 0.5, "shift_root": curvature**0.5}
 
 
 # The cubature Kalman filter: moments by the third-degree spherical-radial rule, with equal weights.
@@ -199,29 +198,29 @@ def cubature_points(model, x, L):
 
 
 def cubature_moments(model, Y, angles):
-    """Mean of values at the points, and their deviations; angles first come to one side of their mean."""
+    """Mean of values at the points, and deviations from it, of angles on one branch around their mean."""
     Y = on_circle(Y, angles)
     y = (Y @ ones(Y)) * model.own.weight
     return y, Y - outer(y, ones(Y))
 
 
 def add_process_noise_cubature(model, X):
-    """The end of a step."""
+    """Mean and covariance of the points, with Q added, at the end of a step."""
     x, D = cubature_moments(model, X, model.state_angles)
     return wrap(x, model.state_angles), square(D) * model.own.weight + model.Q
 
 
 def update_cubature(model, x, P, z):
-    """The measurement z; channels that are NaN are missing."""
-    (g, w), L, U, seen = model.own, root(P), without_first(units(x)), present(z)
+    """Update with the measurement z; NaN marks missing channels."""
+    (g, w), L, U, measured = model.own, root(P), without_first(units(x)), present(z)
     y, D = cubature_moments(model, model.h(cubature_points(model, x, L)), model.measurement_angles)
-    D, R = only(seen, D), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - y, model.measurement_angles))
+    D, R = only(measured, D), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - y, model.measurement_angles))
     C = (L @ (U @ D.T)) * (w * g)
     S = square(D) * w + R
     K = divide(C, S)
     rest = square((L * g) @ U - K @ D) * w + sym(K @ R @ K.T)
-    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,8 +234,8 @@ class CubatureKalmanFilter(PageFilter):
                  K = w g L U D' S^-1,  x += K v,  P = w (g L U - K D) (g L U - K D)' + K R K'
 
     The last line equals P - K S K'; sums of squares, all covariances are symmetric and positive by construction.
-    The rule is exact for cubic f and h. It has no parameters: it gives the moments of an unscented filter with
-    alpha = 1 and beta = kappa = 0, and does not ask for f and h at the mean itself.
+    The moments are exact for cubic f and h. The filter has no parameters: its moments are those of an unscented
+    filter with alpha = 1 and beta = kappa = 0, but it does not evaluate f and h at the mean.
 
     Source: Arasaratnam, Haykin (2009), "Cubature Kalman filters", IEEE Trans. Automatic Control 54(6), section IV.
     """
@@ -246,7 +245,7 @@ class CubatureKalmanFilter(PageFilter):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Where the points lie, and their weight."""
+        """The distance of the points, and their weight."""
         n = self.model.n
         return {"spread": n**0.5, "weight": 0.5 / n}
 
@@ -254,12 +253,12 @@ class CubatureKalmanFilter(PageFilter):
 # Rules of a fuzzy filter: a model's affine approximations at the corners of a range of its states.
 
 
-MOST_STATES = 8  # that rules ask for: 256 rules
+MOST_STATES = 8  # premises, for 256 rules
 
 
 @operation(lambda x, low, high, premises: (2 ** len(premises),))
 def memberships(x, low, high, premises):
-    """Of a state in all rules: products of how low or high it is in each premise, as the bits of the rule say."""
+    """Memberships of a state x in all rules: products over the premises of its degree of low or high, by bits."""
     w = np.ones(1)
     for i in premises:
         part = (x[i] - low[i]) / (high[i] - low[i])
@@ -271,23 +270,23 @@ def memberships(x, low, high, premises):
 def rules_at_corners(
     model: StateSpaceModel, low: np.ndarray, high: np.ndarray, premises: tuple[int, ...], offsets: bool
 ) -> tuple[AffineModel, ...]:
-    """The affine model of each rule, whose bits say where it is linearised: low, or high, in each premise."""
+    """The affine model of each rule, linearised at low or high in each premise, as the rule's bits say."""
     control = np.zeros(model.inputs) if model.operating_input is None else model.operating_input
     rules, before = [], model.n * (model.n + model.inputs)
     for rule in range(2 ** len(premises)):
         corner = (low + high) / 2
         for bit, i in enumerate(premises):
             corner[i] = (high if rule >> bit & 1 else low)[i]
-        found = linearize(model, corner, control)
-        c = found.constants  # of which the state's offset may be left out
+        affine = linearize(model, corner, control)
+        c = affine.constants  # A, B, the offset of the state, C and that of the measurement
         without = c[:before] + (0.0,) * model.n + c[before + model.n :]
-        rules.append(found if offsets else found.replace(constants=without))
+        rules.append(affine if offsets else affine.replace(constants=without))
     return tuple(rules)
 
 
 def checked_corners(model: StateSpaceModel, low: Any, high: Any, premises: Any) -> dict[str, Any]:
-    """The range of the states and the places of those that rules ask for; ValueError if there are none."""
-    places = _checked_premises(model, premises)
+    """The range of the states, and the indices of the rules' premises; ValueError if the range is unknown."""
+    indices = _checked_premises(model, premises)
     low, high = model.state_low if low is None else low, model.state_high if high is None else high
     if isinstance(model, AffineModel):  # its rules are all alike, whatever the range
         low = model.prior_mean - model.scales if low is None else low
@@ -302,19 +301,19 @@ def checked_corners(model: StateSpaceModel, low: Any, high: Any, premises: Any) 
         raise ValueError(
             f"low must be below high in every state, but got {short_repr(low)} and {short_repr(high)}"
         )
-    return {"premises": places, "low": low, "high": high}
+    return {"premises": indices, "low": low, "high": high}
 
 
-def _checked_premises(model: StateSpaceModel, given: Any) -> tuple[int, ...]:
-    """Places of the states that rules ask for, all if None."""
-    n, told = model.n, f"all {model.n} states" if given is None else short_repr(given)
-    if given is None:
-        given = (0,) if n > MOST_STATES and isinstance(model, AffineModel) else range(n)  # all rules are alike
+def _checked_premises(model: StateSpaceModel, premises: Any) -> tuple[int, ...]:
+    """Indices of the states that are premises of rules; if None, all, or the first one of a large affine model."""
+    n, premises_text = model.n, f"all {model.n} states" if premises is None else short_repr(premises)
+    if premises is None:
+        premises = (0,) if n > MOST_STATES and isinstance(model, AffineModel) else range(n)  # all rules are alike
     try:
-        places = tuple(place_of("premises", place, n) for place in given)
+        indices = tuple(place_of("premises", index, n) for index in premises)
     except TypeError:
-        places = ()
-    if not 1 <= len(places) <= MOST_STATES or len(set(places)) < len(places):
+        indices = ()
+    if not 1 <= len(indices) <= MOST_STATES or len(set(indices)) < len(indices):
         rule = f"premises must name 1 to {MOST_STATES} different states, for there is a rule for each corner"
-        raise ValueError(f"{rule} of their range, but got {told}")
-    return places
+        raise ValueError(f"{rule} of their range, but got {premises_text}")
+    return indices
