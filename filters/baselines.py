@@ -19,55 +19,52 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, vector_reader, vector_writer, zeros_of
 from thruster_env.model.shape import Functions, Shape, constants_reader, innovation_of, number_places
 
-# Solving h(x) = z for one component of x, by bracketing: for any continuous function, compiled or not.
-
-
-INTERVALS = 100  # on either side, in which a sign change is looked for
-HALVINGS = 60  # of such an interval; and steps of the golden section, each of which leaves 0.618 of it
+INTERVALS = 100  # on either side, that are searched for a sign change
+HALVINGS = 60  # of an interval; also the steps of the golden section, which each shorten it to 0.618
 _GOLDEN = 0.6180339887498949
 
 
 @lru_cache(maxsize=64)
 def component_solver(observe: Callable, n: int, component: int, channel: int, angle: bool = False) -> Callable:
-    """Return `solve(x, z, c, reach)`: x with the value of one component at which channel h_i(x) = z.
+    """Return `solve(x, z, c, reach)`: x with one component changed so that channel h_i(x) = z.
 
-    It is the root nearest to the value in x, among those within `reach` of it whose sign change shows between two
-    of 100 equal steps on either side. If there is none, it is the value at which h comes nearest to z, as found by
-    a golden section about the nearest step. Where the channel is an `angle`, h_i(x) - z goes the short way round,
-    and its jump half a turn away is no root.
+    The result is the root nearest to the component's value. It is searched within `reach`, by sign changes between
+    100 equal steps on either side. Without a root the result is the value at which h comes nearest to z, by a
+    golden section around the nearest step. If the channel is an `angle`, h_i(x) - z is wrapped to (-pi, pi], and
+    its jump at pi is no root.
     """
-    source = Source("place", "x, v", result=(n,), x=(n,))
-    place = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
+    source = Source("replaced", "x, v", result=(n,), x=(n,))
+    replaced = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
 
     @inlined
     def misfit_of_number(x, v, z, c):
-        return observe(place(x, v), c)[channel] - z
+        return observe(replaced(x, v), c)[channel] - z
 
     @inlined
     def misfit_of_angle(x, v, z, c):
-        return wrapped(observe(place(x, v), c)[channel] - z)
+        return wrapped(observe(replaced(x, v), c)[channel] - z)
 
     @inlined
-    def crossing_of_number(one, other):
-        return (other > 0.0) != (one > 0.0)
+    def crossing_of_number(before, after):
+        return (after > 0.0) != (before > 0.0)
 
     @inlined
-    def crossing_of_angle(one, other):
-        return (other > 0.0) != (one > 0.0) and abs(other - one) < math.pi
+    def crossing_of_angle(before, after):
+        return (after > 0.0) != (before > 0.0) and abs(after - before) < math.pi
 
     misfit = misfit_of_angle if angle else misfit_of_number
     crossing = crossing_of_angle if angle else crossing_of_number
 
     @inlined
-    def halved(x, z, c, one, other, at_one):
+    def halved(x, z, c, near, far, misfit_near):
         for _ in range(HALVINGS):
-            middle = 0.5 * (one + other)
+            middle = 0.5 * (near + far)
             value = misfit(x, middle, z, c)
-            if (value > 0.0) == (at_one > 0.0):
-                one = middle
+            if (value > 0.0) == (misfit_near > 0.0):
+                near = middle
             else:
-                other = middle
-        return 0.5 * (one + other)
+                far = middle
+        return 0.5 * (near + far)
 
     @inlined
     def nearest_approach(x, z, c, low, high):
@@ -91,7 +88,7 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
                 inner = (k - 1) * step
                 down = halved(x, z, c, start - inner, start - k * step, below) if crossed_below else start - reach
                 up = halved(x, z, c, start + inner, start + k * step, above) if crossed_above else start + reach
-                return place(x, down if start - down < up - start else up)
+                return replaced(x, down if start - down < up - start else up)
             if abs(next_below) < least:
                 nearest, least = start - k * step, abs(next_below)
             if abs(next_above) < least:
@@ -99,24 +96,21 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
             below, above = next_below, next_above
         low, high = max(nearest - step, start - reach), min(nearest + step, start + reach)
         finer = nearest_approach(x, z, c, low, high)
-        return place(x, finer if abs(misfit(x, finer, z, c)) < least else nearest)
+        return replaced(x, finer if abs(misfit(x, finer, z, c)) < least else nearest)
 
     return solve
 
 
-# Baselines that any filter should beat: open loop, inversion of the measurement, low-pass with inversion.
+@inlined
+def blend_numbers(y, z, share):
+    """The output of a low-pass filter, with this share of its last output y, for a measurement z."""
+    return share * y + (1.0 - share) * z
 
 
 @inlined
-def blend_numbers(y, z, kept):
-    """What a low-pass makes of its last value y and a measurement z."""
-    return kept * y + (1.0 - kept) * z
-
-
-@inlined
-def blend_angles(y, z, kept):
-    """The same of angles: from y the short way towards z."""
-    return wrapped(y + (1.0 - kept) * wrapped(z - y))
+def blend_angles(y, z, share):
+    """`blend_numbers` of angles: from y the short way towards z."""
+    return wrapped(y + (1.0 - share) * wrapped(z - y))
 
 
 @lru_cache(maxsize=64)
@@ -126,15 +120,20 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     Args:
         functions: of the model.
         shape: of the model.
-        inverted: (component, channel) that are inverted, or None for the open loop.
+        inverted: (component, channel), or None for the open loop.
 
-    Extras: the open loop's state (n,), the low-passed measurement, and 1 once it has a value.
+    Extras: the open loop's state (n,), the output of the low-pass filter, and 1 once that has a value.
     """
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
-    substeps_place, step_place, likelihood_place = source.substeps, places.step, places.log_likelihood
-    smooth_place, known_place, reach_place, kept_place = places.extras + n, places.extras + n + 1, own, own + 1
-    read_open, store_open = vector_reader(n, places.extras), vector_writer(n, places.extras)
+    layout, source, first_parameter = memory_places(n, m), number_places(n, m), own_place(shape)
+    substeps_place, step_place, likelihood_place = source.substeps, layout.step, layout.log_likelihood
+    smooth_place, known_place, reach_place, share_place = (
+        layout.extras + n,
+        layout.extras + n + 1,
+        first_parameter,
+        first_parameter + 1,
+    )
+    read_open, store_open = vector_reader(n, layout.extras), vector_writer(n, layout.extras)
     (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     prior_mean, constants, control = (
         vector_reader(n, source.prior_mean),
@@ -181,8 +180,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         store_s(row, no_s())
         row[likelihood_place] = 0.0
         if inverts and z[channel] == z[channel]:
-            kept = numbers[kept_place] * row[known_place]
-            row[smooth_place] = blend(row[smooth_place], z[channel], kept)
+            share = numbers[share_place] * row[known_place]
+            row[smooth_place] = blend(row[smooth_place], z[channel], share)
             row[known_place] = 1.0
             estimate(row, numbers)
 
@@ -191,7 +190,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OpenLoop(Filter):
-    """The model alone, from the mean of the prior: x = f(x, u). No measurement changes it.
+    """The model alone, from the mean of the prior: x = f(x, u). It ignores measurements.
 
     It has no covariance (zeros) and no likelihood; the innovation is z - h(x).
     """
@@ -211,7 +210,7 @@ class OpenLoop(Filter):
 
     @property
     def own_parameters(self) -> tuple[float, ...]:
-        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        """The reach of the search for a root, and the low-pass filter's share of its last output."""
         return 0.0, 0.0
 
 
@@ -222,17 +221,17 @@ class Inversion(OpenLoop):
         x = f(x, u), the open loop;  the estimate is x with x_i replaced by the root v of
         h(x with x_i = v) = z nearest to x_i, else by the v at which h comes nearest to z, an extremum
 
-    One channel of z and one component are used: for the thruster the flow velocity U_a follows from the thrust,
-    with the open loop's motor speed. While a measurement is missing, the last one is inverted; before the first,
-    the estimate is the open loop. There is no covariance (zeros) and no likelihood; the innovation is z minus its
+    It uses one channel of z and one component: for the thruster the flow velocity U_a follows from the thrust and
+    the open loop's motor speed. While measurements are missing it inverts the last one; before the first the
+    estimate is the open loop. There is no covariance (zeros) and no likelihood; the innovation is z minus its
     prediction from the estimate before.
 
     Attributes:
         inverted: index i of the component that is solved for; -1 is the last.
         channel: index of the channel of z.
-        reach: largest distance from the open loop's x_i at which a root is looked for, in the unit of x_i; if
-            None, the width of the range of x_i in the model (`state_high` minus `state_low`), or, without a range,
-            20 times its spread in prior and process noise.
+        reach: largest distance of a root from the open loop's x_i, in the unit of x_i; if None, the width of the
+            range of x_i in the model (`state_high` minus `state_low`), or, without a range, 20 times its spread in
+            prior and process noise.
 
     Raises:
         ValueError: if the model has no such component or channel, or reach is not positive.
@@ -264,12 +263,12 @@ class Inversion(OpenLoop):
 
     @property
     def own_parameters(self) -> tuple[float, ...]:
-        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        """The reach of the search for a root, and the low-pass filter's share of its last output, zero."""
         return self._numbers(0.0)
 
-    def _numbers(self, kept: float) -> tuple[float, ...]:
+    def _numbers(self, share: float) -> tuple[float, ...]:
         assert self.reach is not None  # it is set when the filter is made
-        return self.reach, kept
+        return self.reach, share
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,7 +283,7 @@ class LowPass(Inversion):
         time_constant: of the low-pass filter, in steps; positive.
         inverted: index i of the component that is solved for; -1 is the last.
         channel: index of the channel of z.
-        reach: largest distance from the open loop's x_i at which a root is looked for; see `Inversion`.
+        reach: largest distance of a root from the open loop's x_i; see `Inversion`.
 
     Raises:
         ValueError: as `Inversion`, or if time_constant is not positive.
@@ -300,20 +299,20 @@ class LowPass(Inversion):
 
     @property
     def own_parameters(self) -> tuple[float, ...]:
-        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        """The reach of the search for a root, and the low-pass filter's share of its last output."""
         return self._numbers(math.exp(-1.0 / self.time_constant))
 
 
 def place_of(name: str, value, count: int) -> int:
-    """Return a place 0 ... count - 1, counted from the end if negative; raise ValueError if there is none."""
-    place = at_least(name, value, -count)
-    if place >= count:
+    """Return an index as 0 ... count - 1, negative ones counted from the end; raise ValueError beyond."""
+    index = at_least(name, value, -count)
+    if index >= count:
         raise ValueError(f"{name} must be a whole number from {-count} to {count - 1}, but got {value!r}")
-    return place % count
+    return index % count
 
 
-def places_of(name: str, given, count: int) -> tuple[int, ...]:
-    """Return places 0 ... count - 1 in order, each once, of a list of such; raise ValueError for anything else."""
-    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
-        raise ValueError(f"{name} must be a list of indices, but got {short_repr(given)}")
-    return tuple(sorted({place_of(name, one, count) for one in given}))
+def places_of(name: str, indices, count: int) -> tuple[int, ...]:
+    """Return a list of indices as 0 ... count - 1, in order, each once; raise ValueError for anything else."""
+    if not isinstance(indices, Sequence | np.ndarray) or isinstance(indices, str):
+        raise ValueError(f"{name} must be a list of indices, but got {short_repr(indices)}")
+    return tuple(sorted({place_of(name, index, count) for index in indices}))

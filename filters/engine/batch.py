@@ -40,7 +40,7 @@ class Estimates(NamedTuple):
 
 
 def estimates_of(rows: Sequence[tuple], divergences: int) -> Estimates:
-    """What `run` gives of one trajectory, from what `Session.told` said of each row."""
+    """`Estimates` of one trajectory, from the results of `Session.told` at each row."""
     parts = [np.array(part)[None] for part in zip(*rows, strict=True)]
     return Estimates._make([*parts, np.array([divergences])])
 
@@ -58,8 +58,8 @@ def run(
 
     Args:
         filter_: any filter, or an estimator of another package in its place.
-        keys: random keys, one a trajectory, (B, 2): two whole numbers below 2^32 each; those of seeds 0, 1, ...,
-            B - 1 if None. Filters that draw nothing ignore them: run(filter_, inputs=u, measurements=z).
+        keys: random keys (B, 2), two whole numbers below 2^32 for each trajectory; those of seeds 0, 1, ..., B - 1
+            if None. Filters without random draws ignore them: run(filter_, inputs=u, measurements=z).
         inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs. The filter
             predicts step k + 1 with u[:, k].
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing; z[:, 0]
@@ -118,7 +118,7 @@ def trajectories(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The arguments of `run` as the arrays that compiled code takes; ValueError if something is wrong."""
     model = filter_.kernel_model
-    # Arrays that may be written to: others are another type to numba, which compiles once more for them.
+    # Writeable arrays, because numba would compile again for read-only ones.
     requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
     if measurements is None:
         raise ValueError("measurements must be an array (B, K + 1, m), but got None")
@@ -127,8 +127,10 @@ def trajectories(
         count, steps = shape[:2] if len(shape) == 3 else (0, 1)
         inputs = np.zeros((count, steps - 1, 0)) if inputs is None else inputs
         keys = filter_keys(range(count)).reshape(count, 2) if keys is None else keys
-    given = {"keys": keys, "inputs": inputs, "measurements": measurements}
-    keys, inputs, z = (np.require(_floats(name, value), np.float64, requirements) for name, value in given.items())
+    arguments = {"keys": keys, "inputs": inputs, "measurements": measurements}
+    keys, inputs, z = (
+        np.require(_floats(name, value), np.float64, requirements) for name, value in arguments.items()
+    )
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
         raise ValueError(
             "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
@@ -157,9 +159,9 @@ def _floats(name: str, value) -> np.ndarray:
 def noise_rows(
     filter_: Filter, times: int, process_noise_covs, measurement_noise_covs
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (Q, its root) of each step and (R, its root) of each measurement; no rows where the model's act.
+    """Rows (Q, its root) of each step and (R, its root) of each measurement; no rows for the model's Q or R.
 
-    Raises ValueError for what is no covariance, other shapes, and what the filter cannot take.
+    Raises ValueError for matrices that are no covariances, for wrong shapes, and if the filter cannot take them.
     """
     filter_.check_noise(process_noise_covs, measurement_noise_covs)
     model = filter_.kernel_model
@@ -169,21 +171,21 @@ def noise_rows(
     )
 
 
-def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:
-    if given is None:
+def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
+    if covs is None:
         return np.empty((0, 2 * size * size))
-    given = _floats(name, given)
-    if given.shape != (count, size, size):
-        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {given.shape}")
+    covs = _floats(name, covs)
+    if covs.shape != (count, size, size):
+        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {covs.shape}")
     definite = name.startswith("measurement")
-    return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in given])
+    return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in covs])
 
 
 # Batch session: one belief for each copy of a vector env, all advanced in place by one compiled call.
 
 
-THREADED_COPIES = 256  # fewer are done before a second thread has woken up
-IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # what a copy's belief does in a call
+THREADED_COPIES = 256  # one thread runs fewer copies before a second one has woken up
+IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # the task of a copy in a call
 
 
 class Beliefs:
@@ -248,13 +250,13 @@ class Beliefs:
 @lru_cache(maxsize=128)
 def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
     operate = inlined(build_operation(kernels))
-    kept = kernels.kept_rows
+    kept_rows = kernels.kept_rows
 
     def operate_many(first, last, row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers):
-        # Each thread works in memory of its own: slices of arrays that threads share cost contended counts.
+        # Each thread has its own memory: slices of shared arrays cost contended reference counts.
         row, table, draws = np.zeros_like(row), np.zeros_like(table), np.zeros_like(draws)
         p, m = inputs.shape[1], measurements.shape[1]
-        given = np.zeros(p + m)
+        values = np.zeros(p + m)
         for b in range(first, last):
             task = tasks[b]
             if task == IDLE:
@@ -262,17 +264,17 @@ def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
             for i in range(row.shape[0]):
                 row[i] = rows[b, i]
             if task == STEP:
-                for i in range(kept):
+                for i in range(kept_rows):
                     for j in range(tables.shape[2]):
                         table[i, j] = tables[b, i, j]
             for i in range(p):
-                given[i] = inputs[b, i]
+                values[i] = inputs[b, i]
             for i in range(m):
-                given[p + i] = measurements[b, i]
-            operate(row, table, draws, size, given, numbers, task)
+                values[p + i] = measurements[b, i]
+            operate(row, table, draws, size, values, numbers, task)
             for i in range(row.shape[0]):
                 rows[b, i] = row[i]
-            for i in range(kept):
+            for i in range(kept_rows):
                 for j in range(tables.shape[2]):
                     tables[b, i, j] = table[i, j]
 

@@ -1,8 +1,8 @@
 """Beliefs: the values, their layout in memory, checks of arguments, and the restart of a diverged one.
 
 A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column per ensemble
-member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
-model's numbers, behind which a filter has its own, is laid out by `thruster_env.model.shape`.
+member, and a vector of random draws. Rows are cheap to pass to compiled code, to copy and to stack. The row of
+numbers has those of the model, laid out by `thruster_env.model.shape`, then the filter's parameters.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.model.shape import Shape, number_places, starts_of
 
-# Beliefs, innovations, and the plain functions that a kind of filter is made of.
-
 
 class Belief(NamedTuple):
     """The estimate of a filter at one time.
@@ -31,10 +29,10 @@ class Belief(NamedTuple):
         cov: covariance of the error, (n, n).
         members: of an ensemble, (n, N), one row for each state; N = 0 for Gaussian filters. Particle filters add a
             row of log weights.
-        key: two integers on which all random draws depend, together with `step`.
+        key: two integers; with `step` they determine all random draws.
         step: number of steps predicted so far.
         divergences: restarts from the prior after an estimate that was not finite.
-        extras: what else the filter keeps, such as an estimate of R.
+        extras: what the filter keeps besides, such as an estimate of R.
     """
 
     mean: np.ndarray
@@ -47,7 +45,7 @@ class Belief(NamedTuple):
 
 
 class LostBelief(Belief):
-    """What `predict` returns where a belief is no longer finite; the next update restarts from the prior."""
+    """The result of `predict` if it is not finite; the next update restarts from the prior."""
 
     __slots__ = ()
 
@@ -72,12 +70,12 @@ class Kernels(NamedTuple):
     `row` is laid out by `filters.engine.belief`, `numbers` by `thruster_env.model.shape`; `table` is
     (table_rows, padded size), its first n rows the members, without columns for filters without an ensemble;
     `draws` has room for `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first
-    `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch`
-    values that are not kept follow.
+    `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; then come
+    `scratch` values that it does not keep.
 
-    `vectors`, where given, are what `predict` does before its substeps, in each of them and after them, and
-    `update`, each for eight beliefs that lie together, as functions (rows, given, numbers): batches then run them
-    (`engine.side_by_side`).
+    `vectors`, if there are any, are four functions (rows, given, numbers) for eight beliefs side by side: the
+    parts of `predict` before its substeps, in each substep and after them, and `update`. Batches run these
+    (`engine.compile.build_side_by_side`).
     """
 
     n: int
@@ -103,7 +101,7 @@ class Kernels(NamedTuple):
 
 
 class MemoryPlaces(NamedTuple):
-    """First places of the parts of a filter's row, for n states and m measurements."""
+    """Offsets of the parts of a filter's row, for n states and m measurements."""
 
     mean: int  # (n,)
     cov: int  # (n, n)
@@ -115,12 +113,12 @@ class MemoryPlaces(NamedTuple):
     innovation_cov: int  # (m, m)
     log_likelihood: int
     gain: int  # (n, m), scratch
-    extras: int  # what a kind of filter keeps beside; the row ends with these
+    extras: int  # of a kind of filter, then its scratch: the end of the row
 
 
 @cache
 def memory_places(n: int, m: int) -> MemoryPlaces:
-    """Places in the row of a filter."""
+    """Offsets in the row of a filter."""
     return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
@@ -141,11 +139,11 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
         `write(row, value)` of the innovation (m,) and its covariance (m, m).
     """
     n, m = shape.n, shape.m
-    places = memory_places(n, m)
+    layout = memory_places(n, m)
     return (
-        (vector_reader(n, places.mean), matrix_reader(n, n, places.cov)),
-        (mean_writer(shape), matrix_writer(n, n, places.cov)),
-        (vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)),
+        (vector_reader(n, layout.mean), matrix_reader(n, n, layout.cov)),
+        (mean_writer(shape), matrix_writer(n, n, layout.cov)),
+        (vector_writer(m, layout.innovation), matrix_writer(m, m, layout.innovation_cov)),
     )
 
 
@@ -157,7 +155,7 @@ def own_place(shape: Shape) -> int:
 # Checks of the arguments of filters: beliefs, keys, inputs and measurements.
 
 
-FEW = 4  # states, up to which a belief is looked at in Python
+FEW = 4  # states, up to which Python checks a belief faster than NumPy
 
 
 def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
@@ -207,12 +205,12 @@ def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray
 
 
 def check_belief(belief: Belief, prior_variances: np.ndarray) -> None:
-    """Raise ValueError unless a belief's numbers are finite and its covariance is one, within rounding.
+    """Raise ValueError unless a belief's numbers are finite and its covariance is positive semidefinite.
 
-    What filters leave of a covariance that is impossible is a part of its variances, or of the prior's (n,), which
-    they began with. A `LostBelief`, which declares that it is not finite, is accepted.
+    Rounding may leave errors relative to its variances, or to the prior's (n,), from which a filter starts. A
+    `LostBelief`, which declares that it is not finite, passes.
     """
-    if _is_surely_one(belief, prior_variances):
+    if _passes_quickly(belief, prior_variances):
         return
     at_least("step of a belief", belief.step, 0)
     at_least("divergences of a belief", belief.divergences, 0)
@@ -229,14 +227,14 @@ def check_belief(belief: Belief, prior_variances: np.ndarray) -> None:
     covariance("cov of a belief", belief.cov, len(belief.mean), variances=prior_variances)
 
 
-def _is_surely_one(belief: Belief, prior_variances: np.ndarray) -> bool:
-    """Whether a belief passes all checks, by a quick look; if not, the thorough one says what is amiss.
+def _passes_quickly(belief: Belief, prior_variances: np.ndarray) -> bool:
+    """Whether a belief passes all checks, by a quick test; if not, the thorough checks find what is wrong.
 
     P + r V = L L' with L real, where V has the variances or the prior's, and r is the tolerance: so no eigenvalue
     of V^(-1/2) P V^(-1/2) is below -r.
     """
     mean, cov, members, extras = belief.mean, belief.cov, belief.members, belief.extras
-    if not all(type(one) is np.ndarray and one.dtype == np.float64 for one in (mean, cov, members, extras)):
+    if not all(type(array) is np.ndarray and array.dtype == np.float64 for array in (mean, cov, members, extras)):
         return False
     if type(belief.step) is not int or type(belief.divergences) is not int or min(belief[4:6]) < 0:
         return False
@@ -268,8 +266,8 @@ def _few(mean: list[float], cov: list[list[float]], prior_variances: list[float]
         pivot = row[i] + ROUNDING * max(row[i], prior_variances[i])
         if pivot == 0.0 and not any(row):  # of what is known exactly
             pivot = 1.0
-        for one in new:
-            pivot -= one * one
+        for entry in new:
+            pivot -= entry * entry
         if not (row[i] >= 0.0 and 0.0 < pivot < inf):
             return False
         new.append(sqrt(pivot))
@@ -294,39 +292,39 @@ def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> boo
 # Restart of a belief that has diverged (not finite, or with a negative variance): it becomes the prior.
 
 
-LARGEST = 1e300  # what the numbers of a belief may add up to
+LARGEST = 1e300  # of the sum of a belief's absolute numbers
 
 
 @cache
 def row_magnitude(n: int, m: int) -> Callable:
     """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation.
 
-    A negative variance, which rounding leaves of a covariance of very unequal numbers, counts as a number beyond
-    LARGEST, and so does NaN.
+    A negative variance, which rounding may leave in a covariance of very unequal numbers, counts as a number
+    beyond LARGEST, and so does NaN.
     """
-    places = memory_places(n, m)
+    layout = memory_places(n, m)
     beyond = 10 * LARGEST
-    variances = [places.cov + i * (n + 1) for i in range(n)]
-    source = Source("magnitude", "row", work=places.gain)
+    variances = [layout.cov + i * (n + 1) for i in range(n)]
+    source = Source("magnitude", "row", work=layout.gain)
     if source.loops:
-        of_all = source.sum(f"abs(row[{i}])" for i in source.range(places.gain))
+        of_all = source.sum(f"abs(row[{i}])" for i in source.range(layout.gain))
         of_variances = source.sum(
-            f"(0.0 if row[{place}] >= 0.0 else {beyond})"
-            for place in (i * (n + 1) + places.cov for i in source.range(n))
+            f"(0.0 if row[{variance}] >= 0.0 else {beyond})"
+            for variance in (i * (n + 1) + layout.cov for i in source.range(n))
         )
         return source.function(f"{of_all} + {of_variances}")
-    terms = [f"abs(row[{i}])" for i in range(places.gain) if i not in variances]
+    terms = [f"abs(row[{i}])" for i in range(layout.gain) if i not in variances]
     terms += [f"(row[{i}] if row[{i}] >= 0.0 else {beyond})" for i in variances]
     return source.function(" + ".join(terms))
 
 
 @lru_cache(maxsize=64)
 def restart_if_lost(kernels: Kernels) -> Callable:
-    """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count."""
+    """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count the restart."""
     n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
-    places, r_place = memory_places(n, m), number_places(n, m).r
-    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
-    divergences, magnitude = places.divergences, row_magnitude(n, m)
+    layout, r_place = memory_places(n, m), number_places(n, m).r
+    innovation, s_place, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
+    divergences, magnitude = layout.divergences, row_magnitude(n, m)
 
     @inlined
     def restart(memory, numbers, size):

@@ -1,13 +1,16 @@
-"""Estimates that keep bounds on the states, by truncated moments or by projection, of any filter of one Gaussian.
+"""Estimates within bounds on the states, by truncated moments or by projection, for any filter of one Gaussian.
 
-The filter itself goes on with the belief x, P that knows of no bounds; what it tells is constrained:
+The filter itself continues with the unconstrained belief x, P; only the estimates that it returns are constrained:
 
-- truncation: the moments of the normal distribution within the bounds. Where state i, with s^2 = P_ii, has the
-  mean mu and the variance v in units of s: x += P_i mu/s, P += P_i P_i' (v - 1)/s^2. Of several bounded states
-  this is repeated until it settles, each seen without its own bound and with all others (expectation propagation).
-- projection: the x within the bounds whose (x - x_f)' P^-1 (x - x_f) is smallest, x_f the filter's; P stays.
+- truncation: the moments of the normal distribution within the bounds. If the truncated state i, with s^2 = P_ii,
+  has the mean mu and the variance v in units of s: x += P_i mu/s, P += P_i P_i' (v - 1)/s^2. For several bounded
+  states this is repeated until it converges, each time for one state without its own bound and with all other
+  bounds (expectation propagation).
+- projection: the x within the bounds with the smallest (x - x_f)' P^-1 (x - x_f), where x_f is the filter's mean;
+  P is unchanged.
 
-To go on with a constrained belief would count a bound anew in each step: a constant would drift away from it.
+If the filter continued with the constrained belief, a bound would count again in each step: the estimate of a
+constant would drift away from it.
 
 Source: Simon, Simon (2010), "Constrained Kalman filtering via density function truncation for turbofan engine
 health estimation"; Simon (2010), "Kalman filtering with state constraints: a survey"; for several states
@@ -29,21 +32,21 @@ from thruster_env.model.state_bounds import Bound
 
 TRUNCATION, PROJECTION = "truncation", "projection"
 ROUNDS = 10_000  # at most, over all bounds
-ENOUGH, SETTLED = 1e-14, 1e-10  # last moves of projection and of truncation, in standard deviations
-LEAST = 1e-12  # of a variance that a bound leaves
+ENOUGH, SETTLED = 1e-14, 1e-10  # last changes of projection and of truncation, in standard deviations
+LEAST = 1e-12  # fraction of a variance that truncation leaves at least
 
 
 @lru_cache(maxsize=64)
 def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str) -> Kernels:
-    """Kernels of the same filter whose mean and covariance keep bounds.
+    """Kernels of the same filter with mean and covariance within bounds.
 
-    Its own mean (n,) and covariance (n, n) are the last of `Belief.extras`: with these it goes on.
+    Its unconstrained mean (n,) and covariance (n, n) are the last of `Belief.extras`.
     """
-    n, places = kernels.n, memory_places(kernels.n, kernels.m)
-    mean, free = places.mean, places.extras + kernels.extras + kernels.scratch
+    n, layout = kernels.n, memory_places(kernels.n, kernels.m)
+    mean, free = layout.mean, layout.extras + kernels.extras + kernels.scratch
     size = n + n * n  # mean and covariance are neighbours
     plain_start, plain_predict, plain_update = kernels.start, kernels.predict, kernels.update
-    constrain = _constraint(n, mean, places.cov, bounds, bounded_by)
+    constrain = _constraint(n, mean, layout.cov, bounds, bounded_by)
 
     @inlined
     def tell(row):
@@ -73,14 +76,14 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
         plain_update(memory, z, numbers, size)
         tell(memory[0])
 
-    kept = kernels.extras + kernels.scratch + size
-    return kernels._replace(start=start, predict=predict, update=update, extras=kept, scratch=0, vectors=())
+    extras = kernels.extras + kernels.scratch + size
+    return kernels._replace(start=start, predict=predict, update=update, extras=extras, scratch=0, vectors=())
 
 
 def constrained(
     means: np.ndarray, covs: np.ndarray, bounds: tuple[Bound, ...], bounded_by: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Means (..., n) and covariances (..., n, n) within bounds, of Gaussians that know of none."""
+    """Means (..., n) and covariances (..., n, n) within bounds, from those of unconstrained Gaussians."""
     n = means.shape[-1]
     rows = np.concatenate([means.reshape(-1, n), covs.reshape(-1, n * n)], axis=1)
     _constrain_rows(n, bounds, bounded_by, is_interpreting())(rows)
@@ -101,17 +104,17 @@ def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpre
 
 
 def _constraint(n: int, mean: int, cov: int, bounds: tuple[Bound, ...], bounded_by: str) -> Callable:
-    """The function that constrains the mean and the covariance in a row at these places."""
+    """The function that constrains the mean and the covariance at these offsets of a row."""
     return (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, cov, bounds)
 
 
 def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
-    states = tuple(one.place for one in bounds)
-    low, high = tuple(one.low for one in bounds), tuple(one.high for one in bounds)
+    states = tuple(bound.place for bound in bounds)
+    low, high = tuple(bound.low for bound in bounds), tuple(bound.high for bound in bounds)
 
     @inlined
     def constrain(row):
-        # A state's bounds are a Gaussian factor: a precision and an information. Without it there is the cavity.
+        # A state's bounds act as a Gaussian factor: a precision and an information. The cavity is without it.
         column, precisions, informations = np.zeros(n), np.zeros(len(states)), np.zeros(len(states))
         for _ in range(ROUNDS if len(states) > 1 else 1):
             largest = 0.0
@@ -121,8 +124,8 @@ def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Calla
                 precision = 1.0 / p - precisions[b] if p > 0.0 else 0.0
                 if precision > 0.0:
                     s, cavity = precision**-0.5, (x / p - informations[b]) / precision
-                    moved, variance = truncated_normal((low[b] - cavity) / s, (high[b] - cavity) / s)
-                    new_x, new_p = cavity + s * moved, max(s * s * variance, LEAST * p)
+                    shift, variance = truncated_normal((low[b] - cavity) / s, (high[b] - cavity) / s)
+                    new_x, new_p = cavity + s * shift, max(s * s * variance, LEAST * p)
                     for j in range(n):
                         column[j] = row[cov + j * n + i] / p
                     for j in range(n):
@@ -141,8 +144,8 @@ def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Calla
 
 
 def _projection(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
-    states = tuple(one.place for one in bounds)
-    low, high = tuple(one.low for one in bounds), tuple(one.high for one in bounds)
+    states = tuple(bound.place for bound in bounds)
+    low, high = tuple(bound.low for bound in bounds), tuple(bound.high for bound in bounds)
 
     @inlined
     def constrain(row):

@@ -1,7 +1,7 @@
 """From kernels to compiled steps and trajectories, one belief at a time or eight side by side.
 
-The memory of eight beliefs lies together, number i of all of them in one line: `rows[group, 8 i + j]`. Each stage
-of a step goes over four such groups, whose instructions the processor works on at the same time.
+The memory of eight beliefs is interleaved: number i of belief j is `rows[group, 8 i + j]`. Each stage of a step
+runs over four such groups, whose instructions the processor overlaps.
 """
 
 from __future__ import annotations
@@ -17,25 +17,22 @@ from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, i
 from thruster_env.core.streams import GROUP
 from thruster_env.model.shape import LANES, number_places, padded
 
-# Batches of filters from pages: runs side by side in vectors, a program's instruction for eight of them.
-
-
-GROUPS = 4  # worked on one after the other in each stage: their instructions overlap
+GROUPS = 4  # which each stage runs one after the other, so that their instructions overlap
 
 
 def build_side_by_side(kernels: Kernels) -> Callable:
     """Return `run(keys, inputs, measurements, numbers, noise, out, first, last)`.
 
-    It filters runs first ... last - 1, by `kernels.vectors`. Empty places of a group are filled with copies of the
-    last run. For the rest see `filters.engine.compile.batch`.
+    It filters runs first ... last - 1 by `kernels.vectors`. Copies of the last run fill up a group. For the
+    arguments see `batch`.
     """
     n, m, start = kernels.n, kernels.m, kernels.start
     begin, advance, finish, update = kernels.vectors
-    places, source, width, groups = memory_places(n, m), number_places(n, m), LANES, GROUPS
-    mean, cov, innovation, s = places.mean, places.cov, places.innovation, places.innovation_cov
-    divergences, log_likelihood, substeps = places.divergences, places.log_likelihood, source.substeps
-    q_place, r_place, checked = source.q, source.r, places.gain
-    length, restart = places.extras + kernels.extras + kernels.scratch, restart_if_lost(kernels)
+    layout, source, width, groups = memory_places(n, m), number_places(n, m), LANES, GROUPS
+    mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
+    divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
+    q_place, r_place, checked = source.q, source.r, layout.gain
+    length, restart = layout.extras + kernels.extras + kernels.scratch, restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, begin, advance, finish, update, within=__name__)
 
     @narrow
@@ -43,19 +40,19 @@ def build_side_by_side(kernels: Kernels) -> Callable:
         fingerprint  # noqa: B018 - part of the cache's key
         qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
-        numbers = given_numbers.copy()  # its own: noise of one step is written into it
-        one, memory = np.zeros(length), (np.zeros((0, 0)), np.zeros(0))
+        numbers = given_numbers.copy()  # because the noise of each step is written into it
+        belief, memory = np.zeros(length), (np.zeros((0, 0)), np.zeros(0))
         rows, zs = np.zeros((groups, length * width)), np.zeros((groups, m * width))
         us = np.zeros((groups, inputs.shape[2] * width))
         for b in range(first, last, groups * width):
             count = min(groups * width, last - b)
             used = (count + width - 1) // width
-            one[:] = 0.0
-            start((one, *memory), numbers, 0)
+            belief[:] = 0.0
+            start((belief, *memory), numbers, 0)
             for g in range(used):
                 for i in range(length):
                     for j in range(width):
-                        rows[g, i * width + j] = one[i]
+                        rows[g, i * width + j] = belief[i]
             for k in range(measurements.shape[1]):
                 if k > 0:
                     for g in range(used):
@@ -92,10 +89,10 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                     for g in range(used):
                         for j in range(width):
                             for i in range(length):
-                                one[i] = rows[g, i * width + j]
-                            restart((one, *memory), numbers, 0)
+                                belief[i] = rows[g, i * width + j]
+                            restart((belief, *memory), numbers, 0)
                             for i in range(length):
-                                rows[g, i * width + j] = one[i]
+                                rows[g, i * width + j] = belief[i]
                 for j in range(count):
                     g, at = j // width, j % width
                     for i in range(n):
@@ -113,29 +110,26 @@ def build_side_by_side(kernels: Kernels) -> Callable:
     return run
 
 
-# From kernels to compiled code: steps of one belief, or whole trajectories of many.
-
-
-START, PREDICT, UPDATE = 1, 2, 4  # what an operation does, to be added
-REFUSED = -1  # what it returns of an input that is not finite, or an infinite measurement: it has done nothing
+START, PREDICT, UPDATE = 1, 2, 4  # tasks of an operation; a sum is several
+REFUSED = -1  # the result for an input that is not finite or an infinite measurement, which changes nothing
 
 
 def build_operation(kernels: Kernels) -> Callable:
-    """`operation`, not yet compiled."""
+    """`operation` as a Python function."""
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
-    places, m = memory_places(kernels.n, kernels.m), kernels.m
-    step, divergences = places.step, places.divergences
+    layout, m = memory_places(kernels.n, kernels.m), kernels.m
+    step, divergences = layout.step, layout.divergences
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
-    def operate(row, table, draws, size, given, numbers, task):
+    def operate(row, table, draws, size, values, numbers, task):
         fingerprint  # noqa: B018 - part of the cache's key
-        memory, inputs = (row, table, draws), given.shape[0] - m
-        for i in range(given.shape[0]):
+        memory, inputs = (row, table, draws), values.shape[0] - m
+        for i in range(values.shape[0]):
             if i < inputs:
-                wrong = task & PREDICT and not abs(given[i]) < inf
+                wrong = task & PREDICT and not abs(values[i]) < inf
             else:
-                wrong = task & UPDATE and abs(given[i]) == inf
+                wrong = task & UPDATE and abs(values[i]) == inf
             if wrong:
                 return REFUSED
         if task & START:
@@ -143,9 +137,9 @@ def build_operation(kernels: Kernels) -> Callable:
             row[divergences] = 0.0
             start(memory, numbers, size)
         if task & PREDICT:
-            predict(memory, given[:inputs], numbers, size)
+            predict(memory, values[:inputs], numbers, size)
         if task & UPDATE:
-            update(memory, given[inputs:], numbers, size)
+            update(memory, values[inputs:], numbers, size)
             restart(memory, numbers, size)
         else:
             summarise(memory, size)
@@ -156,10 +150,10 @@ def build_operation(kernels: Kernels) -> Callable:
 
 def _build_batch(kernels: Kernels) -> Callable:
     n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
-    places = memory_places(n, m)
-    mean, cov, innovation, s = places.mean, places.cov, places.innovation, places.innovation_cov
-    key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
-    log_likelihood = places.log_likelihood
+    layout = memory_places(n, m)
+    mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
+    key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
+    log_likelihood = layout.log_likelihood
     q_place, r_place = number_places(n, m).q, number_places(n, m).r
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
@@ -207,9 +201,9 @@ def _build_batch(kernels: Kernels) -> Callable:
 
 
 def operation(kernels: Kernels) -> CompiledOrPython:
-    """`operate(*memory, size, given, numbers, task)` on one belief; it returns its number of restarts, or REFUSED.
+    """`operate(*memory, size, values, numbers, task)` on one belief; returns its number of restarts, or REFUSED.
 
-    given = (u, z) in one array, because each further array costs some 80 ns a call; task is a sum of START,
+    values = (u, z) in one array, because each further array costs some 80 ns a call; task is a sum of START,
     PREDICT and UPDATE.
     """
     return _runner(build_operation, kernels, is_interpreting())
@@ -218,14 +212,14 @@ def operation(kernels: Kernels) -> CompiledOrPython:
 def batch(kernels: Kernels) -> CompiledOrPython:
     """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
 
-    noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement that stand
-    in for the model's, or no rows. Those are written into numbers, which threads must thus not share.
+    noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement, in place
+    of the model's, or no rows. They are written into `numbers`, so threads must not share these.
     """
     return _runner(_build_batch, kernels, is_interpreting())
 
 
 def vectors(kernels: Kernels) -> CompiledOrPython:
-    """The same for kernels that have vectors, of eight trajectories at a time."""
+    """`batch` for kernels that have vectors, of eight trajectories at a time."""
     return _runner(build_side_by_side, kernels, is_interpreting())
 
 

@@ -27,9 +27,6 @@ from thruster_env.logs.steps import sample_time_place
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import number_places, with_root
 
-# Sessions: a filter that runs in place on one belief, for wrappers and for the filter's pure functions.
-
-
 if TYPE_CHECKING:
     from filters.filter import Filter
 
@@ -52,10 +49,10 @@ class Running(Protocol):
     divergences: int
 
     def start(self, key, z) -> None:
-        """Begin with a random key (2,) and a first measurement z (m,)."""
+        """Start with a random key (2,) and a first measurement z (m,)."""
 
     def step(self, u, z) -> None:
-        """One step later, after input u (p,) and measurement z (m,); NaN marks a missing channel."""
+        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
 
 
 class Session:
@@ -71,14 +68,14 @@ class Session:
         self._filter = filter_
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
-        places = memory_places(n, m)
+        layout = memory_places(n, m)
         self._name, self._kernels = filter_.name, kernels
         self._operate: Callable = operation(kernels)
-        self._numbers, self._size, self._places = filter_.numbers, size, places
+        self._numbers, self._size, self._places = filter_.numbers, size, layout
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
-        self._extras = self._row[places.extras : places.extras + kernels.extras]
+        self._extras = self._row[layout.extras : layout.extras + kernels.extras]
         values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
         self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
         self._p, self._m = model.inputs, m
@@ -86,13 +83,13 @@ class Session:
         self._prior_variances = model.prior_cov.diagonal()
         self._first_values, self._is_direct = values.copy(), False
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
-        self.source: tuple = ()  # what the numbers follow from, where the session is kept
+        self.source: tuple = ()  # the origin of the numbers, for sessions that are kept
         self.divergences = 0
         self._given = (*self._memory, size, values, self._numbers)
-        self.mean = self._row[places.mean : places.mean + n]
-        self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
-        self.innovation = self._row[places.innovation : places.innovation + m]
-        self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
+        self.mean = self._row[layout.mean : layout.mean + n]
+        self.cov = self._row[layout.cov : layout.cov + n * n].reshape(n, n)
+        self.innovation = self._row[layout.innovation : layout.innovation + m]
+        self.innovation_cov = self._row[layout.innovation_cov : layout.innovation_cov + m * m].reshape(m, m)
 
     def __getstate__(self) -> tuple:
         """The filter and its memory; machine code and views are rebuilt from these."""
@@ -107,8 +104,8 @@ class Session:
     def _go_on(self, divergences: int, arrays: tuple) -> None:
         if not np.array_equal(self._numbers, arrays[-1]):
             self._remember_noise()
-        for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
-            own[...] = kept
+        for array, stored in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
+            array[...] = stored
         self.divergences = divergences
         self._call_directly()
 
@@ -121,11 +118,11 @@ class Session:
 
     @property
     def numbers(self) -> np.ndarray:
-        """What the kernels read now, with all that was set: a view, laid out as `Filter.numbers`."""
+        """The numbers that the kernels read, with all that was set: a view, laid out as `Filter.numbers`."""
         return self._numbers
 
     def clear(self) -> None:
-        """Make the memory as it was when it was new."""
+        """Reset the memory to that of a new session."""
         for part in self._memory:
             part.fill(0.0)
         self._values[:] = self._first_values
@@ -139,9 +136,9 @@ class Session:
         self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
 
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
-        """Use another Q or R from here on: what a filter of a model with these would do with the belief.
+        """Use another Q or R from now on, as a filter of a model with these would.
 
-        Raises ValueError for a matrix that is no covariance, and for what the filter cannot take:
+        Raises ValueError for a matrix that is no covariance, and for one that the filter cannot change:
         `Filter.fixed_noise`.
         """
         self._filter.check_noise(process_noise_cov, measurement_noise_cov)
@@ -155,52 +152,53 @@ class Session:
             self._numbers[at.r : at.r + 2 * m * m] = with_root(r)
 
     def set_dt(self, dt: float) -> None:
-        """Use another sample time from here on, for a model that has a constant named "dt", or "substep", a part.
+        """Use another sample time from now on; the model needs a constant named "dt", or "substep", a part of dt.
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
         Raises ValueError for a model without such a constant, a filter of several models or of an affine
         approximation, or another number.
         """
-        place, parts = self._dt_place
-        self._numbers[place] = positive("dt", dt) / parts
+        index, parts = self._dt_place
+        self._numbers[index] = positive("dt", dt) / parts
 
     @property
     def sample_time(self) -> float:
-        """That of the model [s]; ValueError for one without a constant that says it."""
-        place, parts = self._dt_place
-        return float(self._filter.numbers[place]) * parts
+        """The sample time [s]; ValueError for a model without a constant for it."""
+        index, parts = self._dt_place
+        return float(self._filter.numbers[index]) * parts
 
     @cached_property
     def _dt_place(self) -> tuple[int, int]:
-        """Where the constant lies, and how many of it are a step."""
+        """Index of the constant among the numbers, and how many substeps a step has."""
         self._check_one_model("set_dt")
         model = self._filter.model
-        place, parts = sample_time_place(model, "set_dt")
+        index, parts = sample_time_place(model, "set_dt")
         if self._filter.kernel_model.constants is not model.constants:  # A and B, which are those of one dt
             raise ValueError(
                 f"set_dt needs a filter that evaluates f(x, u) at each step, but {self._name!r} has the A and B "
                 "of one dt: 'ekf' is the Kalman filter at any dt where f and h are affine"
             )
-        return self._noise_places.constants + place, parts
+        return self._noise_places.constants + index, parts
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Use another value of one of the filter's numbers from here on; ValueError for one that it lacks."""
-        place, names = own_place(self._filter.kernel_model.shape), []
+        """Use another value of one of the filter's parameters from now on; ValueError for one that it lacks."""
+        offset, names = own_place(self._filter.kernel_model.shape), []
         page = getattr(self._filter, "written_page", None)
         for known, shape in () if page is None else page.own:
             if known == name and not shape:
                 self._remember_noise()
-                self._numbers[place] = finite(name, value)
+                self._numbers[offset] = finite(name, value)
                 return
             names.append(known)
-            place += prod(shape)
+            offset += prod(shape)
         raise ValueError(f"a number of {self._name!r} must be one of {', '.join(names)}, but got {name!r}")
 
     def scale_process_noise(self, factor: float) -> None:
-        """Use Q of the model times a factor above zero from here on.
+        """Use Q of the model times a factor above zero from now on.
 
-        Raises ValueError for a filter of several models, or of one Q if the factor is not 1 to rounding.
+        Raises ValueError for a filter of several models, and if the filter cannot change Q, unless the factor is 1
+        to rounding.
         """
         self._check_one_model("scale_process_noise")
         if "Q" in self._filter.fixed_noise and same_dt(factor, 1.0):
@@ -217,7 +215,7 @@ class Session:
             raise ValueError(f"{name} needs a filter with one model, but got {self._name!r}")
 
     def _remember_noise(self) -> None:
-        """Keep the first numbers, with which `clear` begins again."""
+        """Keep the first numbers, which `clear` restores."""
         if self._noise_was is None:
             self._noise_was = self._numbers.copy()
 
@@ -242,8 +240,8 @@ class Session:
 
         Raises ValueError, before anything changes, for an input that is not finite and an infinite measurement.
         """
-        try:  # what `_set` does, whose call would take a tenth of the step
-            if type(z) is MaskedArray or type(u) is MaskedArray:  # whose numbers behind the mask are none
+        try:  # inlined `_set`: its call would take a tenth of the step
+            if type(z) is MaskedArray or type(u) is MaskedArray:  # masked numbers are not valid
                 raise TypeError
             if len(z) != self._m or self._p and len(u) != self._p:  # NumPy would repeat a single number
                 raise TypeError
@@ -251,19 +249,19 @@ class Session:
                 self._values[0], self._values[1] = u[0], z[0]
             else:
                 self._u[:], self._z[:] = u, z
-        except (TypeError, ValueError, LookupError):  # they are not looked at before: a step has to be quick
+        except (TypeError, ValueError, LookupError):  # `_set` checks only if this fails: a step has to be quick
             self._set(u, z)
-        found = self._operate(*self._given, STEP)
-        if found == REFUSED:
-            self._set(u, z)  # which says why
-        self.divergences = found
+        divergences = self._operate(*self._given, STEP)
+        if divergences == REFUSED:
+            self._set(u, z)  # raises ValueError with the reason
+        self.divergences = divergences
 
     def _set(self, u, z) -> None:
         self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
 
     def run(self, operation: str, u=None, z=None, count: int = 1) -> None:
-        """Do one of "start", "predict" or "update" alone, arguments checked; a prediction `count` times."""
+        """Do only "start", "predict" or "update", with checked arguments; repeat a prediction `count` times."""
         if operation == "predict":
             self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         if operation == "update":
@@ -274,7 +272,7 @@ class Session:
                 self._call_directly()
 
     def load(self, belief: Belief) -> None:
-        """Put a belief into the memory; ValueError for one of another model or kind of filter, or none at all."""
+        """Put a belief into the memory; ValueError if it does not fit the filter or is no belief."""
         shapes = {
             "mean": self.mean.shape,
             "cov": self.cov.shape,
@@ -282,15 +280,15 @@ class Session:
             "extras": self._extras.shape,
         }
         for name, shape in shapes.items():
-            given = getattr(belief, name)
-            given = given.shape if type(given) is np.ndarray else np.shape(given)
-            if given != shape:
+            part = getattr(belief, name)
+            part_shape = part.shape if type(part) is np.ndarray else np.shape(part)
+            if part_shape != shape:
                 whose = f"a belief that the filter {self._name!r} can take"
-                raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
+                raise ValueError(f"{name} of {whose} must have shape {shape}, but got {part_shape}")
         check_belief(belief, self._prior_variances)
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
-            self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member
+            self._table[: self._kept_rows] = belief.members[:, :1]  # the padding is copies of a member
             self._table[: self._kept_rows, : self._size] = belief.members
         self._extras[:] = belief.extras
         self.set_key(belief.key)
@@ -299,12 +297,12 @@ class Session:
 
     def belief(self) -> Belief:
         """A copy of the belief in the memory."""
-        row, places = self._row, self._places
-        key = int(row[places.key_0]), int(row[places.key_1])
+        row, layout = self._row, self._places
+        key = int(row[layout.key_0]), int(row[layout.key_1])
         members = self._table[: self._kept_rows, : self._size].copy()
-        step, extras = int(row[places.step]), self._extras.copy()
-        # Compared with the sum: it is NaN or infinite where one of the numbers is.
-        total = np.add.reduce(np.abs(row[: places.key_0]))
+        step, extras = int(row[layout.step]), self._extras.copy()
+        # The sum is NaN or infinite if one of the numbers is.
+        total = np.add.reduce(np.abs(row[: layout.key_0]))
         if self._size:
             total += np.abs(members[: len(self.mean)]).sum()
         kind = Belief if total < np.inf else LostBelief
@@ -318,13 +316,6 @@ class Session:
         """A copy of the last update's innovation."""
         log_likelihood = float(self._row[self._places.log_likelihood])
         return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
-
-
-# Sessions that leave out measurements too far from what the filter expects.
-
-
-if TYPE_CHECKING:
-    from filters.filter import Filter
 
 
 class GatedSession(Session):
@@ -349,13 +340,13 @@ class GatedSession(Session):
         """Predict with input u (p,), then update with the channels of z (m,) that are within the gate."""
         self._set(u, z)
         self.divergences = self._operate(*self._given, PREDICT)
-        for kept, part in zip(self._kept, self._memory, strict=True):
-            kept[...] = part
+        for saved, part in zip(self._kept, self._memory, strict=True):
+            saved[...] = part
         self.divergences = self._operate(*self._given, UPDATE)
         far = np.abs(self.innovation) > self.gate * np.sqrt(self.innovation_cov.diagonal())
         if far.any():
-            for kept, part in zip(self._kept, self._memory, strict=True):
-                part[...] = kept
+            for saved, part in zip(self._kept, self._memory, strict=True):
+                part[...] = saved
             self._z[far] = np.nan
             self.rejected += far
             self.divergences = self._operate(*self._given, UPDATE)
