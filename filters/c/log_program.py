@@ -133,8 +133,10 @@ def log_program(
     """
     model, key = programs.model, "".join(f", {int(word)}" for word in filter_keys([0])[0])
     pairs = [(model.states, ("", "std")), (model.measurements, ("innovation", "innovation_std"))]
-    titles = [header_of(what, one) for some, kinds in pairs for one in some for what in kinds]
-    titles += [header_of("alarm", one._replace(unit="")) for one in model.measurements if tested]
+    titles = [
+        header_of(what, quantity) for quantities, kinds in pairs for quantity in quantities for what in kinds
+    ]
+    titles += [header_of("alarm", quantity._replace(unit="")) for quantity in model.measurements if tested]
     words = {
         "ABOUT": ABOUT * tested,
         "BEGIN": BEGIN * tested,
@@ -152,24 +154,24 @@ def log_program(
         "INPUTS": str(model.inputs),
         "CHANNELS": str(model.m),
         "STATES": str(model.n),
-        "TITLES": _text("".join(f",{one}" for one in titles)).replace("%", "%%"),
+        "TITLES": _text("".join(f",{title}" for title in titles)).replace("%", "%%"),
         "LAST": ", last" * (model.inputs > 0),
     }
-    found = MAIN
+    source = MAIN
     for word, text in words.items():
-        found = found.replace(f"@{word}@", text)
-    return found
+        source = source.replace(f"@{word}@", text)
+    return source
 
 
 def _tables(quantities: tuple[Quantity, ...]) -> str:
     """The constants of the reader: headers, names and symbols of columns, and the units that it converts."""
     headers: dict[str, None] = {}
     names: list[str] = []
-    for one in quantities:
-        headers[write.header_of(one, headers)] = None
-        name = plain(one.name).lower()
+    for quantity in quantities:
+        headers[write.header_of(quantity, headers)] = None
+        name = plain(quantity.name).lower()
         names.append("" if name in names else name)  # of two quantities of one name the second has its symbol
-    units = [*(one.unit for one in quantities), "s"]
+    units = [*(quantity.unit for quantity in quantities), "s"]
     rates = [
         f"{over}/{under}{power}" for over in WORDS for under in ("s", "min", "h") for power in ("", "^2", "^3")
     ]
@@ -181,12 +183,12 @@ def _tables(quantities: tuple[Quantity, ...]) -> str:
                 rows.append(
                     f'    {{{units.index(wanted)}, "{_text(unit)}", {known[0]!r}, {known[1]!r}, {known[2]!r}}},'
                 )
-    firsts = ", ".join(str(units.index(one)) for one in units)
+    firsts = ", ".join(str(units.index(unit)) for unit in units)
     return "\n".join(
         [
             _array("headers[COLUMNS]", headers),
             _array("names[COLUMNS]", names),
-            _array("symbols[COLUMNS]", [plain(one.symbol) for one in quantities]),
+            _array("symbols[COLUMNS]", [plain(quantity.symbol) for quantity in quantities]),
             _array("time_names[]", [*TIME_NAMES, ""]),
             _array("date_names[]", [*DATE_NAMES, ""]),
             _array("known_units[]", [*WORDS, ""]),
@@ -207,8 +209,8 @@ def _tables(quantities: tuple[Quantity, ...]) -> str:
 def _array(name: str, texts: Iterable[str]) -> str:
     """An array of texts, some to a line."""
     lines, line = list[str](), "   "
-    for one in texts:
-        word = f' "{_text(one)}",'
+    for entry in texts:
+        word = f' "{_text(entry)}",'
         if len(line) + len(word) > 110:
             lines, line = [*lines, line], "   "
         line += word

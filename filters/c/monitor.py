@@ -187,8 +187,8 @@ class TestsWriter:
             "sqrt": "sqrt" + "f" * single,
             "abs": "fabs" + "f" * single,
             **{key: str(int(value)) for key, value in counts.items()},
-            "of_outliers": ", ".join(literal(one, single) for one in of_outliers),
-            "tests": ", ".join(f"{one} = {1 << k}" for k, one in enumerate(tests.values())),
+            "of_outliers": ", ".join(literal(limit, single) for limit in of_outliers),
+            "tests": ", ".join(f"{test} = {1 << k}" for k, test in enumerate(tests.values())),
         }
         self._places = "enum {{ {} }};\n\n".format(", ".join(test.upper() for test in TESTS))
 
@@ -216,7 +216,7 @@ class TestsWriter:
     def readme(self) -> str:
         """A section of the README."""
         monitor, (cusum, glr, low, high, of_outliers) = self._monitor, self._numbers
-        squares = ", ".join(f"{one:.4g}" for one in of_outliers)
+        squares = ", ".join(f"{limit:.4g}" for limit in of_outliers)
         counts = "of 1, 2, ... channels " * (len(of_outliers) > 1)
         at = {
             "outlier": f"v' S^-1 v {counts}of {squares}",

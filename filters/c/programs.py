@@ -98,7 +98,7 @@ def is_macro(text: str) -> bool:
 
 
 def is_taken(name: str, texts: Iterable[str]) -> bool:
-    """Whether a filter cannot have a name: libraries of C declare it, as do types that end in _t, or its files do.
+    """Whether a name is taken: declared by C libraries or the filter's own files, or ending in _t as types do.
 
     Args:
         name: of letters, digits and _.
@@ -107,7 +107,7 @@ def is_taken(name: str, texts: Iterable[str]) -> bool:
     if name in OF_LIBRARIES or name in HEADERS or name == "board" or name.endswith("_t") or is_macro(name):
         return True
     used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _without_comments(text))}
-    return not used.isdisjoint([name, *(one.format(name) for one in FUNCTIONS)])
+    return not used.isdisjoint([name, *(pattern.format(name) for pattern in FUNCTIONS)])
 
 
 def _without_comments(text: str) -> str:
@@ -134,21 +134,21 @@ class Scalar(Place):
 
 
 class FilterPrograms(NamedTuple):
-    """What the functions of a filter do, as programs whose places are expressions of C.
+    """The functions of a filter as programs whose places are expressions of C.
 
     Attributes:
-        start: what the filter keeps besides mean and covariance, at the prior; of an ensemble the members.
-        begin: X, which is predicted in place of them: points, one behind the other, or a mean and a root.
-        advance: a substep of the belief or of X under u; of points that of one, x; of an ensemble all members.
+        start: the filter's extras at the prior; of an ensemble the members.
+        begin: X, which is predicted in place of mean and covariance: points in a row, or a mean and a root.
+        advance: a substep under u of the belief or of X; of one point, x; of all members of an ensemble.
         settle: the belief at the end of a step.
-        update: the belief after z, the innovation, and what is told of it.
+        update: the belief after z, the innovation, its covariance and its log-likelihood.
         summarise: mean and covariance of an ensemble.
-        kept: the shapes of what the filter keeps, by name.
+        kept: shapes of the extras that the filter keeps, by name.
         flying: how many numbers X has.
-        points: how many there are, if X are points that are moved one by one; else 0.
-        members: how many an ensemble has; else 0.
-        model: that the filter runs on.
-        page: the module in which the filter's equations stand.
+        points: how many points X has, if they are propagated one by one; else 0.
+        members: how many members an ensemble has; else 0.
+        model: the filter's model.
+        page: the module of the filter's equations.
     """
 
     start: Program
@@ -171,12 +171,12 @@ class FilterPrograms(NamedTuple):
 
     @property
     def operations(self) -> tuple[int, int]:
-        """How many operations a prediction and an update are, without those of random numbers."""
-        begin, advance, settle, update, summarise = (
-            sum(self.members if one.member else 1 for one in program.works) for program in self[1:6]
+        """Numbers of operations of a prediction and of an update, without those of random numbers."""
+        begin, advance, add_noise, update, summarise = (
+            sum(self.members if number.member else 1 for number in program.works) for program in self[1:6]
         )
         substeps = self.model.substeps * max(self.points, 1)
-        return begin + substeps * advance + settle + summarise, update
+        return begin + substeps * advance + add_noise + summarise, update
 
 
 def programs_of(filter_: Filter) -> FilterPrograms:
@@ -200,29 +200,29 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     """The programs of a filter of mean and covariance."""
     model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
     shape = model.shape
-    places, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
+    layout, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
-    stages = [one.of_rows for one in stages_of(page, memory, equations)]
-    kept = {name: one.shape for name, one in memory.kept.items()}
-    if wrong := [name for name in kept if name in TOLD or not is_name(name) or is_macro(name)]:
+    stages = [stage.of_rows for stage in stages_of(page, memory, equations)]
+    extras = {name: matrix.shape for name, matrix in memory.kept.items()}
+    if wrong := [name for name in extras if name in TOLD or not is_name(name) or is_macro(name)]:
         raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
-    flying = memory.end - places.extras - sum(prod(size) for size in kept.values())
-    points = _points_of(stages[2], equations, memory, flying)
+    point_count = memory.end - layout.extras - sum(prod(size) for size in extras.values())
+    points = _points_of(stages[2], equations, memory, point_count)
     if points:
-        stages[2] = {places.mean: equations.f(memory.x, memory.u)}
-    stages[4][NIS] = _nis(stages[4][places.innovation], stages[4][places.innovation_cov])
-    others = [
-        *((one.operation.at, one.shape, f"filter->{name}") for name, one in memory.kept.items()),
-        (memory.end - flying, (flying,), "X"),
+        stages[2] = {layout.mean: equations.f(memory.x, memory.u)}
+    stages[4][NIS] = _nis(stages[4][layout.innovation], stages[4][layout.innovation_cov])
+    extra_parts = [
+        *((matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.kept.items()),
+        (memory.end - point_count, (point_count,), "X"),
     ]
     means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
-    start, begin, advance, settle, update = (
-        _program({Place("rows", at): one for at, one in stage.items()}, lies, numbers, Graph(MOST))
-        for stage, mean, given in zip(stages, means, "uuuuz", strict=True)
-        for lies in [_where(shape, mean, given, others, points)]
+    start, begin, advance, add_noise, update = (
+        _program({Place("rows", at): matrix for at, matrix in stage.items()}, lies, numbers, Graph(MOST))
+        for stage, mean, argument in zip(stages, means, "uuuuz", strict=True)
+        for lies in [_where(shape, mean, argument, extra_parts, points)]
     )
-    programs = start, begin, advance, settle, update, Program([], [], [])
-    return FilterPrograms(*programs, kept, flying, points, 0, model, page.update.__module__)
+    programs = start, begin, advance, add_noise, update, Program([], [], [])
+    return FilterPrograms(*programs, extras, point_count, points, 0, model, page.update.__module__)
 
 
 def _of_members(paged: EnsembleFilter) -> FilterPrograms:
@@ -231,30 +231,38 @@ def _of_members(paged: EnsembleFilter) -> FilterPrograms:
     model, page, numbers, size = paged.kernel_model, paged.written_page, paged.numbers, paged.size
     shape, memory = model.shape, MembersMemory(model.shape, page)
     stages = stages_of_members(page, memory, Equations(model.functions, memory, constants_move=False, trace=True))
-    told = {place: one for name in stages for place, one in stages[name].stores[0]}
-    places = memory_places(shape.n, shape.m)
-    v, s = (told[Place("rows", at)] for at in (places.innovation, places.innovation_cov))
+    outputs = {target: matrix for name in stages for target, matrix in stages[name].stores[0]}
+    layout = memory_places(shape.n, shape.m)
+    v, s = (outputs[Place("rows", at)] for at in (layout.innovation, layout.innovation_cov))
     stages["update"].values[Place("rows", NIS)] = _nis(v, s)
-    kept = {name: one.shape for name, one in memory.kept.items()}
-    others = [(one.operation.at, one.shape, f"filter->{name}") for name, one in memory.kept.items()]
+    extras = {name: matrix.shape for name, matrix in memory.kept.items()}
+    extra_parts = [(matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.kept.items()]
     begin = Program([], [], [])
-    start, advance, settle, update, summarise = (
+    start, advance, add_noise, update, summarise = (
         _program(dict(stages[name].stores[0]), lies, numbers, Graph(MOST, size))
-        for name, given in (("start", "u"), ("advance", "u"), ("settle", "u"), ("update", "z"), ("summarise", "z"))
-        for lies in [_where(shape, "filter->x", given, others)]
+        for name, argument in (
+            ("start", "u"),
+            ("advance", "u"),
+            ("settle", "u"),
+            ("update", "z"),
+            ("summarise", "z"),
+        )
+        for lies in [_where(shape, "filter->x", argument, extra_parts)]
     )
-    programs = start, begin, advance, settle, update, summarise
-    return FilterPrograms(*programs, kept, 0, 0, size, model, type(paged).page.update.__module__)
+    programs = start, begin, advance, add_noise, update, summarise
+    return FilterPrograms(*programs, extras, 0, 0, size, model, type(paged).page.update.__module__)
 
 
 def _nis(v: Matrix, s: Matrix) -> Matrix:
     return dot(v, quotient(v, factor(s)))
 
 
-def _check_traced(name: str, function: Callable, jacobian: Callable | None, others: int, shape: Shape) -> None:
-    """Raise ValueError that names a function which does not take numbers that are not known yet."""
+def _check_traced(
+    name: str, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape
+) -> None:
+    """Raise ValueError that names the function if it cannot be traced."""
     try:
-        Traced(function, jacobian, others, shape)
+        Traced(function, jacobian, further_arguments, shape)
     except TooLarge:
         raise
     except Exception as error:  # whatever a user's function raises
@@ -264,37 +272,41 @@ def _check_traced(name: str, function: Callable, jacobian: Callable | None, othe
         ) from error
 
 
-def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowMemory, flying: int) -> int:
-    """How many points a substep moves, each by f alone; 0 where it does something else."""
-    (at, moved), *others = advance.items()
-    if flying == 0 or others or not moved.of or moved.of[0].operation != Place("rows", at):
+def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowMemory, point_count: int) -> int:
+    """How many points a substep propagates by f alone; 0 if it has other operations."""
+    (at, propagated), *rest = advance.items()
+    if point_count == 0 or rest or not propagated.of or propagated.of[0].operation != Place("rows", at):
         return 0
-    return moved.shape[1] if moved is equations.f(moved.of[0], memory.u) else 0
+    return propagated.shape[1] if propagated is equations.f(propagated.of[0], memory.u) else 0
 
 
 def _where(
-    shape: Shape, mean: str, given: str, others: Sequence[tuple[int, tuple[int, ...], str]], points: int = 0
+    shape: Shape,
+    mean: str,
+    argument: str,
+    extra_parts: Sequence[tuple[int, tuple[int, ...], str]],
+    points: int = 0,
 ) -> Callable[[Place], Place]:
-    """Where a place lies in C: in the filter, in X, or in what is given, u or z."""
+    """The function from a place to its expression in C: in the filter, in X, or in the argument u or z."""
     n, m = shape.n, shape.m
-    places = memory_places(n, m)
+    layout = memory_places(n, m)
     parts = [
         (NIS, (), "filter->nis"),
-        (places.mean, (n,), mean),
-        (places.cov, (n, n), "filter->P"),
-        (places.innovation, (m,), "filter->innovation"),
-        (places.innovation_cov, (m, m), "filter->S"),
-        (places.log_likelihood, (), "filter->log_likelihood"),
-        *others,
+        (layout.mean, (n,), mean),
+        (layout.cov, (n, n), "filter->P"),
+        (layout.innovation, (m,), "filter->innovation"),
+        (layout.innovation_cov, (m, m), "filter->S"),
+        (layout.log_likelihood, (), "filter->log_likelihood"),
+        *extra_parts,
     ]
 
-    def lies(place: Place) -> Place:
-        if place.array == "given":
-            return Place(given, place.at)
-        if place.array in BY_MEMBERS:
-            return place
-        first, size, name = next(one for one in parts if 0 <= place.at - one[0] < prod(one[1]))
-        at = place.at - first
+    def lies(source: Place) -> Place:
+        if source.array == "given":
+            return Place(argument, source.at)
+        if source.array in BY_MEMBERS:
+            return source
+        first, size, name = next(part for part in parts if 0 <= source.at - part[0] < prod(part[1]))
+        at = source.at - first
         if name == "X" and points:  # one behind the other
             row, column = divmod(at, points)
             at = column * n + row
@@ -308,15 +320,15 @@ def _program(
 ) -> Program:
     """The program of a stage, of the numbers of a model and a filter as constants."""
 
-    def number(place: Place, **of_member: bool):
-        if place.array == "numbers":
-            return graph.constant(numbers[place.at])
-        return graph.given(lies(place), **of_member)
+    def number(source: Place, **of_member: bool):
+        if source.array == "numbers":
+            return graph.constant(numbers[source.at])
+        return graph.given(lies(source), **of_member)
 
     wanted, stores = list(stage.values()), []
     for (array, first), value in zip(stage, evaluate(wanted, numbers_of(wanted, number)), strict=True):
-        for k, one in enumerate(np.ravel(np.array(value, dtype=object))):
-            stores.append((lies(Place(array, first + k)), graph.number(one)))
+        for k, entry in enumerate(np.ravel(np.array(value, dtype=object))):
+            stores.append((lies(Place(array, first + k)), graph.number(entry)))
     return program_of(stores, {})
 
 
@@ -344,20 +356,20 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
     exact = run(filter_, key, inputs[None], z[None])
     stds = np.sqrt(np.einsum("kii->ki", exact.covs[0]))
     with np.errstate(all="ignore"):
-        found = _means(programs, key[0], inputs.astype(np.float32), z.astype(np.float32))
-    off = abs(difference(found, exact.means[0], programs.model.shape.state_angles))
+        means = _means(programs, key[0], inputs.astype(np.float32), z.astype(np.float32))
+    off = abs(difference(means, exact.means[0], programs.model.shape.state_angles))
     return float(np.max(off / np.where(stds > 0, stds, 1.0)))
 
 
 def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Means of a run, (K + 1, n), without restarts."""
     model, n, m = programs.model, programs.model.n, programs.model.m
-    start, begin, advance, settle, update, _ = map(_compiled, programs.all)
+    start, begin, advance, add_noise, update, _ = map(_compiled, programs.all)
     names = {**work_names(), "float": _Single, "X": np.zeros(programs.flying, np.float32)}
     names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
     names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.kept.items()}
     x = names["x"] = wrapped_where(model.prior_mean, model.shape.state_angles).astype(np.float32)
-    names["innovation"], found = np.zeros(m, np.float32), []
+    names["innovation"], means = np.zeros(m, np.float32), []
     size, width = programs.members, padded(programs.members, LANES)
     names |= {"size": size, "table": np.zeros((n, size), np.float32)}
 
@@ -376,12 +388,12 @@ def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.
                 for point in names["X"].reshape(-1, n) if programs.points else [x]:
                     exec(advance, names | {"x": point})
             draw(FILTER_PROCESS, k, n)
-            exec(settle, names)
+            exec(add_noise, names)
         names["z"] = z[k]
         draw(FILTER_MEASUREMENT, k, m)
         exec(update, names)
-        found.append(x.astype(np.float64))
-    return np.array(found)
+        means.append(x.astype(np.float64))
+    return np.array(means)
 
 
 def _compiled(program: Program):

@@ -173,13 +173,17 @@ class Sizes(NamedTuple):
     code: int  # and constants
 
 
-def sizes_of(made: CFilter, compiler: str = "gcc") -> Sizes | None:
+def sizes_of(generated: CFilter, compiler: str = "gcc") -> Sizes | None:
     """The sizes with -Os; None where that compiler of `COMPILERS`, or its `size`, is not installed."""
     size = compiler.removesuffix("gcc") + "size"
     if shutil.which(compiler) is None or shutil.which(size) is None:
         return None
     with TemporaryDirectory() as folder:
-        texts = {f"{made.name}.h": made.header, "filter.c": made.source, "one.c": ONE.format(name=made.name)}
+        texts = {
+            f"{generated.name}.h": generated.header,
+            "filter.c": generated.source,
+            "one.c": ONE.format(name=generated.name),
+        }
         for name, text in texts.items():
             Path(folder, name).write_text(text, encoding="utf-8")
         options = f"-std=c99 -Os -fstack-usage {COMPILERS[compiler]} -c filter.c one.c".split()
@@ -192,18 +196,20 @@ def sizes_of(made: CFilter, compiler: str = "gcc") -> Sizes | None:
         )
         lines = Path(folder, "filter.su").read_text(encoding="utf-8").splitlines()
     stacks = {line.split("\t")[0].rsplit(":", 1)[1]: int(line.split("\t")[1]) for line in lines}
-    own = [stacks.pop(f"{made.name}_{one}", 0) for one in ("init", "predict", "update")]
+    of_calls = [stacks.pop(f"{generated.name}_{function}", 0) for function in ("init", "predict", "update")]
     tested = stacks.pop("test_update", 0) + stacks.pop("test_channel", 0) + stacks.pop("sound", 0)
     drawn = stacks.pop("draw", 0) + stacks.pop("philox", 0)
     of_prior = max(drawn, stacks.pop("start", 0), stacks.pop("summarise", 0))
-    of_update = max((stacks.pop(one) for one in [*stacks] if one.startswith("geometric_mean")), default=0)
+    of_update = max(
+        (stacks.pop(function) for function in [*stacks] if function.startswith("geometric_mean")), default=0
+    )
     within = (
         stacks.pop("become_prior", 0) + of_prior,
         stacks.pop("correct", 0) + of_update,
         tested,
         *stacks.values(),
     )
-    return Sizes(struct, max(own) + max(within), code + data + bss)
+    return Sizes(struct, max(of_calls) + max(within), code + data + bss)
 
 
 # A Cortex-M4 that QEMU emulates, for a program that filters a log: start-up code, memory map, and commands.
@@ -337,38 +343,42 @@ def write_project(
         ValueError: as `c_filter`, for a wrong monitor, or if a file cannot be written.
     """
     watch = monitor_of(monitor)
-    made, programs = c_filter(filter_, name, single=single, monitor=watch), programs_of(filter_)
+    generated, programs = c_filter(filter_, name, single=single, monitor=watch), programs_of(filter_)
     model = programs.model
     predict, update = programs.operations
-    sizes = {one: found for one in COMPILERS if (found := sizes_of(made, one)) is not None}
-    labels = (", ".join(one.short_label for one in some) or "none" for some in model.quantities)
+    sizes = {
+        compiler: measured for compiler in COMPILERS if (measured := sizes_of(generated, compiler)) is not None
+    }
+    labels = (
+        ", ".join(quantity.short_label for quantity in quantities) or "none" for quantities in model.quantities
+    )
     about = {
-        "name": made.name,
+        "name": generated.name,
         "filter": filter_.name,
         "precision": "single" if single else "double",
         "states": "State: {}. Inputs: {}. Measurements: {}.".format(*labels),
-        "compilers": " | ".join(LABELS[one] for one in sizes) or "any",
+        "compilers": " | ".join(LABELS[compiler] for compiler in sizes) or "any",
         "rules": "|".join("--:" for _ in sizes) or "--:",
         **{
-            key: " | ".join(str(getattr(one, key)) for one in sizes.values()) or "not measured"
+            key: " | ".join(str(getattr(size, key)) for size in sizes.values()) or "not measured"
             for key in Sizes._fields
         },
         "predict": predict,
         "update": update,
-        "draws": DRAWS.format(name=made.name, members=programs.members) if programs.members else "",
-        "alarms": "" if watch is None else TestsWriter(watch, made.name, model.m, single).readme,
-        "board": _of_board(made.name) if board else "",
+        "draws": DRAWS.format(name=generated.name, members=programs.members) if programs.members else "",
+        "alarms": "" if watch is None else TestsWriter(watch, generated.name, model.m, single).readme,
+        "board": _of_board(generated.name) if board else "",
     }
     texts = {
-        f"{made.name}.h": made.header,
-        f"{made.name}.c": made.source,
-        f"{made.name}.hpp": class_of(made.name, programs, single=single, tested=watch is not None),
-        "main.c": log_program(made.name, programs, single=single, tested=watch is not None, dt=dt),
-        "CMakeLists.txt": CMAKE.format(name=made.name),
+        f"{generated.name}.h": generated.header,
+        f"{generated.name}.c": generated.source,
+        f"{generated.name}.hpp": class_of(generated.name, programs, single=single, tested=watch is not None),
+        "main.c": log_program(generated.name, programs, single=single, tested=watch is not None, dt=dt),
+        "CMakeLists.txt": CMAKE.format(name=generated.name),
         "README.md": README.format(**about),
         **({"board.c": BOARD, "board.ld": MEMORY} if board else {}),
     }
-    files = [Path(folder) / one for one in texts]
+    files = [Path(folder) / name for name in texts]
     for file in files:
         check_target(file)
     for file, text in zip(files, texts.values(), strict=True):

@@ -226,15 +226,15 @@ void {name}_update({name} *filter{z})
     def predict(self) -> str:
         """Statements of a step."""
         programs, n = self.programs, self.model.n
-        flying = ", X" * bool(programs.flying)
-        begin, step = "", f"        advance(filter{flying}{self.by_u});\n"
+        points = ", X" * bool(programs.flying)
+        begin, step = "", f"        advance(filter{points}{self.by_u});\n"
         if programs.flying:
             begin = f"    {self.real} X[{programs.flying}];\n\n    begin(filter, X);\n"
         if programs.points:
             move = f"            advance(X + {n} * i{self.by_u});\n"
             step = f"        for (int i = 0; i < {programs.points}; i++) {{\n{move}        }}\n"
         loop = f"    for (int k = 0; k < {self.model.substeps}; k++) {{\n{step}    }}\n"
-        return f"{begin}{loop}    settle(filter{flying});\n"
+        return f"{begin}{loop}    settle(filter{points});\n"
 
     def before_update(self) -> str:
         """Statements before a correction."""
@@ -248,8 +248,8 @@ void {name}_update({name} *filter{z})
         """A function that runs a program."""
         lines = self.statements(program)
         used = set(re.findall(r"\w+", " ".join(lines)))
-        unused = [one for one in re.findall(r"\*(\w+)", arguments) if one not in used]
-        body = "\n".join(f"    {line}" for line in [*(f"(void){one};" for one in unused), *lines])
+        unused = [argument for argument in re.findall(r"\*(\w+)", arguments) if argument not in used]
+        body = "\n".join(f"    {line}" for line in [*(f"(void){argument};" for argument in unused), *lines])
         return f"static void {name}({arguments})\n{{\n{body}\n}}\n"
 
     def _given(self) -> list[str]:
@@ -262,7 +262,7 @@ void {name}_update({name} *filter{z})
 
 
 def _listed(quantities: Iterable[Quantity]) -> str:
-    return _plain(", ".join(one.short_label for one in quantities))
+    return _plain(", ".join(quantity.short_label for quantity in quantities))
 
 
 def _indented(text: str) -> str:
@@ -328,7 +328,7 @@ class EnsembleWriter(Writer):
 
     def kept(self) -> str:
         """The members of the struct for the ensemble."""
-        size, rows = self.programs.members, max(cut(one, self.model.n).rows for one in self.programs.all)
+        size, rows = self.programs.members, max(cut(program, self.model.n).rows for program in self.programs.all)
         normals = max(self.model.n, self.model.m) * self._width
         return f"""\
     {self.real} members[{rows * size}]; /* {size} of each state, one state behind the other; then scratch */
@@ -363,12 +363,12 @@ class EnsembleWriter(Writer):
     def predict(self) -> str:
         """Statements of a step."""
         drawn = f"    filter->step++;\n    draw(filter, {FILTER_PROCESS}, {self.model.n});\n"
-        *substeps, settle = super().predict().splitlines(keepends=True)
-        return "".join([*substeps, drawn, settle, "    summarise(filter);\n"])
+        *substeps, add_noise = super().predict().splitlines(keepends=True)
+        return "".join([*substeps, drawn, add_noise, "    summarise(filter);\n"])
 
     def before_update(self) -> str:
         """Normals for the update, where it draws any."""
-        draws = any(place.array == "draws" for place, _ in self.programs.update.reads)
+        draws = any(source.array == "draws" for source, _ in self.programs.update.reads)
         return f"    draw(filter, {FILTER_MEASUREMENT}, {self.model.m});\n" * draws
 
     def statements(self, program: Program) -> list[str]:

@@ -42,7 +42,7 @@ def slightly(ratio: Interval) -> str:
 def span(value: Interval, digits: int, unit: str = "", sign: str = "") -> str:
     """A value with its 95 % interval in brackets, such as "26 % [25, 27]".
 
-    Where both ends would be the same number it has up to three more digits, and beyond these no brackets.
+    If both ends would read the same it has up to three more digits, and if they still do, no brackets.
 
     Args:
         value: with its ends.
@@ -50,8 +50,8 @@ def span(value: Interval, digits: int, unit: str = "", sign: str = "") -> str:
         unit: after the value, with its space.
         sign: "+" for signs before positive numbers, too.
     """
-    for places in range(digits, digits + MORE_DIGITS + 1):
-        middle, low, high = (f"{round(part, places) + 0.0:{sign}.{places}f}" for part in value)  # no -0.00
+    for decimals in range(digits, digits + MORE_DIGITS + 1):
+        middle, low, high = (f"{round(part, decimals) + 0.0:{sign}.{decimals}f}" for part in value)  # no -0.00
         if low != high:
             return f"{middle}{unit} [{low}, {high}]"
     return f"{value.value:{sign}.{digits}f}{unit}"
@@ -85,8 +85,8 @@ def ratio_of_resampled(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
     Resamples that pick only runs without any count are left out.
     """
     above, below = resampled_means(totals), resampled_means(counts)
-    some = below.reshape(len(below)) > 0
-    return above[some] / below[some]
+    counted = below.reshape(len(below)) > 0
+    return above[counted] / below[counted]
 
 
 def rmse_intervals(
@@ -182,11 +182,11 @@ def uniformity(values: np.ndarray, steps: int = POINTS) -> Uniformity:
         nothing = np.full((len(edges) - 1, 2), np.nan)
         return Uniformity(np.nan, np.nan, edges, nothing[:, 0], nothing)
     reached = counts.cumsum(axis=1)
-    found = reached.sum(axis=0) / totals.sum()
-    distance = np.abs(found - grid[1:]).max()
+    cumulative = reached.sum(axis=0) / totals.sum()
+    distance = np.abs(cumulative - grid[1:]).max()
     p_value = np.nan
     if len(values) >= FEWEST_RUNS:
-        by_chance = np.abs(ratio_of_resampled(reached, totals) - found).max(axis=1)
+        by_chance = np.abs(ratio_of_resampled(reached, totals) - cumulative).max(axis=1)
         p_value = float((by_chance >= distance).mean())
     bars = np.add.reduceat(counts, ends[:-1], axis=1)
     widths = np.diff(edges)

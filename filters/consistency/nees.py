@@ -129,8 +129,8 @@ def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = N
     counted = freedom > 0
     squares = np.where(counted, squares, np.nan)
     runs = counted.sum(axis=0)
-    some, band = runs > 0, band_of_means(freedom)
-    means = np.where(some, np.nansum(squares, axis=0) / np.maximum(runs, 1), np.nan)
+    any_run, band = runs > 0, band_of_means(freedom)
+    means = np.where(any_run, np.nansum(squares, axis=0) / np.maximum(runs, 1), np.nan)
     inside = (means >= band[:, 0]) & (means <= band[:, 1])
     probability = np.where(counted, chdtr(np.maximum(freedom, 1.0), squares), np.nan)
     return SquaresCheck(
@@ -139,7 +139,7 @@ def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = N
         mean_interval(squares),
         means,
         band,
-        float(inside[some].mean()) if some.any() else np.nan,
+        float(inside[any_run].mean()) if any_run.any() else np.nan,
         mean_interval(np.where(counted, probability > 0.95, np.nan)),
         uniformity(probability),
     )
@@ -154,8 +154,8 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
         freedom: degrees of freedom of each run and step, (B, T); 0 where a run does not count.
     """
     runs, total = (freedom > 0).sum(axis=0), freedom.sum(axis=0)
-    sums, place = np.unique(total, return_inverse=True)  # there are few, and chdtri is slow
-    limits = chdtri(np.maximum(sums, 1.0)[:, None], [0.975, 0.025])[place]  # it takes the upper tail
+    sums, inverse = np.unique(total, return_inverse=True)  # there are few, and chdtri is slow
+    limits = chdtri(np.maximum(sums, 1.0)[:, None], [0.975, 0.025])[inverse]  # it takes the upper tail
     return np.where(runs[:, None] > 0, limits / np.maximum(runs, 1)[:, None], np.nan)
 
 
@@ -207,13 +207,13 @@ def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = L
     lags = at_least("lags", lags, 1)
     if steps <= lags:
         raise ValueError(f"there must be more steps than lags, but got {steps} steps and {lags} lags")
-    there = ~np.isnan(e) if present is None else present & ~np.isnan(e)
-    e, there = np.where(there, e, 0.0), there.astype(np.float64)
-    values = np.maximum(there.sum(axis=(0, 1)), 1.0)
+    mask = ~np.isnan(e) if present is None else present & ~np.isnan(e)
+    e, mask = np.where(mask, e, 0.0), mask.astype(np.float64)
+    values = np.maximum(mask.sum(axis=(0, 1)), 1.0)
     e /= np.sqrt(np.maximum((e**2).sum(axis=(0, 1)) / values, 1e-300))
     sums = _lagged_sums(e, lags)
-    pairs = _all_pairs(there, lags) if there.all() else _lagged_sums(there, lags)
-    known = pairs > 0  # a channel that never was measured is no white one
+    pairs = _all_pairs(mask, lags) if mask.all() else _lagged_sums(mask, lags)
+    known = pairs > 0  # a channel without measurements does not count as white
     pairs = np.maximum(pairs, 1.0)
     correlations = sums / pairs
     size = np.sqrt(np.outer(values, values))
@@ -236,9 +236,9 @@ def _lagged_sums(x: np.ndarray, lags: int) -> np.ndarray:
     )
 
 
-def _all_pairs(there: np.ndarray, lags: int) -> np.ndarray:
-    """The same of ones: numbers of pairs."""
-    runs, steps, m = there.shape
+def _all_pairs(mask: np.ndarray, lags: int) -> np.ndarray:
+    """Numbers of pairs at each lag if no value is missing."""
+    runs, steps, m = mask.shape
     return np.broadcast_to(runs * (steps - np.arange(1.0, lags + 1.0))[:, None, None], (lags, m, m))
 
 
@@ -250,19 +250,19 @@ BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is s
 
 def root_mean_square(values: np.ndarray) -> float:
     """Root mean square of the values that are not NaN, infinite only if one of them is; NaN of none."""
-    there = values[~np.isnan(values)]
-    if not there.size:
+    present = values[~np.isnan(values)]
+    if not present.size:
         return np.nan
-    largest = float(abs(there).max()) or 1.0  # by which squares stay finite where a model blows up
-    return float(np.sqrt(((there / largest) ** 2).mean()) * largest) if isfinite(largest) else np.inf
+    largest = float(abs(present).max()) or 1.0  # by which squares stay finite where a model blows up
+    return float(np.sqrt(((present / largest) ** 2).mean()) * largest) if isfinite(largest) else np.inf
 
 
 def blow_up_sentence(
     innovations: np.ndarray, measurements: np.ndarray, names: Sequence[str], dt: float | None = None
 ) -> str:
-    """A sentence on a model that blows up between samples; empty where it does not.
+    """A sentence on a model that blows up between samples; empty if it does not.
 
-    That is where a channel's root mean square innovation is a thousand times its standard deviation.
+    It blows up if a channel's root mean square innovation is a thousand times the channel's standard deviation.
 
     Args:
         innovations: (..., m), NaN where they do not count.
@@ -270,8 +270,8 @@ def blow_up_sentence(
         names: of the channels.
         dt: sample time [s], if there is one.
     """
-    for place, name in enumerate(names):
-        rmse, z = root_mean_square(innovations[..., place]), measurements[..., place]
+    for j, name in enumerate(names):
+        rmse, z = root_mean_square(innovations[..., j]), measurements[..., j]
         if np.isnan(rmse) or np.isnan(z).all():
             continue
         spread = float(np.nanstd(z))

@@ -94,14 +94,14 @@ def findings(
     late = slice(first_step, None)
     truth = np.full(estimates.means.shape, np.nan) if states is None else states
     errors = difference(estimates.means, truth, angles)[:, late]
-    there = None if counted is None else counted[:, late]
+    mask = None if counted is None else counted[:, late]
     present = None if measurements is None else ~np.isnan(measurements[:, late])
-    if there is not None:
+    if mask is not None:
         everything = np.ones(estimates.innovations[:, late].shape, dtype=bool)
-        present = (everything if present is None else present) & there[..., None]
+        present = (everything if present is None else present) & mask[..., None]
     return Findings(
-        _residuals(errors, estimates.covs[:, late], there),
-        _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late], there),
+        _residuals(errors, estimates.covs[:, late], mask),
+        _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late], mask),
         present,
         estimates.divergences,
         None if measurements is None else longest_stretches(_without_padding(measurements, counted)[:, late]),
@@ -126,26 +126,28 @@ def longest_stretches(measurements: np.ndarray) -> np.ndarray:
 
 
 def joined(parts: Sequence[Findings]) -> Findings:
-    """Findings of all runs from those of some after the others."""
-    present = [one.present for one in parts if one.present is not None]
+    """Findings of all runs, from parts in their order."""
+    present = [part.present for part in parts if part.present is not None]
     return Findings(
-        _joined([one.errors for one in parts]),
-        _joined([one.innovations for one in parts]),
+        _joined([part.errors for part in parts]),
+        _joined([part.innovations for part in parts]),
         np.concatenate(present) if present else None,
-        np.concatenate([one.divergences for one in parts]),
-        None if any(one.repeats is None for one in parts) else np.concatenate([one.repeats for one in parts]),
+        np.concatenate([part.divergences for part in parts]),
+        None if any(part.repeats is None for part in parts) else np.concatenate([part.repeats for part in parts]),
     )
 
 
 def _joined(parts: Sequence[Residuals]) -> Residuals:
-    values, whitened_ones, deviations = (np.concatenate(some) for some in zip(*parts, strict=True))
+    values, whitened_ones, deviations = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Residuals(values, whitened_ones, deviations)
 
 
-def _residuals(values: np.ndarray, covs: np.ndarray, there: np.ndarray | None) -> Residuals:
-    """Residuals of all steps; NaN where a step is not there, (B, T) bool, if that is given."""
-    found = Residuals(values, whitened(values, covs), _deviations(covs))
-    return found if there is None else Residuals(*(np.where(there[..., None], one, np.nan) for one in found))
+def _residuals(values: np.ndarray, covs: np.ndarray, mask: np.ndarray | None) -> Residuals:
+    """Residuals of all steps; NaN where the mask (B, T) is false."""
+    residuals = Residuals(values, whitened(values, covs), _deviations(covs))
+    if mask is None:
+        return residuals
+    return Residuals(*(np.where(mask[..., None], array, np.nan) for array in residuals))
 
 
 def consistency_report(
@@ -177,14 +179,14 @@ def consistency_report(
         raise ValueError(
             f"states must have the shape of the estimates, {estimates.means.shape}, but got {np.shape(states)}"
         )
-    found = findings(estimates, states, measurements, first_step, angles, counted)
+    result = findings(estimates, states, measurements, first_step, angles, counted)
     if states is not None and counted is not None:
         states = np.where(counted[..., None], states, np.nan)
-    return report_of(found, states, first_step=first_step, angles=angles, **options)
+    return report_of(result, states, first_step=first_step, angles=angles, **options)
 
 
 def report_of(
-    found: Findings,
+    result: Findings,
     states: np.ndarray | None,
     *,
     members: Members | None = None,
@@ -197,23 +199,23 @@ def report_of(
     """The report of findings; other arguments and errors are those of `consistency_report`.
 
     Args:
-        found: of all runs, at least two.
+        result: findings of all runs, at least two.
         states: the truth, (B, K + 1, n); None where it is not known.
         members: of the first of these runs, for ensembles, from `filters.ensembles.rank_histogram.record_members`.
         first_step: the first that counts.
         names: of the states, with units.
         angles: (n,), which states are angles.
         channels: names of the measurements, with units.
-        lags: of the innovations' correlation; of as few steps as these one less than there are steps.
+        lags: of the innovations' correlation; of fewer steps, one less than the steps.
     """
-    errors, whitened_errors, deviations = found.errors
-    innovations, whitened_innovations, expected_deviations = found.innovations
+    errors, whitened_errors, deviations = result.errors
+    innovations, whitened_innovations, expected_deviations = result.innovations
     if len(errors) < 2:
         raise ValueError(f"a consistency report must have at least two runs, but got {len(errors)}")
-    n, m, present = errors.shape[-1], innovations.shape[-1], found.present
+    n, m, present = errors.shape[-1], innovations.shape[-1], result.present
     names = _named("names", names, n, "state")
     channels = _named("channels", channels, m, "channel")
-    seen = innovations if present is None else np.where(present, innovations, np.nan)
+    measured = innovations if present is None else np.where(present, innovations, np.nan)
     crps = np.where(deviations > 0, gaussian_crps(errors, deviations), np.nan)
     expected = expected_gaussian_crps(deviations)
     return ConsistencyReport(
@@ -229,16 +231,16 @@ def report_of(
         crps_expected=_mean(expected, (0, 1)),
         crps_ratio=_mean(crps, 0) / _mean(expected, 0),
         tails=_kurtosis(whitened_innovations, present),
-        repeats=() if found.repeats is None else tuple(found.repeats.max(axis=0).tolist()),
-        divergences=int(found.divergences.sum()),
-        diverged_runs=int((found.divergences > 0).sum()),
+        repeats=() if result.repeats is None else tuple(result.repeats.max(axis=0).tolist()),
+        divergences=int(result.divergences.sum()),
+        diverged_runs=int((result.divergences > 0).sum()),
         ensemble=None if members is None or states is None else check_ensemble(members, states, angles),
         channels=channels,
         innovation_coverage=tuple(
-            mean_interval(covered(seen[..., j], expected_deviations[..., j])) for j in range(m)
+            mean_interval(covered(measured[..., j], expected_deviations[..., j])) for j in range(m)
         ),
         innovation_coverage_by_level=np.array(
-            [_mean(covered(seen, expected_deviations, level), (0, 1)) for level in LEVELS]
+            [_mean(covered(measured, expected_deviations, level), (0, 1)) for level in LEVELS]
         ),
         has_truth=states is not None,
     )
@@ -289,7 +291,7 @@ def _mean(values: np.ndarray, axes) -> np.ndarray:
 
 def _kurtosis(whitened_ones: np.ndarray, present: np.ndarray | None) -> tuple[float, ...]:
     """E v^4 / (E v^2)^2 of each channel's whitened innovations (B, T, m), NaN without any."""
-    seen = whitened_ones if present is None else np.where(present, whitened_ones, np.nan)
+    measured = whitened_ones if present is None else np.where(present, whitened_ones, np.nan)
     with np.errstate(all="ignore"):
-        fourth, second = (_mean(seen**power, (0, 1)) for power in (4, 2))
+        fourth, second = (_mean(measured**power, (0, 1)) for power in (4, 2))
         return tuple((fourth / second**2).tolist())

@@ -120,21 +120,21 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
         return None
     model, n = filter_.kernel_model, filter_.kernel_model.n
     scales = _scales(model, path)
-    closed, taken = np.empty_like(path.transitions), np.zeros((model.m, model.m))
+    closed, removed = np.empty_like(path.transitions), np.zeros((model.m, model.m))
     for i, (f, h, p, s, factor) in enumerate(zip(*path, strict=True)):
-        seen = h.any(axis=1)
-        h, s = h[seen], s[np.ix_(seen, seen)]
+        measured = h.any(axis=1)
+        h, s = h[measured], s[np.ix_(measured, measured)]
         with np.errstate(over="ignore", invalid="ignore"):  # of a filter that has lost its state
             predicted = f @ p @ f.T + factor * model.process_noise_cov
             gain = np.linalg.solve(s, h @ predicted).T
             closed[i] = (np.eye(n) - gain @ h) @ f
-            taken[np.ix_(seen, seen)] += h @ gain / len(closed)
+            removed[np.ix_(measured, measured)] += h @ gain / len(closed)
     if not (np.abs(closed) < LARGEST).all():
         return None
     observable, blind = observable_part(path, scales, model.measurement_noise_cov)
     closed = observable.T @ (closed / scales[:, None] * scales) @ observable
     growth, direction = _growth(closed)
-    kappa = min(float(np.linalg.eigvals(taken).real.max(initial=0.0)), 1.0)
+    kappa = min(float(np.linalg.eigvals(removed).real.max(initial=0.0)), 1.0)
     slowest = int(np.abs(observable @ direction).argmax()) if len(growth) else 0
     length = min(inputs.shape[1] for _, inputs, _ in runs)
     return TimeConstants(tuple(map(_steps_of, growth)), slowest, _steps_of(1.0 - kappa), blind, length)
@@ -146,10 +146,10 @@ def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
     functions = model.functions
     slopes = observation_slopes(functions, model.shape)
     for keys, inputs, measurements in runs:
-        found: Estimates = run(filter_, keys, inputs, measurements)
-        ends, count = (int(place * inputs.shape[1]) for place in PLACES), _steps_to_take(measurements[0])
+        estimates: Estimates = run(filter_, keys, inputs, measurements)
+        ends, count = (int(fraction * inputs.shape[1]) for fraction in PLACES), _steps_to_take(measurements[0])
         for k in sorted({k for end in ends for k in range(max(end - count, 0) + 1, end + 1)}):
-            x, p, s = found.means[0, k - 1], found.covs[0, k - 1], found.innovation_covs[0, k]
+            x, p, s = estimates.means[0, k - 1], estimates.covs[0, k - 1], estimates.innovation_covs[0, k]
             if constant is None or not isinstance(model, AffineModel):
                 f, _, after = slopes_of_step(model, x, inputs[0, k - 1], functions=functions)
                 h = np.array(slopes(as_value(after), as_value(model.scales), model.given_constants))
@@ -183,12 +183,12 @@ def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.n
             observed = h * scales @ phi
             gramian += observed.T @ np.linalg.solve(r, observed)
     roots = np.sqrt(gramian.diagonal())
-    seen = roots > 0.0
-    correlations = gramian[np.ix_(seen, seen)] / roots[seen, None] / roots[seen]
+    visible = roots > 0.0
+    correlations = gramian[np.ix_(visible, visible)] / roots[visible, None] / roots[visible]
     values, vectors = np.linalg.eigh(correlations)
-    null = np.zeros((n, n - int(seen.sum()) + int((values < BLIND).sum())))
-    null[~seen, : n - int(seen.sum())] = np.eye(n - int(seen.sum()))
-    null[seen, n - int(seen.sum()) :] = vectors[:, values < BLIND] / roots[seen, None]
+    null = np.zeros((n, n - int(visible.sum()) + int((values < BLIND).sum())))
+    null[~visible, : n - int(visible.sum())] = np.eye(n - int(visible.sum()))
+    null[visible, n - int(visible.sum()) :] = vectors[:, values < BLIND] / roots[visible, None]
     basis = np.linalg.qr(null, mode="complete")[0]
     count = null.shape[1]
     outside = np.abs(basis[:, :count]).max(axis=1, initial=0.0) > 1e-6
@@ -261,20 +261,22 @@ def forgetting_noise(
 def _floor(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """The mean of F P F' along a path, (n, n), P the steady covariance after each update."""
     p, total = _steady(f, h, q, factors)[1], np.zeros_like(q)
-    for one, seen, factor in zip(f, h, factors, strict=True):
-        moved = one @ p @ one.T
-        total += moved / len(f)
-        predicted = moved + factor * q
-        gain = np.linalg.solve(np.eye(len(seen)) + seen @ predicted @ seen.T, seen @ predicted).T
-        left = np.eye(len(q)) - gain @ seen
+    for transition, observation, factor in zip(f, h, factors, strict=True):
+        propagated = transition @ p @ transition.T
+        total += propagated / len(f)
+        predicted = propagated + factor * q
+        gain = np.linalg.solve(
+            np.eye(len(observation)) + observation @ predicted @ observation.T, observation @ predicted
+        ).T
+        left = np.eye(len(q)) - gain @ observation
         p = left @ predicted @ left.T + gain @ gain.T
     return 0.5 * (total + total.T)
 
 
 def _steady(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of a path that is repeated for ever: A of one pass, the steady covariance P at its end, and J of one pass.
+    """For an endlessly repeated path: A of one pass, the steady covariance P at its end, and J of one pass.
 
-    A pass takes P to A (I + P J)^-1 P A' + C. Its steps are composed by pairs, and then it is doubled.
+    A pass takes P to A (I + P J)^-1 P A' + C. The function composes its steps by pairs, then doubles the pass.
 
     Source: Sarkka, Garcia-Fernandez (2021), "Temporal parallelization of Bayesian smoothers", IEEE TAC 66(1).
     """
@@ -282,26 +284,30 @@ def _steady(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) ->
     s = np.eye(h.shape[1]) + h @ noise @ h.transpose(0, 2, 1)
     weighted = np.linalg.solve(s, h)  # S^-1 H
     left = unit - noise @ h.transpose(0, 2, 1) @ weighted
-    seen = h @ f
-    part: tuple[np.ndarray, ...] = left @ f, left @ noise, seen.transpose(0, 2, 1) @ np.linalg.solve(s, seen)
+    observed = h @ f
+    part: tuple[np.ndarray, ...] = (
+        left @ f,
+        left @ noise,
+        observed.transpose(0, 2, 1) @ np.linalg.solve(s, observed),
+    )
     while len(part[0]) > 1:
         half = len(part[0]) // 2
-        rest = [one[2 * half :] for one in part]
-        pairs = _composed([one[: 2 * half : 2] for one in part], [one[1 : 2 * half : 2] for one in part])
-        part = tuple(np.concatenate([one, more]) for one, more in zip(pairs, rest, strict=True))
-    a, c, j = (one[0] for one in part)
+        rest = [stack[2 * half :] for stack in part]
+        pairs = _composed([stack[: 2 * half : 2] for stack in part], [stack[1 : 2 * half : 2] for stack in part])
+        part = tuple(np.concatenate([stack, more]) for stack, more in zip(pairs, rest, strict=True))
+    a, c, j = (stack[0] for stack in part)
     first, p = (a, j), unit
     for _ in range(DOUBLINGS):
         before, p = p, a @ np.linalg.solve(unit + j, a.T) + c  # from the identity
         if np.abs(p - before).max() <= SETTLED * np.abs(p).max() or np.abs(a).max() > LARGEST:
             break
-        a, c, j = (one[0] for one in _composed(*[(a[None], c[None], j[None])] * 2))
+        a, c, j = (stack[0] for stack in _composed(*[(a[None], c[None], j[None])] * 2))
     return first[0], 0.5 * (p + p.T), first[1]
 
 
-def _composed(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """(A, C, J) of one part of a path and then another."""
-    (a, c, j), (b, d, k) = one, other
+def _composed(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """(A, C, J) of one part of a path followed by a second."""
+    (a, c, j), (b, d, k) = first, second
     through = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, b.swapaxes(1, 2)).swapaxes(1, 2)  # B (I + C K)^-1
     inner = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, k @ a)
     joined = through @ c @ b.swapaxes(1, 2) + d, a.swapaxes(1, 2) @ inner + j
@@ -310,9 +316,9 @@ def _composed(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[n
 
 def _is_regular(path: Path) -> bool:
     """Whether S of all channels that were measured can be solved for."""
-    seen = path.observations.any(axis=2)
+    measured = path.observations.any(axis=2)
     variances = np.einsum("kii->ki", path.innovation_covs)
-    return bool((variances[seen] > 0.0).all())
+    return bool((variances[measured] > 0.0).all())
 
 
 def _growth(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

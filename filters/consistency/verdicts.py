@@ -22,22 +22,22 @@ STUCK = 40  # equal readings in a row, beyond what a quantised sensor at rest gi
 
 def symptoms(report: ConsistencyReport) -> list[str]:
     """A remedy for each symptom that a report shows, without a full stop; none where it shows none."""
-    said = []
+    remedies = []
     stuck = [name for name, longest in zip(report.channels, report.repeats, strict=False) if longest >= STUCK]
     if stuck:
-        said.append(
+        remedies.append(
             f"look at {', '.join(stuck)}, which has {max(report.repeats)} equal readings in a row: a stuck "
             "sensor does not measure; replace its readings by NaN"
         )
-    elif any(one > HEAVY for one in report.tails):
-        said.append(
+    elif any(kurtosis > HEAVY for kurtosis in report.tails):
+        remedies.append(
             "a filter that models outliers, `--filter ekf-robust`, because innovations have heavy tails "
             f"(kurtosis {max(report.tails):.3g} where 3 is normal); `thruster identify --gate` leaves them "
             "out"
         )
     if report.divergences:
-        said.append("more substeps of the model, or a smaller sample time, because estimates blow up")
-    return said
+        remedies.append("more substeps of the model, or a smaller sample time, because estimates blow up")
+    return remedies
 
 
 SLIGHT_FACTOR = 1.2  # a mean NEES or NIS this close to the right one is off by little
@@ -53,40 +53,40 @@ NO_TRUTH = "These data have no truth: the following is based on the innovations 
 
 def sentences(report: ConsistencyReport) -> list[str]:
     """A report in sentences, one per check, a remedy last; of many states those with the worst coverage."""
-    said = [] if report.has_truth else [NO_TRUTH]
+    parts = [] if report.has_truth else [NO_TRUTH]
     for check in (report.nees, report.nis) if report.has_truth else (report.nis,):
-        said.append(squares_sentence(check, report.runs))
+        parts.append(squares_sentence(check, report.runs))
         if not np.isnan(check.mean.value):
-            said.append(distribution_sentence(check))
-    said.append(whiteness_sentence(report.whiteness, report.channels))
+            parts.append(distribution_sentence(check))
+    parts.append(whiteness_sentence(report.whiteness, report.channels))
     if report.has_truth:
-        said += _state_sentences(report)
+        parts += _state_sentences(report)
     else:
         pairs = zip(report.channels, report.innovation_coverage, strict=True)
-        said += [coverage_sentence(f"the expected {name}", part, "the measurement") for name, part in pairs]
-    said.append(divergence_sentence(report.divergences, report.diverged_runs, report.runs))
-    said.append(remedy_sentence(report))
-    return [sentence for sentence in said if sentence]
+        parts += [coverage_sentence(f"the expected {name}", part, "the measurement") for name, part in pairs]
+    parts.append(divergence_sentence(report.divergences, report.diverged_runs, report.runs))
+    parts.append(remedy_sentence(report))
+    return [sentence for sentence in parts if sentence]
 
 
 def _state_sentences(report: ConsistencyReport) -> list[str]:
     """Coverage, CRPS and ranks, state by state."""
     ensemble, n = report.ensemble, len(report.states)
     off = [-abs(part.value - 0.95) for part in report.coverage]
-    told = sorted(sorted(range(n), key=off.__getitem__)[:MOST_STATES])
-    said = []
-    for i in told:
+    worst = sorted(sorted(range(n), key=off.__getitem__)[:MOST_STATES])
+    parts = []
+    for i in worst:
         of_members = None if ensemble is None else ensemble.crps[i]
-        said.append(coverage_sentence(report.states[i], report.coverage[i]))
-        said.append(crps_sentence(report.states[i], report.crps[i], report.crps_expected[i], of_members))
+        parts.append(coverage_sentence(report.states[i], report.coverage[i]))
+        parts.append(crps_sentence(report.states[i], report.crps[i], report.crps_expected[i], of_members))
     if n > MOST_STATES and not np.isnan(off).all():
-        said.append(
+        parts.append(
             f"Of {n} states these are the {MOST_STATES} whose coverage is furthest off; that of the others lies "
             f"within {100 * sorted(-part for part in off)[-MOST_STATES - 1]:.2g} percentage points of 95 %."
         )
     if ensemble is not None:
-        said += [ranks_sentence(report.states[i], ensemble.ranks[i], ensemble.size) for i in told]
-    return said
+        parts += [ranks_sentence(report.states[i], ensemble.ranks[i], ensemble.size) for i in worst]
+    return parts
 
 
 def confidence(mean: Interval, dimension: float) -> str:
@@ -107,12 +107,12 @@ def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
 
 def squares_sentence(check: SquaresCheck, runs: int) -> str:
     """The mean NEES or NIS, and how many steps lie in their band."""
-    said = mean_sentence(check.name, check.mean, check.dimension)
+    sentence = mean_sentence(check.name, check.mean, check.dimension)
     if np.isnan(check.mean.value):
-        return said
+        return sentence
     low, high = np.nanmedian(check.band, axis=0)
     return (
-        f"{said[:-1]}; the mean of {runs} runs lies in its 95 % band, about [{low:.3g}, {high:.3g}], "
+        f"{sentence[:-1]}; the mean of {runs} runs lies in its 95 % band, about [{low:.3g}, {high:.3g}], "
         f"in {100 * check.share_inside:.0f} % of the steps."
     )
 
@@ -131,22 +131,22 @@ def distribution_sentence(check: SquaresCheck) -> str:
     )
 
 
-def whiteness_sentence(found: Whiteness, channels: Sequence[str] = ()) -> str:
+def whiteness_sentence(whiteness: Whiteness, channels: Sequence[str] = ()) -> str:
     """Whether innovations are white, and which way they are not; `channels` names the measurements."""
-    if found.statistic == 0:
+    if whiteness.statistic == 0:
         return "No test of whiteness: the filter gives no innovation covariance, or nothing was measured."
-    largest_at = np.unravel_index(np.argmax(np.abs(found.correlations)), found.correlations.shape)
-    lag, i, j = (int(place) for place in largest_at)
-    largest = found.correlations[lag, i, j]
+    largest_at = np.unravel_index(np.argmax(np.abs(whiteness.correlations)), whiteness.correlations.shape)
+    lag, i, j = (int(index) for index in largest_at)
+    largest = whiteness.correlations[lag, i, j]
     after = "from one step to the next" if lag == 0 else f"over {lag + 1} steps"
-    channels = channels or [f"channel {place + 1}" for place in range(found.correlations.shape[1])]
+    channels = channels or [f"channel {index + 1}" for index in range(whiteness.correlations.shape[1])]
     of = "" if len(channels) == 1 else f", of {channels[i]} with {channels[j]}"
-    share, width = 100 * found.share_inside, np.median(found.half_widths)
+    share, width = 100 * whiteness.share_inside, np.median(whiteness.half_widths)
     numbers = (
         f"the largest correlation is {largest:+.2g} {after}{of}; {share:.0f} % of them lie within "
-        f"±{width:.2g}, where 95 % do by chance ({probability_text(found.p_value)})"
+        f"±{width:.2g}, where 95 % do by chance ({probability_text(whiteness.p_value)})"
     )
-    if found.p_value >= SIGNIFICANT:
+    if whiteness.p_value >= SIGNIFICANT:
         return f"Innovations are white, as far as these runs show: {numbers}."
     if abs(largest) < SLIGHT_CORRELATION:
         return f"Innovations are nearly white: {numbers}."
@@ -155,14 +155,14 @@ def whiteness_sentence(found: Whiteness, channels: Sequence[str] = ()) -> str:
     return f"Innovations are not white, the filter follows the noise: {numbers}."
 
 
-def coverage_sentence(name: str, coverage: Interval, held: str = "the truth") -> str:
+def coverage_sentence(name: str, coverage: Interval, contained: str = "the truth") -> str:
     """Whether a 95 % interval contains the truth, or a measurement, as often as stated."""
     if np.isnan(coverage.value):
         return ""
     low, value, high = 100 * coverage.low, 100 * coverage.value, 100 * coverage.high
     amiss = "too rarely" if value < 95 else "more often than stated"
     return (
-        f"The 95 % interval of {name} contains {held} in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
+        f"The 95 % interval of {name} contains {contained} in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
         f"{'as it should' if coverage.covers(0.95) else amiss}."
     )
 
@@ -253,25 +253,25 @@ def remedy_sentence(report: ConsistencyReport) -> str:
         what = "lower Q where nothing is measured" + ("; the innovations are consistent" if white else "")
     else:
         what = ""
-    shown = symptoms(report)
-    if lasting and not shown:
+    remedies = symptoms(report)
+    if lasting and not remedies:
         first, second = what or "raise Q", _augment(report.constants)
         what = f"{first}; or {second}" if over or under or slow else f"{second}; or {first}"
-    tried = "; ".join([*shown, *([what] if what else [])])
+    tried = "; ".join([*remedies, *([what] if what else [])])
     return f"To try: {tried}." if tried else ""
 
 
-def is_white(found: Whiteness) -> bool:
+def is_white(whiteness: Whiteness) -> bool:
     """Whether innovations are white as far as the runs show, or were not tested: no sentence says otherwise."""
-    return found.statistic == 0 or bool(found.p_value >= SIGNIFICANT)
+    return whiteness.statistic == 0 or bool(whiteness.p_value >= SIGNIFICANT)
 
 
 def _augment(constants: Sequence[str]) -> str:
-    """What to do about a model whose errors last: a constant that is off becomes a state."""
+    """Advice for a model whose errors last: make a constant that may be off a state."""
     constants = [name for name in constants if name not in NEVER]
-    some = ", ".join(constants[:MOST_CONSTANTS])
+    names = ", ".join(constants[:MOST_CONSTANTS])
     more = f" and {len(constants) - MOST_CONSTANTS} more" if len(constants) > MOST_CONSTANTS else ""
-    of_it = f" (it has {some}{more})" if constants else ""
+    of_it = f" (it has {names}{more})" if constants else ""
     return (
         f"estimate a constant of the model that may be off{of_it} as a further state, with "
         "`thruster compare --augment NAME` or `filters.augmented_model`"
@@ -282,14 +282,14 @@ def _ranks_are_right(report: ConsistencyReport) -> bool:
     return report.ensemble is not None and all(ranks_verdict(ranks) == EVEN for ranks in report.ensemble.ranks)
 
 
-def _alike(found: Uniformity) -> bool:
-    return found.p_value >= SIGNIFICANT if not np.isnan(found.p_value) else found.distance < SLIGHT_DISTANCE
+def _alike(check: Uniformity) -> bool:
+    return check.p_value >= SIGNIFICANT if not np.isnan(check.p_value) else check.distance < SLIGHT_DISTANCE
 
 
-def _test(found: Uniformity) -> str:
-    if np.isnan(found.p_value):
-        return f"distance {found.distance:.2g}; a test takes {FEWEST_RUNS} runs"
-    return f"distance {found.distance:.2g}, {probability_text(found.p_value)}"
+def _test(check: Uniformity) -> str:
+    if np.isnan(check.p_value):
+        return f"distance {check.distance:.2g}; a test takes {FEWEST_RUNS} runs"
+    return f"distance {check.distance:.2g}, {probability_text(check.p_value)}"
 
 
 def probability_text(p: float) -> str:

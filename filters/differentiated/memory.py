@@ -16,36 +16,36 @@ from thruster_env.model.shape import Shape, number_places, starts_of
 class Memory(NumbersMemory):
     """The arrays of `thruster_env.graphs.programs`, for a model's sizes.
 
-        rows      x, P, what is kept; the same as a stage leaves it; u, z; the score; the true x; what slopes need
-        change    of a parameter: dx, dP, d of what is kept; d score; of the information what `notes` says, twice
+        rows      x, P, extras; the same after a stage; u, z; the score; the true x; scratch of the slopes
+        change    by parameter: dx, dP, d extras; d score; for the information `notes` numbers, twice
         numbers   the model's; tails of two densities (`densities.tail_of`); the filter's own; weights of errors
-        move      of a parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start; of the filter's own
+        move      by parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start; d own parameters
 
-    Matrices lie by rows. Of what lies in `rows` and `change` there is one number for each run. A filter of points
-    has these during a step, in the place of x and P.
+    Matrices lie by rows. `rows` and `change` hold one number for each run. During a step, a filter of points has
+    its points in the place of x and P.
 
     Attributes:
-        flying: what is predicted: x and P, or the points.
-        moves: the slope of each matrix that a parameter may move, but those of the next two.
-        constants_slope, own_slopes: those of the constants, and of the filter's own parameters.
+        flying: the predicted quantities: x and P, or the points.
+        moves: the slope of each matrix that a parameter may move, except constants and own parameters.
+        constants_slope, own_slopes: slopes of the constants, and of the filter's own parameters.
     """
 
     def __init__(self, shape: Shape, page: Page):
         """Take the sizes, and the page of the filter."""
-        n, m, places = shape.n, shape.m, number_places(shape.n, shape.m)
-        tail = places.constants + shape.constants
+        n, m, layout = shape.n, shape.m, number_places(shape.n, shape.m)
+        tail = layout.constants + shape.constants
         self.tail, self.predicted_tail = tail, tail + m + 2
-        own = self.predicted_tail + m + 2
+        own_at = self.predicted_tail + m + 2
         x = input_matrix(Place("rows", 0), (n,))
-        super().__init__(shape, page, x, input_matrix(Place("rows", n), (n, n), symmetric=True, like=x), own)
+        super().__init__(shape, page, x, input_matrix(Place("rows", n), (n, n), symmetric=True, like=x), own_at)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
-        flying = (x, self.P) if page.represent is None else as_tuple(page.represent(model, x, self.P))
+        predicted = (x, self.P) if page.represent is None else as_tuple(page.represent(model, x, self.P))
         started = page.started(model)
         self.begun, self.notes = n + n * n, m + m * m
-        starts = starts_of(*(prod(one.shape) for one in flying))
+        starts = starts_of(*(prod(matrix.shape) for matrix in predicted))
         self.kept_from = max(self.begun, starts[-1])
-        of_kept = starts_of(self.kept_from, *(prod(one.shape) for one in started.values()))[1:]
+        of_kept = starts_of(self.kept_from, *(prod(matrix.shape) for matrix in started.values()))[1:]
         self.state = of_kept[-1]
         self.left, self.input, self.measured, self.level, self.true, self.length = starts_of(
             self.state, self.state, shape.inputs, m, 1, n
@@ -57,7 +57,7 @@ class Memory(NumbersMemory):
         self.ratio = self.ratio_in("rows", self.input)
         self.tails = [self.read("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
         self.truth = self.read("rows", self.true, n)
-        self.weights = self.read("numbers", own + page.own_size, n, n, symmetric=True)
+        self.weights = self.read("numbers", own_at + page.own_size, n, n, symmetric=True)
         self.constants_slope = self.read("move", c, shape.constants)
         self.size = self.read("move", size)
         self.moves: dict[Matrix, Matrix] = {
@@ -68,15 +68,17 @@ class Memory(NumbersMemory):
         }
         self.flying = [self.x, self.P]
         if page.represent is not None:
-            self.flying = [self._moving(*one) for one in zip(starts, flying, strict=False)]
+            self.flying = [self._moving(at, matrix) for at, matrix in zip(starts, predicted, strict=False)]
         self.kept = {
-            name: self._moving(at, one) for at, (name, one) in zip(of_kept, started.items(), strict=False)
+            name: self._moving(at, matrix) for at, (name, matrix) in zip(of_kept, started.items(), strict=False)
         }
-        slopes = page.parameters(lambda place, size: self.read("move", own_slopes + place, *size))
+        slopes = page.parameters(lambda offset, size: self.read("move", own_slopes + offset, *size))
         self.own_slopes = dict(zip(self.own[: len(page.own)], slopes, strict=False))
 
     def _moving(self, at: int, like: Matrix) -> Matrix:
-        """A matrix like another one that lies in `rows`, and its slope at the same place in `change`."""
-        made, slope = (self.read(array, at, *like.shape, symmetric=like.symmetric) for array in ("rows", "change"))
-        self.moves[made] = slope
-        return made
+        """A matrix like another one in `rows`, with its slope at the same offset in `change`."""
+        value, slope = (
+            self.read(array, at, *like.shape, symmetric=like.symmetric) for array in ("rows", "change")
+        )
+        self.moves[value] = slope
+        return value

@@ -1,7 +1,7 @@
-"""The recursion of a filter over some runs, with derivatives along parameters: what calls its stages.
+"""The recursion of a filter over runs, with derivatives along parameters.
 
-Runs lie side by side in memory, as many as a stage works on at once. What is accumulated is each run's own, so
-that it does not matter which of them lie together.
+As many runs lie side by side in memory as a stage works on at once. Sums are kept for each run, so the grouping of
+runs has no effect.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from thruster_env.model.shape import (
     transition_slopes,
 )
 
-# What is summed over a filter's steps, with its slopes: densities of innovations, or scores of true states.
+# The sum over a filter's steps, with its slopes: densities of innovations, or scores of true states.
 
 
-LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
+LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
 
 
 class Wanted(NamedTuple):
-    """What is worked out: a score, with its gradient, and what stands beside it."""
+    """The outputs of a recursion: a score with its gradient, and options."""
 
     information: bool  # Fisher's
     constants: bool  # slopes along the model's constants
@@ -60,13 +60,13 @@ class Wanted(NamedTuple):
 def density_of(
     memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted
 ) -> tuple[dict, dict]:
-    """The log density of an innovation, and of a parameter its slope, and what the information takes of both."""
-    seen, of = present(memory.z), factor(s)
-    w, e = quotient(v, of), inverse(of, seen)
-    level, weighted = density(v, of, seen), w
+    """The log density of an innovation, its slope along a parameter, and the terms of the information."""
+    measured, of = present(memory.z), factor(s)
+    w, e = quotient(v, of), inverse(of, measured)
+    level, weighted = density(v, of, measured), w
     if wanted.tails:
         q = dot(v, w)
-        level, weighted = level + heavier(q, seen, tail), w * outlier_weight(q, seen, tail)
+        level, weighted = level + heavier(q, measured, tail), w * outlier_weight(q, measured, tail)
     dv, ds = slopes_of([v, s], moves)
     slopes = {memory.slope: density_slope(w, weighted, e, dv, ds)}
     if wanted.information:
@@ -123,21 +123,21 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
     try:
         model = Equations(functions, memory, constants_move=wanted.constants, trace=True)
         stages = stages_of(memory, model, wanted, page)
-        made = [as_programs(stage, memory.length, MOST) for stage in stages]
-        works = [callable_of(program, AT_ONCE) for one in made for program in one[:2]]
+        compiled = [as_programs(stage, memory.length, MOST) for stage in stages]
+        works = [callable_of(program, AT_ONCE) for programs in compiled for program in programs[:2]]
         fingerprint, at_once = function_fingerprint(within=__name__), AT_ONCE
-    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+    except Exception:  # a user's function cannot be traced, whatever it raises: it is called instead
         model = Equations(functions, memory, constants_move=wanted.constants, trace=False)
         readers = {memory.constants: constants_reader(shape)}
-        made = [
+        compiled = [
             as_calls(stage, memory.length, model.called, readers)
             for stage in stages_of(memory, model, wanted, page)
         ]
-        works = [work for one in made for work in one[:2]]
+        works = [work for calls in compiled for work in calls[:2]]
         slopes = transition_slopes(functions, shape), observation_slopes(functions, shape)
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
-    length = max(one.length for one in made)
+    length = max(stage.length for stage in compiled)
     if page.initial is None:
         works[:0] = nothing, nothing
     if page.represent is None:
@@ -148,11 +148,11 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
 
 @inlined
 def nothing(rows, change, numbers, move):
-    """In place of a stage that a filter does not have."""
+    """Do nothing, in place of a stage that a filter does not have."""
 
 
 def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXTENDED) -> list[Stage]:
-    """The stages of a step, and what is done with channels that are predicted only."""
+    """The stages of a step, and with tails the density of channels that are predicted only."""
     x, p = memory.x, memory.P
     moves = dict(memory.moves)
     if wanted.constants:
@@ -161,52 +161,54 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     if wanted.own:
         moves |= memory.own_slopes
 
-    def moved(results: Any, more: dict | None = None, slopes: dict | None = None) -> Stage:
-        """What is predicted or kept, where it lies after the stage, and its slopes."""
+    def belief_stage(results: Any, more: dict | None = None, slopes: dict | None = None) -> Stage:
+        """A stage that stores results of the page and its extras, with their slopes."""
         *values, changed = with_extras(results)
-        kept = {name: changed.get(name, one) for name, one in memory.kept.items()}
-        starts = starts_of(*(prod(one.shape) for one in values))
-        left = dict(zip(starts, values, strict=False)) | _by_place(memory, kept)
-        found = stage_of({memory.left + at: one for at, one in left.items()} | (more or {}), left, moves)
-        still = {at: one * 0.0 for at, one in _by_place(memory, changed).items() if at not in found.slopes}
-        return found._replace(slopes=still | found.slopes | (slopes or {}))
+        extras = {name: changed.get(name, extra) for name, extra in memory.kept.items()}
+        starts = starts_of(*(prod(value.shape) for value in values))
+        left = dict(zip(starts, values, strict=False)) | _by_offset(memory, extras)
+        stage = stage_of({memory.left + at: value for at, value in left.items()} | (more or {}), left, moves)
+        still = {at: value * 0.0 for at, value in _by_offset(memory, changed).items() if at not in stage.slopes}
+        return stage._replace(slopes=still | stage.slopes | (slopes or {}))
 
     stages = []
     if page.initial is not None:
-        started = _by_place(memory, page.initial(model))
-        found = stage_of(started, started, moves)
-        stages.append(found._replace(slopes={at: one * 0.0 for at, one in started.items()} | found.slopes))
+        started = _by_offset(memory, page.initial(model))
+        stage = stage_of(started, started, moves)
+        stages.append(stage._replace(slopes={at: value * 0.0 for at, value in started.items()} | stage.slopes))
     model.extras = memory.kept
     if page.represent is not None:
-        stages.append(moved(page.represent(model, x, p)))
+        stages.append(belief_stage(page.represent(model, x, p)))
     stages += [
-        moved(page.propagate(model, *memory.flying, memory.u)),
-        moved(page.add_process_noise(model, *memory.flying)),
+        belief_stage(page.propagate(model, *memory.flying, memory.u)),
+        belief_stage(page.add_process_noise(model, *memory.flying)),
     ]
     mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
     if wanted.of_truth:
         known = present(memory.truth)
         off = only(known, wrap(memory.truth - mean, model.state_angles))
         of_truth = score_of_truth(memory, off, cov, moves, wanted.score)
-        stages.append(moved((mean, cov, changed), *of_truth))
+        stages.append(belief_stage((mean, cov, changed), *of_truth))
         return stages
-    stages.append(moved((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
+    stages.append(belief_stage((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
-        seen = present(memory.z)
-        v = only(seen, wrap(memory.z - model.h(x), model.measurement_angles))
-        stages.append(Stage(*density_of(memory, v, uncorrelated(seen, model.R), moves, memory.tails[1], wanted)))
+        measured = present(memory.z)
+        v = only(measured, wrap(memory.z - model.h(x), model.measurement_angles))
+        stages.append(
+            Stage(*density_of(memory, v, uncorrelated(measured, model.R), moves, memory.tails[1], wanted))
+        )
     return stages
 
 
-def _by_place(memory: Memory, kept: Mapping[str, Matrix]) -> dict[int, Matrix]:
-    return {memory.kept[name].operation.at: one for name, one in kept.items()}
+def _by_offset(memory: Memory, extras: Mapping[str, Matrix]) -> dict[int, Matrix]:
+    return {memory.kept[name].operation.at: extra for name, extra in extras.items()}
 
 
 def _accumulator(
     memory: Memory, works: list[Callable], wanted: Wanted, page: Page, at_once: int, fingerprint: str
 ) -> Callable:
     """The recursion over steps of some runs."""
-    start, start_slopes, begin, begin_slopes, advance, advance_slopes, settle, settle_slopes = works[:8]
+    start, start_slopes, begin, begin_slopes, advance, advance_slopes, add_noise, add_noise_slopes = works[:8]
     update, update_slopes = works[8:10]
     predicted, predicted_slopes = works[10:] or works[8:10]  # not called, if there are none
     begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.represent is None else -1
@@ -224,7 +226,7 @@ def _accumulator(
         begins,
         numbers,
         moves,
-        own,
+        moves_prior,
         counted_from,
         fed,
         turns,
@@ -232,7 +234,7 @@ def _accumulator(
         information,
         rows,
         changes,
-        told,
+        outputs,
         counted,
         first,
         last,
@@ -240,24 +242,24 @@ def _accumulator(
         fingerprint  # noqa: B018 - part of the cache's key
         count = out.shape[2] - 1
         for b in range(first, last, at_once):
-            there = min(at_once, last - b)  # beyond, the last run again
+            lanes = min(at_once, last - b)  # beyond, the last run again
             for j in range(at_once):
-                run = b + min(j, there - 1)
+                run = b + min(j, lanes - 1)
                 for i in range(begun):
                     rows[i * at_once + j] = begins[run, i]
                     for q in range(count):
-                        changes[q, i * at_once + j] = moves[q, prior + i] * own[run]
+                        changes[q, i * at_once + j] = moves[q, prior + i] * moves_prior[run]
             start(rows, changes[0], numbers, moves[0])
             for q in range(count):
                 start_slopes(rows, changes[q], numbers, moves[q])
                 for r in range(count):
                     for j in range(at_once):
-                        told[q, r, j] = 0.0
+                        outputs[q, r, j] = 0.0
             for k in range(measurements.shape[1]):
                 if k > 0:
                     for j in range(at_once):
                         for i in range(inputs_count):
-                            rows[(first_input + i) * at_once + j] = inputs[b + min(j, there - 1), k - 1, i]
+                            rows[(first_input + i) * at_once + j] = inputs[b + min(j, lanes - 1), k - 1, i]
                     for part in range(first_part, int(numbers[substeps]) + 1):
                         if part < 0:
                             begin(rows, changes[0], numbers, moves[0])
@@ -268,16 +270,16 @@ def _accumulator(
                             for q in range(count):
                                 advance_slopes(rows, changes[q], numbers, moves[q])
                         else:
-                            settle(rows, changes[0], numbers, moves[0])
+                            add_noise(rows, changes[0], numbers, moves[0])
                             for q in range(count):
-                                settle_slopes(rows, changes[q], numbers, moves[q])
+                                add_noise_slopes(rows, changes[q], numbers, moves[q])
                         for i in range(state):
                             for j in range(at_once):
                                 rows[i * at_once + j] = rows[(left + i) * at_once + j]
                 block = k * out.shape[1] // measurements.shape[1]
                 for turn in range(turns):
                     for j in range(at_once):
-                        run = b + min(j, there - 1)
+                        run = b + min(j, lanes - 1)
                         counted[j] = 1.0 if k >= counted_from[run] else 0.0
                         for i in range(channels):
                             z = measurements[run, k, i]
@@ -295,7 +297,7 @@ def _accumulator(
                         predicted(rows, changes[0], numbers, moves[0])
                         for q in range(count):
                             predicted_slopes(rows, changes[q], numbers, moves[q])
-                    for j in range(there):
+                    for j in range(lanes):
                         if counted[j] > 0.0:
                             out[b + j, block, 0] += rows[level * at_once + j]
                             for q in range(count):
@@ -309,11 +311,11 @@ def _accumulator(
                                             changes[q, (noted + i) * at_once + j]
                                             * changes[r, (weighed + i) * at_once + j]
                                         )
-                                        told[q, r, j] += product if counted[j] > 0.0 else 0.0
+                                        outputs[q, r, j] += product if counted[j] > 0.0 else 0.0
             if informative:
-                for j in range(there):
+                for j in range(lanes):
                     for q in range(count):
                         for r in range(q + 1):
-                            information[b + j, q, r] = information[b + j, r, q] = told[q, r, j]
+                            information[b + j, q, r] = information[b + j, r, q] = outputs[q, r, j]
 
     return accumulate

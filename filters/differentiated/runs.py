@@ -93,7 +93,7 @@ class ModelSlopes(NamedTuple):
 
     @classmethod
     def of(cls, model: StateSpaceModel, parameters: int, **moving: np.ndarray) -> ModelSlopes:
-        """Those of parameters that move what is named, and nothing else."""
+        """Slopes of parameters that move the named arrays, and nothing else."""
         still = (name for name in cls._fields if name not in moving)
         return cls(**moving, **{name: np.zeros((parameters, *np.shape(getattr(model, name)))) for name in still})
 
@@ -109,7 +109,7 @@ class ModelSlopes(NamedTuple):
 
 
 class Density(NamedTuple):
-    """Of innovations: degrees of freedom of Student's t, and which channels (m,) the filter sees."""
+    """The density of innovations: degrees of freedom of Student's t, and which channels (m,) the filter sees."""
 
     degrees: float
     seen: np.ndarray
@@ -138,9 +138,9 @@ def derivatives(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scores and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
 
-    Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked; and the filter
-    is used with the model in place of its own. Along a parameter its `own_parameters` may move
-    by `own_slopes`, (p, their count). Of what is not wanted there is nothing: (B, 0, 0).
+    Arguments are those of `filters.sensitivity.sensitivity`, with shapes already checked. The filter is used with
+    the model in place of its own. A parameter may move its `own_parameters` by `own_slopes`, (p, their count).
+    An output that is not wanted is empty: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
     given_model = model
@@ -162,51 +162,51 @@ def derivatives(
     wanted = wanted._replace(own=bool(own_slopes.any()))
     recursion = recursion_of(model.functions, model.shape, wanted, page)
     begun = as_the_prior_says(model, count) if starts is None else starts
-    own = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
-    given = density or Density(np.inf, np.ones(m))
-    turns = 1 if (given.seen > 0).all() else 2  # channels that are predicted only come behind the others
-    tails = [tail_of(np.inf, m), tail_of(given.degrees, m)]
+    moves_prior = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
+    density = density or Density(np.inf, np.ones(m))
+    turns = 1 if (density.seen > 0).all() else 2  # channels that are predicted only come after the others
+    tails = [tail_of(np.inf, m), tail_of(density.degrees, m)]
     states, weights = truth or Truth(np.zeros((count, 0, 0)), np.zeros(0))
     of_density = tails if turns == 2 else tails[::-1]
     numbers = np.concatenate([model.numbers, *of_density, own_parameters, np.diag(weights).ravel()])
     out = np.zeros((count, blocks, 1 + parameters))
     information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
     arguments = (
-        *(np.ascontiguousarray(one) for one in (inputs, measurements, states, _begins(model, begun))),
+        *(np.ascontiguousarray(array) for array in (inputs, measurements, states, _begins(model, begun))),
         numbers,
         _moves(slopes, own_slopes, model),
-        own,
+        moves_prior,
         begun.counted_from.astype(np.int64),
-        given.seen,
+        density.seen,
         turns,
         out,
         information,
     )
     at_once, sizes = recursion.at_once, recursion.sizes(parameters)
 
-    def some(first: int, last: int) -> None:
+    def run_some(first: int, last: int) -> None:
         memory = (np.zeros(size) for size in sizes)
         recursion.run(*arguments, *memory, first * at_once, min(last * at_once, count))
 
-    spread(some, -(-count // at_once))
+    spread(run_some, -(-count // at_once))
     return out, information
 
 
 def _following(used: PageFilter, model: StateSpaceModel, slopes: ModelSlopes) -> np.ndarray:
-    """How own parameters move (p, their count) that follow from numbers of the model, by central differences."""
-    found = np.zeros((len(slopes.constants), len(used.own_parameters)))
+    """Slopes (p, count) of own parameters that follow from numbers of the model, by central differences."""
+    changes = np.zeros((len(slopes.constants), len(used.own_parameters)))
     for name in {name for names in used.follows_from.values() for name in names}:
-        for row, slope in zip(found, getattr(slopes, name), strict=True):
+        for row, slope in zip(changes, getattr(slopes, name), strict=True):
             if slope.any():
                 ends = (getattr(model, name) + side * STEP * slope for side in (1.0, -1.0))
                 ahead, behind = (replace(used, model=model.replace(**{name: end})).own_parameters for end in ends)
                 row += np.subtract(ahead, behind) / (2.0 * STEP)
-    return found
+    return changes
 
 
-def same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
+def same_functions(first: StateSpaceModel, other: StateSpaceModel) -> bool:
     """Whether models differ in numbers alone, for which there are slopes."""
-    return (one.functions, one.shape, one.substeps) == (other.functions, other.shape, other.substeps)
+    return (first.functions, first.shape, first.substeps) == (other.functions, other.shape, other.substeps)
 
 
 def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
@@ -218,7 +218,7 @@ def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
 
 
 def _moves(slopes: ModelSlopes, own_slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """Rows of parameters, as `Memory` has them; at least one, for compiled code reads it."""
+    """Rows of parameters as in `Memory`; at least one, because compiled code reads it."""
     p, nn, mm = len(slopes.constants), model.n**2, model.m**2
     noise = slopes.process_noise_cov.reshape(p, nn), slopes.measurement_noise_cov.reshape(p, mm)
     prior = slopes.prior_mean, slopes.prior_cov.reshape(p, nn)

@@ -32,28 +32,28 @@ class Checks:
     def __init__(self, name: str, n: int, m: int, has_covariance: bool):
         self.name, self._sizes, self._has_covariance = name, {"n": (n,), "m": (m,)}, has_covariance
 
-    def output(self, given, where: str, leading: tuple[int, ...] = ()) -> Output:
+    def output(self, returned, where: str, leading: tuple[int, ...] = ()) -> Output:
         """The parts of an output as float64 arrays of shape (*leading, ...); ValueError if one is wrong.
 
         Args:
-            given: what the estimator returned `where`.
+            returned: output of the estimator.
             where: for messages, such as "step 3".
             leading: shape of all before the states: () of one step, (B, K + 1) of many runs.
         """
-        parts = given if isinstance(given, tuple) else (given,)
+        parts = returned if isinstance(returned, tuple) else (returned,)
         if not 1 <= len(parts) <= len(PARTS):
             raise ValueError(
                 f"{self._of} must give a mean, or a tuple of mean, covariance, innovation and its covariance, "
                 f"but gave a tuple of {len(parts)} at {where}"
             )
-        found = Output(*parts)
-        if self._has_covariance and found.cov is None:
+        output = Output(*parts)
+        if self._has_covariance and output.cov is None:
             raise ValueError(
                 f"{self._of} must give a covariance, or say has_covariance = False, but gave none at {where}"
             )
         checked = {
             name: None if value is None and name != "mean" else self._part(name, value, where, leading)
-            for name, value in found._asdict().items()
+            for name, value in output._asdict().items()
         }
         return Output(**checked)
 
@@ -77,8 +77,8 @@ class Checks:
                 f"{CALLED[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
             )
         if not np.isfinite(array).all():
-            place = _first(~np.isfinite(array), leading)
-            raise ValueError(f"{CALLED[name]} of {self._of} must be finite, but it is not at {place or where}")
+            location = _first(~np.isfinite(array), leading)
+            raise ValueError(f"{CALLED[name]} of {self._of} must be finite, but it is not at {location or where}")
         return self._covariance(name, array, where, leading) if is_cov else array
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
@@ -87,10 +87,10 @@ class Checks:
         wrong = (least < -ROUNDING) | (asymmetry > ROUNDING)
         covs = 0.5 * (covs + covs.swapaxes(-1, -2))
         if wrong.any():
-            place = _first(wrong, leading)
+            location = _first(wrong, leading)
             raise ValueError(
                 f"{CALLED[name]} of {self._of} must be symmetric and positive semidefinite, "
-                f"but it is not at {place or where}"
+                f"but it is not at {location or where}"
             )
         return covs
 
@@ -122,30 +122,30 @@ def log_likelihoods(
         measurements: (B, K + 1, m), NaN where missing.
         gaussian: whether the likelihood is Gaussian.
     """
-    there = ~np.isnan(measurements)
+    present = ~np.isnan(measurements)
     if not gaussian:
-        return np.where(there.any(axis=-1), np.nan, 0.0)
-    pairs = there[..., :, None] & there[..., None, :]
+        return np.where(present.any(axis=-1), np.nan, 0.0)
+    pairs = present[..., :, None] & present[..., None, :]
     s = np.where(pairs, covs, np.eye(covs.shape[-1]))
-    v = np.where(there, innovations, 0.0)
-    told = np.asarray(np.isfinite(s).all(axis=(-1, -2)) & np.isfinite(v).all(axis=-1))
-    s = np.where(told[..., None, None], s, np.eye(covs.shape[-1]))
-    definite = (np.linalg.eigvalsh(s)[..., 0] > 0.0) & told
+    v = np.where(present, innovations, 0.0)
+    complete = np.asarray(np.isfinite(s).all(axis=(-1, -2)) & np.isfinite(v).all(axis=-1))
+    s = np.where(complete[..., None, None], s, np.eye(covs.shape[-1]))
+    definite = (np.linalg.eigvalsh(s)[..., 0] > 0.0) & complete
     s = np.where(definite[..., None, None], s, np.eye(covs.shape[-1]))
     squares = (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(axis=-1)
-    found = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + there.sum(axis=-1) * math.log(2.0 * math.pi))
-    return np.where(there.any(axis=-1), np.where(definite, found, np.nan), 0.0)
+    densities = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + present.sum(axis=-1) * math.log(2.0 * math.pi))
+    return np.where(present.any(axis=-1), np.where(definite, densities, np.nan), 0.0)
 
 
 def without_missing(output: Output, z: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Innovation and S as filters have them where channels of z are NaN: zero, and no correlations to these."""
     innovation, s = output.innovation, output.innovation_cov
-    there = ~np.isnan(z)
-    if there.all():
+    present = ~np.isnan(z)
+    if present.all():
         return innovation, s
     if innovation is not None:
-        innovation = np.where(there, innovation, 0.0)
+        innovation = np.where(present, innovation, 0.0)
     if s is not None:
-        pairs = there[..., :, None] & there[..., None, :]
+        pairs = present[..., :, None] & present[..., None, :]
         s = np.where(pairs | np.eye(s.shape[-1], dtype=bool), s, 0.0)
     return innovation, s

@@ -11,24 +11,24 @@ class Output(NamedTuple):
 
     mean: Any  # of the state, (n,)
     cov: Any = None  # (n, n) or n variances; None of an estimator that has none
-    innovation: Any = None  # (m,), measurement less what was foreseen; None of one that does not tell
+    innovation: Any = None  # (m,), measurement less its prediction; None of an estimator without one
     innovation_cov: Any = None  # S, (m, m) or m variances
 
 
 class Estimator:
     """An estimator of one trajectory at a time; it keeps its own state, and its random draws follow from the key.
 
-    Each run begins with a deep copy of it. Generators of Python and NumPy that it holds are seeded by the key, and
-    so are the global ones, with that of torch.
+    Each run begins with a deep copy of it. The key seeds the generators of Python and NumPy that it holds, and the
+    global ones, also torch's.
 
-    A subclass defines `reset` and `step`; any other object with both is accepted too, and the rest defaults to
-    what is here. Each may return an `Output`, a tuple of the first of its parts, such as (mean, cov), or an array,
-    which is a mean alone. A method `run(keys, inputs, measurements)`, of keys (B, 2), inputs (B, K, p) and
-    measurements (B, K + 1, m), may take the place of both in evaluations: it returns the same for all trajectories
-    and steps, means (B, K + 1, n), covariances (B, K + 1, n, n) and so on.
+    A subclass defines `reset` and `step`; any other object with both is accepted too, and gets the defaults below
+    for the rest. Each may return an `Output`, a tuple of its first parts, such as (mean, cov), or an array, which
+    is the mean. In evaluations, a method `run(keys, inputs, measurements)` may replace both: with keys (B, 2),
+    inputs (B, K, p) and measurements (B, K + 1, m) it returns the same parts for all trajectories and steps, means
+    (B, K + 1, n), covariances (B, K + 1, n, n) and so on.
 
     Attributes:
-        name: for tables; the name under which it is found if None.
+        name: for tables; if None, the name by which the user refers to it.
         has_covariance: whether it gives covariances; NEES is left out where it does not.
         gaussian_likelihood: whether the likelihood of a measurement is N(innovation; 0, S); it is left out if not.
         parameters: its tunable parameters: `Parameter`s, each an argument of the function that makes it.
@@ -54,11 +54,15 @@ class Estimator:
         raise NotImplementedError(f"{type(self).__name__} has no step")
 
 
-def steps_alone(found) -> bool:
+def steps_alone(candidate) -> bool:
     """Whether something estimates one trajectory step by step."""
-    return not isinstance(found, type) and all(callable(getattr(found, name, None)) for name in ("reset", "step"))
+    return not isinstance(candidate, type) and all(
+        callable(getattr(candidate, name, None)) for name in ("reset", "step")
+    )
 
 
-def is_estimator(found) -> bool:
-    """Whether something is an estimator, of one trajectory or of many at once, rather than what makes one."""
-    return steps_alone(found) or (not isinstance(found, type) and callable(getattr(found, "run", None)))
+def is_estimator(candidate) -> bool:
+    """Whether something is an estimator, of one trajectory or of many at once, and not a factory of estimators."""
+    return steps_alone(candidate) or (
+        not isinstance(candidate, type) and callable(getattr(candidate, "run", None))
+    )

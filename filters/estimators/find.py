@@ -15,66 +15,68 @@ from thruster_env.model.state_space import StateSpaceModel
 TRAINED = ".safetensors"  # the end of the name of a trained estimator's file
 
 
-def is_trained(given) -> bool:
+def is_trained(argument) -> bool:
     """Whether something is the name of a file of `thruster train-estimator`."""
-    return isinstance(given, str | Path) and str(given).endswith(TRAINED)
+    return isinstance(argument, str | Path) and str(argument).endswith(TRAINED)
 
 
-def is_foreign(given) -> bool:
+def is_foreign(argument) -> bool:
     """Whether something stands for an estimator of another package, and is not the name of a filter."""
     return (
-        is_trained(given)
-        or is_code(given)
-        or (not isinstance(given, str) and (is_estimator(given) or callable(given)))
+        is_trained(argument)
+        or is_code(argument)
+        or (not isinstance(argument, str) and (is_estimator(argument) or callable(argument)))
     )
 
 
-def label_of(given) -> str:
+def label_of(argument) -> str:
     """The label of a user's estimator: "module:object", its own name, that of its factory, or of its file."""
-    if is_trained(given):
-        return Path(given).stem
-    if isinstance(given, str):
-        return given
-    for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
+    if is_trained(argument):
+        return Path(argument).stem
+    if isinstance(argument, str):
+        return argument
+    for name in (getattr(argument, "name", None), getattr(argument, "__name__", None)):
         if isinstance(name, str) and name:
             return name
-    return type(given).__name__
+    return type(argument).__name__
 
 
-def is_filter_class(given) -> bool:
+def is_filter_class(argument) -> bool:
     """Whether something is a user's class of filters."""
-    return isinstance(given, type) and issubclass(given, Filter)
+    return isinstance(argument, type) and issubclass(argument, Filter)
 
 
-def estimator_named(given) -> Any:
+def estimator_named(argument) -> Any:
     """A user's estimator argument: what a trained one's file makes, the object of "module:object", or itself."""
-    if is_trained(given):
+    if is_trained(argument):
         from filters.learned import read_estimator
 
-        return read_estimator(given)
-    return object_named(given, "estimator") if isinstance(given, str) else given
+        return read_estimator(argument)
+    return object_named(argument, "estimator") if isinstance(argument, str) else argument
 
 
-def as_filter(found: Any, label: str, model: StateSpaceModel, numbers: dict) -> Filter:
+def as_filter(estimator: Any, label: str, model: StateSpaceModel, numbers: dict) -> Filter:
     """An estimator in the place of a filter.
 
     Args:
-        found: an estimator; or a function, or class, of a model (and of `numbers`) that makes one, or a `Filter`.
+        estimator: an estimator; or a function or class that makes one, or a `Filter`, from a model and `numbers`.
         label: its name in tables, if it does not name itself.
-        model: of states, inputs and measurements: what a function gets, and where names and angles come from.
+        model: passed to the function; it names states, inputs and measurements and says which are angles.
         numbers: further arguments of the function.
 
     Raises:
         ValueError: if it neither is an estimator nor makes one.
     """
-    if not is_estimator(found):
-        found = _made(found, label, model, numbers)
+    if not is_estimator(estimator):
+        estimator = _made(estimator, label, model, numbers)
     elif numbers:
         raise ValueError(
             f"numbers must come with a function that makes an estimator, but {label!r} is one already, and got "
             f"{', '.join(numbers)}"
         )
-    return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
+    if isinstance(estimator, Filter):
+        return estimator
+    return ForeignFilter(model=model, estimator=estimator, label=label)
 
 
 def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
@@ -82,13 +84,13 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
     if not callable(make):
         raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {short_repr(make)}")
     try:
-        found = make(model=model, **numbers) if is_filter_class(make) else make(model, **numbers)
+        result = make(model=model, **numbers) if is_filter_class(make) else make(model, **numbers)
     except Exception as error:
         wanted = ", ".join(["a model", *numbers])
         raise ValueError(f"{what} must be made of {wanted}, but raised {error_line(error)}") from error
-    if not isinstance(found, Filter) and not is_estimator(found):
+    if not isinstance(result, Filter) and not is_estimator(result):
         raise ValueError(
             f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, "
-            f"measurements), but made {short_repr(found)}"
+            f"measurements), but made {short_repr(result)}"
         )
-    return found
+    return result

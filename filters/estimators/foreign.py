@@ -17,7 +17,7 @@ from thruster_env.core.global_generators import GlobalGenerators, seeded_copy
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import GLOBAL_GENERATORS, derived_seed
 
-DIFFERENCE = 1e-6  # of two runs of a key, as part of the largest number: threads leave less
+DIFFERENCE = 1e-6  # between two runs of a key, relative to the largest number: threads differ by less
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,20 +43,20 @@ class ForeignFilter(Filter):
 
     def __post_init__(self):
         """Read the estimator's declarations."""
-        found = self.estimator
-        if not is_estimator(found):
+        estimator = self.estimator
+        if not is_estimator(estimator):
             raise ValueError(
                 f"an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
-                f"but got {short_repr(found)}"
+                f"but got {short_repr(estimator)}"
             )
-        check = getattr(found, "check_model", None)
+        check = getattr(estimator, "check_model", None)
         if callable(check):
             check(self.model)
-        own = getattr(found, "name", None)
-        name = own if isinstance(own, str) and own else self.label or type(found).__name__
+        declared = getattr(estimator, "name", None)
+        name = declared if isinstance(declared, str) and declared else self.label or type(estimator).__name__
         object.__setattr__(self, "name", name)
         for fact in ("has_covariance", "gaussian_likelihood"):
-            object.__setattr__(self, fact, bool(getattr(found, fact, True)))
+            object.__setattr__(self, fact, bool(getattr(estimator, fact, True)))
 
     def kernels(self) -> Kernels:
         """Raise ValueError: another package's estimator cannot be compiled."""
@@ -78,7 +78,7 @@ class ForeignFilter(Filter):
         return ValueError(f"this needs a filter of filters.FILTERS, but got the estimator {self.name!r}")
 
     def session(self, gate: float | None = None) -> EstimatorSession:
-        """The estimator at work on one trajectory; ValueError for a gate, which it would have to have itself."""
+        """The estimator on one trajectory; ValueError for a gate, which it would need to have itself."""
         if gate is not None:
             raise ValueError(f"a gate needs a filter of filters.FILTERS, but got {self.name!r}")
         return EstimatorSession(self)
@@ -96,20 +96,20 @@ class ForeignFilter(Filter):
         likelihoods[:] = log_likelihoods(innovations, innovation_covs, measurements, self.gaussian_likelihood)
 
     def _at_once(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
-        generators, given = GlobalGenerators(), (keys.astype(np.int64), inputs.copy(), z.copy())
-        seed = seed_of(given[0][0]) if len(keys) else 0
+        generators, arguments = GlobalGenerators(), (keys.astype(np.int64), inputs.copy(), z.copy())
+        seed = seed_of(arguments[0][0]) if len(keys) else 0
         generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
         try:
             with generators.used():
-                returned = _copied(self.estimator, seed).run(*given)
+                returned = _copied(self.estimator, seed).run(*arguments)
         except Exception as error:
             raise ValueError(
                 f"the estimator {self.name!r} must not raise, but its run raised {error_line(error)}"
             ) from error
         checks = Checks(self.name, self.model.n, self.model.m, self.has_covariance)
-        found = checks.output(returned, "run", z.shape[:2])
-        innovation, s = without_missing(found, z)
-        for part, values in zip(out, Output(found.mean, found.cov, innovation, s), strict=True):
+        output = checks.output(returned, "run", z.shape[:2])
+        innovation, s = without_missing(output, z)
+        for part, values in zip(out, Output(output.mean, output.cov, innovation, s), strict=True):
             part[...] = absent(part is out[1]) if values is None else values
 
     def _one_by_one(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
@@ -129,9 +129,9 @@ class ForeignFilter(Filter):
             object.__setattr__(self, "_repeats", True)
 
 
-def _run(session: EstimatorSession, b: int, given: tuple, out: tuple) -> None:
+def _run(session: EstimatorSession, b: int, arguments: tuple, out: tuple) -> None:
     """Put run b into arrays: (K + 1, n) of means, and more of the session's parts if there are more arrays."""
-    keys, inputs, z = given
+    keys, inputs, z = arguments
 
     def keep(k: int) -> None:
         now = session.mean, session.cov, session.innovation, session.innovation_cov

@@ -51,14 +51,14 @@ class FilterPyEstimator(Estimator):
 
     def check_model(self, model: StateSpaceModel) -> None:
         """Raise ValueError unless the filter subtracts and averages the angles of a model as angles."""
-        own, lacks = self._given, []
+        filter_, lacks = self._given, []
         for kind, angles in (("x", model.shape.state_angles), ("z", model.shape.measurement_angles)):
             if not any(angles):
                 continue
-            if hasattr(own, "points_fn"):
-                plain = getattr(own, f"residual_{kind}", np.subtract) is np.subtract
+            if hasattr(filter_, "points_fn"):
+                plain = getattr(filter_, f"residual_{kind}", np.subtract) is np.subtract
                 lacks += [f"residual_{kind}"] * plain
-                lacks += [f"{kind}_mean_fn"] * (getattr(own, f"{kind}_mean", None) is None)
+                lacks += [f"{kind}_mean_fn"] * (getattr(filter_, f"{kind}_mean", None) is None)
             elif kind == "z" and "residual" not in self._arguments:
                 lacks.append("residual")
         if lacks:
@@ -82,56 +82,60 @@ class FilterPyEstimator(Estimator):
         return self._updated(z)
 
     def _updated(self, z) -> Output:
-        own, z = self.filter, np.asarray(z, dtype=np.float64)
-        there = ~np.isnan(z)
+        filter_, z = self.filter, np.asarray(z, dtype=np.float64)
+        present = ~np.isnan(z)
         # Channels that are missing have no innovation, and no correlation to the others.
-        innovation, s = np.zeros(len(z)), np.array(own.R, dtype=np.float64)
-        if there.any():
-            measured = z[there, None] if np.ndim(own.x) == 2 else z[there]
-            if there.all():
-                own.update(measured, **self._arguments)
+        innovation, s = np.zeros(len(z)), np.array(filter_.R, dtype=np.float64)
+        if present.any():
+            measured = z[present, None] if np.ndim(filter_.x) == 2 else z[present]
+            if present.all():
+                filter_.update(measured, **self._arguments)
             else:
-                self._update_some(measured, there)
-            innovation[there] = np.ravel(own.y)
-            s[np.ix_(there, there)] = own.S
-        return Output(np.ravel(own.x).copy(), np.array(own.P), innovation, s)
+                self._update_some(measured, present)
+            innovation[present] = np.ravel(filter_.y)
+            s[np.ix_(present, present)] = filter_.S
+        return Output(np.ravel(filter_.x).copy(), np.array(filter_.P), innovation, s)
 
-    def _update_some(self, measured: np.ndarray, there: np.ndarray) -> None:
-        """An update with some channels alone, whose angles are subtracted and averaged as if all were there."""
-        own, given = self.filter, dict(self._arguments)
-        if "residual" in given:
-            given["residual"] = _for_some(given["residual"], there)
-        kept = {name: getattr(own, name, None) for name in ("residual_z", "z_mean")}
-        found = {name: _for_some(one, there) for name, one in kept.items() if one not in (None, np.subtract)}
-        vars(own).update(found)
-        own.update(measured, **{**given, **self._of_some(there)})
-        vars(own).update({name: kept[name] for name in found})
+    def _update_some(self, measured: np.ndarray, present: np.ndarray) -> None:
+        """Update with the present channels alone; functions of angles see vectors of all channels."""
+        filter_, arguments = self.filter, dict(self._arguments)
+        if "residual" in arguments:
+            arguments["residual"] = _for_some(arguments["residual"], present)
+        originals = {name: getattr(filter_, name, None) for name in ("residual_z", "z_mean")}
+        replaced = {
+            name: _for_some(function, present)
+            for name, function in originals.items()
+            if function not in (None, np.subtract)
+        }
+        vars(filter_).update(replaced)
+        filter_.update(measured, **{**arguments, **self._of_some(present)})
+        vars(filter_).update({name: originals[name] for name in replaced})
 
-    def _of_some(self, there: np.ndarray) -> dict:
-        """Arguments of an update with some channels alone."""
-        own, given = self.filter, self._arguments
-        found = {"R": np.asarray(own.R)[np.ix_(there, there)]}
-        if "HJacobian" in given:
-            return found | {
-                "HJacobian": lambda x, *rest: np.asarray(given["HJacobian"](x, *rest))[there],
-                "Hx": lambda x, *rest: np.asarray(given["Hx"](x, *rest))[there],
+    def _of_some(self, present: np.ndarray) -> dict:
+        """Arguments of an update with the present channels alone."""
+        filter_, arguments = self.filter, self._arguments
+        reduced = {"R": np.asarray(filter_.R)[np.ix_(present, present)]}
+        if "HJacobian" in arguments:
+            return reduced | {
+                "HJacobian": lambda x, *rest: np.asarray(arguments["HJacobian"](x, *rest))[present],
+                "Hx": lambda x, *rest: np.asarray(arguments["Hx"](x, *rest))[present],
             }
-        if hasattr(own, "H"):
-            return found | {"H": np.asarray(own.H)[there]}
-        return found | {"hx": lambda x, **rest: np.asarray(own.hx(x, **rest))[there]}
+        if hasattr(filter_, "H"):
+            return reduced | {"H": np.asarray(filter_.H)[present]}
+        return reduced | {"hx": lambda x, **rest: np.asarray(filter_.hx(x, **rest))[present]}
 
 
-def _for_some(function: Callable, there: np.ndarray) -> Callable:
-    """A function of vectors of all channels as one of those that are there, the others zero."""
+def _for_some(function: Callable, present: np.ndarray) -> Callable:
+    """Make a function of all channels one of the present channels; the others are zero."""
 
-    def whole(part):
-        out = np.zeros((*np.shape(part)[:-1], len(there)))
-        out[..., there] = part
+    def padded(part):
+        out = np.zeros((*np.shape(part)[:-1], len(present)))
+        out[..., present] = part
         return out
 
     def of_some(first, second):
         weights = np.ndim(first) == 2  # a mean, of sigma points and their weights
-        return np.asarray(function(whole(first), second if weights else whole(second)))[..., there]
+        return np.asarray(function(padded(first), second if weights else padded(second)))[..., present]
 
     return of_some
 
@@ -175,10 +179,10 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     of_angles = functions("x", shape.state_angles) | functions("z", shape.measurement_angles)
     if any(shape.state_angles):
         of_angles["state_add"] = lambda x, change: wrapped_where(x + change, shape.state_angles)
-    found = UnscentedKalmanFilter(model.n, model.m, 1.0, hx=look, fx=advance, points=points, **of_angles)
-    found.x, found.P = model.prior_mean.copy(), model.prior_cov.copy()
-    found.Q, found.R = model.process_noise_cov.copy(), model.measurement_noise_cov.copy()
-    return FilterPyEstimator(found, name="filterpy ukf")
+    filter_ = UnscentedKalmanFilter(model.n, model.m, 1.0, hx=look, fx=advance, points=points, **of_angles)
+    filter_.x, filter_.P = model.prior_mean.copy(), model.prior_cov.copy()
+    filter_.Q, filter_.R = model.process_noise_cov.copy(), model.measurement_noise_cov.copy()
+    return FilterPyEstimator(filter_, name="filterpy ukf")
 
 
 # Stone Soup's predictors and updaters as an estimator.
@@ -228,7 +232,7 @@ class StoneSoupEstimator(Estimator):
 
         foreseen = np.ravel(self._updater.measurement_model.function(self._prior, noise=False))
         pairs = zip(model.measurements, foreseen, strict=True)
-        plain = [one.symbol for one, value in pairs if one.angle and not isinstance(value, Angle)]
+        plain = [quantity.symbol for quantity, value in pairs if quantity.angle and not isinstance(value, Angle)]
         if plain:
             raise ValueError(
                 f"the estimator {self.name!r} must have a measurement model that gives angles as such "

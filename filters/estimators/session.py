@@ -16,10 +16,10 @@ from thruster_env.model.continuous import same_dt
 
 
 class EstimatorSession:
-    """The counterpart of a filter's `Session`: an own copy of an estimator on one trajectory, outputs checked.
+    """The counterpart of a filter's `Session`: a copy of an estimator on one trajectory, with checked outputs.
 
-    Each trajectory begins with the estimator as it was given; generators that it holds, and the global ones of
-    Python, NumPy and torch, follow from the key. So what was before changes nothing.
+    Each trajectory begins with a fresh copy of the user's estimator. The key seeds the generators that it holds
+    and the global ones of Python, NumPy and torch, so earlier trajectories have no effect.
 
     Attributes:
         generators: the estimator's global generators.
@@ -72,7 +72,7 @@ class EstimatorSession:
             self._filter.check_noise(process_noise_cov=factor)
 
     def set_dt(self, dt: float) -> None:
-        """Raise ValueError: an estimator knows of no dt."""
+        """Raise ValueError: an estimator has no dt."""
         raise self._fixed("dt")
 
     def set_parameter(self, name: str, value: float) -> None:
@@ -87,10 +87,10 @@ class EstimatorSession:
 
     def _take(self, method: str, first, z: np.ndarray) -> None:
         where = f"step {self._steps}"
-        given = z.copy()  # an estimator may write into it, or keep it
+        copied = z.copy()  # an estimator may write into it, or keep it
         try:
             with self.generators.used():
-                returned = getattr(self._estimator, method)(first, given)
+                returned = getattr(self._estimator, method)(first, copied)
         except Exception as error:
             raise ValueError(
                 f"the estimator {self._checks.name!r} must not raise, but its {method} raised {error_line(error)} "
@@ -98,17 +98,17 @@ class EstimatorSession:
             ) from error
         output = self._checks.output(returned, where)
         innovation, s = without_missing(output, z)
-        for own, found in (
+        for attribute, value in (
             (self.mean, output.mean),
             (self.cov, output.cov),
             (self.innovation, innovation),
             (self.innovation_cov, s),
         ):
-            own[...] = absent(own is self.cov) if found is None else found
+            attribute[...] = absent(attribute is self.cov) if value is None else value
 
 
 def seed_of(key) -> int:
-    """The seed of what an estimator draws from, in the run of a key."""
+    """The seed of an estimator's generators in the run of a key."""
     return int(key[0]) << 32 | int(key[1])
 
 

@@ -19,9 +19,9 @@ class TrackedBelief(TensorBelief):
     """A belief of an ensemble that can leave its derivatives behind."""
 
     def detach(self) -> TrackedBelief:
-        """The same belief, along which no derivative goes back."""
-        kept = {name: one.detach() for name, one in self.kept.items()}
-        return self._replace(mean=self.mean.detach(), cov=self.cov.detach(), kept=kept)
+        """The same belief, detached from its derivatives."""
+        extras = {name: tensor.detach() for name, tensor in self.kept.items()}
+        return self._replace(mean=self.mean.detach(), cov=self.cov.detach(), kept=extras)
 
 
 class DifferentiableEnsembleFilter(LearnedEstimator):
@@ -52,8 +52,8 @@ class DifferentiableEnsembleFilter(LearnedEstimator):
         ensemble, equations = make_filter("enkf", model, ensemble_size=ensemble_size), self.equations
         self.tensors = filters.torch(ensemble, transition=equations.transition, observe=equations.observe)
         self.of_state, self.of_measurement = (
-            nn.Sequential(nn.Linear(given, width), nn.Tanh(), starting_at_zero(nn.Linear(width, factors)))
-            for given, factors in ((model.n + model.inputs, model.n), (model.m, model.m))
+            nn.Sequential(nn.Linear(size, width), nn.Tanh(), starting_at_zero(nn.Linear(width, factors)))
+            for size, factors in ((model.n + model.inputs, model.n), (model.m, model.m))
         )
         self.register_buffer("process_noise_cov", torch.tensor(model.process_noise_cov))
         self.register_buffer("measurement_noise_cov", torch.tensor(model.measurement_noise_cov))
@@ -65,19 +65,19 @@ class DifferentiableEnsembleFilter(LearnedEstimator):
 
     def advance(self, track: Track, u: Tensor, z: Tensor) -> Track:
         """The members a step later, updated with the measurements."""
-        x, given = (track.mean - self.scale_state_mean) / self.scale_state, u - self.scale_input_mean
-        factors = self.of_state(torch.cat([compressed(x), compressed(given / self.scale_input)], -1))
+        x, centred = (track.mean - self.scale_state_mean) / self.scale_state, u - self.scale_input_mean
+        factors = self.of_state(torch.cat([compressed(x), compressed(centred / self.scale_input)], -1))
         tensors = self.tensors.replace(process_noise_cov=_times(self.process_noise_cov, factors))
         return self._updated(tensors.predict(track.memory[0], u), z)
 
     def _updated(self, belief: TensorBelief, z: Tensor) -> Track:
-        equations, seen = self.equations, ~torch.isnan(z)
+        equations, present = self.equations, ~torch.isnan(z)
         innovation = equations.of_measurement(z - equations.measured(belief.mean))
-        innovation = torch.where(seen, innovation / self.scale_innovation, 0.0)
+        innovation = torch.where(present, innovation / self.scale_innovation, 0.0)
         factors = self.of_measurement(compressed(innovation))
         tensors = self.tensors.replace(measurement_noise_cov=_times(self.measurement_noise_cov, factors))
-        belief, found = tensors.update(belief, z)
-        return Track(belief.mean, belief.cov, found.value, found.cov, (TrackedBelief(*belief),))
+        belief, updated = tensors.update(belief, z)
+        return Track(belief.mean, belief.cov, updated.value, updated.cov, (TrackedBelief(*belief),))
 
 
 def _times(cov: Tensor, factors: Tensor) -> Tensor:

@@ -37,8 +37,8 @@ class Equations:
 
     def moved_with_jacobian(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """f(x, u) over a whole step, (B, n), and df/dx, (B, n, n), along which nothing is differentiated."""
-        found, slopes = _WithSlopes.apply(x, u.numpy(), self._moved)
-        return self.of_state(found), slopes
+        propagated, slopes = _WithSlopes.apply(x, u.numpy(), self._moved)
+        return self.of_state(propagated), slopes
 
     def measured(self, x: Tensor) -> Tensor:
         """h(x), (B, m)."""
@@ -57,12 +57,10 @@ class Equations:
         return self._of_components(1, x, (x[0],) * self.model.inputs)
 
     def _of_components(self, which: int, x: tuple[Tensor, ...], u: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        rows, given = (
-            torch.stack(tuple(one), -1).flatten(0, -2) if len(one) else x[0].new_zeros(x[0].numel(), 0)
-            for one in (x, u)
-        )
-        found = _WithSlopes.apply(rows, given.detach().numpy(), partial(self._at, which))[0]
-        return found.unflatten(0, x[0].shape).unbind(-1)
+        empty = x[0].new_zeros(x[0].numel(), 0)
+        rows, inputs = (torch.stack(tuple(a), -1).flatten(0, -2) if len(a) else empty for a in (x, u))
+        result = _WithSlopes.apply(rows, inputs.detach().numpy(), partial(self._at, which))[0]
+        return result.unflatten(0, x[0].shape).unbind(-1)
 
     def of_state(self, x: Tensor) -> Tensor:
         """A state or a difference of states, its angles in (-pi, pi]."""
@@ -73,11 +71,11 @@ class Equations:
         return wrapped_where(z, self.model.shape.measurement_angles)
 
     def _moved(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, whole = self._at(0, x, u)
+        x, jacobian = self._at(0, x, u)
         for _ in range(self.model.substeps - 1):
             x, slopes = self._at(0, x, u)
-            whole = slopes @ whole
-        return x, whole
+            jacobian = slopes @ jacobian
+        return x, jacobian
 
     def _measured(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._at(1, x, u)

@@ -1,4 +1,4 @@
-"""`LearnedEstimator`: what estimators with a network have in common."""
+"""`LearnedEstimator`: the base of estimators with a network."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MOST = 10_000  # members, or hidden states
 
 
 class Track(NamedTuple):
-    """What an estimator knows of a batch after a step.
+    """An estimator's results for a batch after a step, with its memory.
 
     Attributes:
         mean: of the states, (B, n).
         cov: (B, n, n); None of an estimator that has none.
         innovation: (B, m), zero in missing channels; None of one that has none.
         innovation_cov: (B, m, m), or None.
-        memory: what else it needs for the next step: tensors, or what has a method `detach`.
+        memory: further input of the next step: tensors, or objects with a method `detach`.
     """
 
     mean: Tensor
@@ -35,9 +35,9 @@ class Track(NamedTuple):
     memory: tuple
 
     def detach(self) -> Self:
-        """The same numbers, along which no derivative goes back."""
-        known = {name: one.detach() for name, one in self._asdict().items() if isinstance(one, Tensor)}
-        return self._replace(**known, memory=tuple(one.detach() for one in self.memory))
+        """The same numbers, detached from their derivatives."""
+        known = {name: tensor.detach() for name, tensor in self._asdict().items() if isinstance(tensor, Tensor)}
+        return self._replace(**known, memory=tuple(tensor.detach() for tensor in self.memory))
 
 
 class Scales(NamedTuple):
@@ -75,8 +75,8 @@ class Scales(NamedTuple):
 class LearnedEstimator(nn.Module):
     """An estimator with a network, with the interface of `filters.estimators.Estimator`, in float64.
 
-    A subclass makes its layers in `build`, and says in `begin` and `advance` what a step does. Estimates of a
-    trajectory that are not finite begin again with the prior.
+    A subclass makes its layers in `build` and defines the first step in `begin`, the others in `advance`. If an
+    estimate is not finite, its trajectory restarts from the prior.
 
     Attributes:
         kind: its name.
@@ -110,7 +110,7 @@ class LearnedEstimator(nn.Module):
 
         Args:
             model: of states, inputs and measurements, with their equations.
-            scales: of its quantities; ones and zeros if None, for a file that has others.
+            scales: of its quantities; ones and zeros if None, for a file that brings its own.
             **options: in place of the defaults.
 
         Raises:
@@ -163,14 +163,14 @@ class LearnedEstimator(nn.Module):
 
     def run(self, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Output:
         """All estimates of trajectories at once: keys (B, 2), inputs (B, K, p), measurements (B, K + 1, m)."""
-        u, z = (torch.tensor(as_floats(one), dtype=torch.float64) for one in (inputs, measurements))
+        u, z = (torch.tensor(as_floats(array), dtype=torch.float64) for array in (inputs, measurements))
         with torch.no_grad(), one_thread():
             track = self.begin(keys, z[:, 0])
             tracks = [track]
             for k in range(u.shape[1]):
                 track = self.advance(track, u[:, k], z[:, k + 1])
                 tracks.append(track)
-        parts = zip(*(one[:4] for one in tracks), strict=True)
+        parts = zip(*(results[:4] for results in tracks), strict=True)
         return Output(*(None if part[0] is None else torch.stack(part, 1).numpy() for part in parts))
 
     def _row(self, values) -> Tensor:
@@ -178,7 +178,7 @@ class LearnedEstimator(nn.Module):
 
     def _output(self) -> Output:
         assert self._track is not None
-        return Output(*(None if one is None else one[0].numpy() for one in self._track[:4]))
+        return Output(*(None if tensor is None else tensor[0].numpy() for tensor in self._track[:4]))
 
 
 def unit_scales(model: StateSpaceModel) -> Scales:

@@ -20,7 +20,7 @@ from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel
 
 LEARNED = {
-    one.kind: one for one in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)
+    kind.kind: kind for kind in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)
 }
 FORMAT = 1
 SHOWN = 5  # constants that differ, of those that an error names
@@ -46,7 +46,7 @@ class TrainedEstimator:
             with safe_open(self.path, framework="pt") as file:
                 self.about = json.loads((file.metadata() or {})[DESCRIPTION])
                 self._numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-            wrong = [name for name, one in self._numbers.items() if not one.isfinite().all()]
+            wrong = [name for name, tensor in self._numbers.items() if not tensor.isfinite().all()]
             if wrong:
                 raise ValueError(f"{', '.join(wrong)} must be finite, but have NaN or infinity")
             if self.about["format"] != FORMAT:
@@ -57,7 +57,9 @@ class TrainedEstimator:
             constants = dict(self.about.get("constants") or {})  # older files have none
             self._constants = {str(key): float(value) for key, value in constants.items()}
             if self._quantities is not None:
-                self._quantities = [[tuple(map(str, one)) for one in some] for some in self._quantities]
+                self._quantities = [
+                    [tuple(map(str, quantity)) for quantity in entries] for entries in self._quantities
+                ]
         except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"an estimator's file must be one of `thruster train-estimator`, but {self.path} is not: {error}"
@@ -68,13 +70,13 @@ class TrainedEstimator:
         """The estimator for a model; ValueError for another model than that of the training."""
         kind = LEARNED[self.name]
         self._check(model, kind.needs_model)
-        made = kind(model, **self._options)
+        estimator = kind(model, **self._options)
         try:
-            made.load_state_dict(self._numbers)
+            estimator.load_state_dict(self._numbers)
         except RuntimeError as error:
-            said = "; ".join(line.strip() for line in str(error).splitlines()[1:]) or str(error)
-            raise ValueError(f"{self.path} must have the numbers of a {self.name}, but: {said}") from None
-        return made
+            reason = "; ".join(line.strip() for line in str(error).splitlines()[1:]) or str(error)
+            raise ValueError(f"{self.path} must have the numbers of a {self.name}, but: {reason}") from None
+        return estimator
 
     def _check(self, model: StateSpaceModel, needs_model: bool) -> None:
         """Raise ValueError for another model; without a model's equations for other names and units of quantities.
@@ -82,16 +84,16 @@ class TrainedEstimator:
         Names that nobody has chosen, such as x_1 without a unit, are those of any plant, and so are missing ones:
         then the equations must agree.
         """
-        found = quantities_of(model)
+        quantities = quantities_of(model)
         if model.digest == self._digest:
             return
-        if not needs_model and found == self._quantities and not _are_unnamed(model):
+        if not needs_model and quantities == self._quantities and not _are_unnamed(model):
             return
         rule = f"{self.path} must be used with the model that it was trained with"
-        if self._quantities is not None and found != self._quantities:
-            both = zip(self._quantities, found, strict=True)
-            own, given = next((_listed(one), _listed(other)) for one, other in both if one != other)
-            raise ValueError(f"{rule}, {own}, but got {given}")
+        if self._quantities is not None and quantities != self._quantities:
+            both = zip(self._quantities, quantities, strict=True)
+            expected, actual = next((_listed(stored), _listed(other)) for stored, other in both if stored != other)
+            raise ValueError(f"{rule}, {expected}, but got {actual}")
         then, now = self._constants, constants_of(model)
         differing = [
             f"{name} {then[name]:.4g} (here {value:.4g})"
@@ -107,20 +109,20 @@ class TrainedEstimator:
 
 def quantities_of(model: StateSpaceModel) -> list[list[tuple[str, str]]]:
     """Symbols and units of states, inputs and measurements."""
-    return [[(one.symbol, one.unit) for one in some] for some in model.quantities]
+    return [[(quantity.symbol, quantity.unit) for quantity in quantities] for quantities in model.quantities]
 
 
 def constants_of(model: StateSpaceModel) -> dict[str, float]:
     """The named constants of a model that are numbers, which tell one preset from another."""
     named: dict = getattr(model.constants, "_asdict", dict)()
-    return {name: float(one) for name, one in named.items() if isinstance(one, int | float)}
+    return {name: float(constant) for name, constant in named.items() if isinstance(constant, int | float)}
 
 
 def _are_unnamed(model: StateSpaceModel) -> bool:
     """Whether all quantities have the symbols that they get of themselves, and no unit."""
     pairs = zip("xuz", model.quantities, strict=True)
     return quantities_of(model) == [
-        [(f"{letter}_{i + 1}", "") for i in range(len(some))] for letter, some in pairs
+        [(f"{letter}_{i + 1}", "") for i in range(len(quantities))] for letter, quantities in pairs
     ]
 
 
@@ -153,7 +155,7 @@ def write_estimator(path: str | Path, estimator: LearnedEstimator, training: dic
         "constants": constants_of(estimator.model),
         "training": training,
     }
-    numbers = {name: one.contiguous() for name, one in estimator.state_dict().items()}
+    numbers = {name: tensor.contiguous() for name, tensor in estimator.state_dict().items()}
     write_whole(path, save(numbers, {DESCRIPTION: json.dumps(about)}))
 
 

@@ -16,13 +16,13 @@ MOST = 16  # states or measurements: weights grow with the fourth power, to sixt
 
 
 class Correction(NamedTuple):
-    """A correction of predictions x~: the track after it, and what it is made of.
+    """A correction of predictions x~: the track after it, and its terms.
 
     Attributes:
         track: means, innovations and memory.
         gain: K (B, n, m).
         features: the network's inputs.
-        lost: trajectories (B, 1) that began again with the prior.
+        lost: trajectories (B, 1) that restarted from the prior.
     """
 
     track: Track
@@ -32,7 +32,7 @@ class Correction(NamedTuple):
 
 
 class KalmanNet(LearnedEstimator):
-    """A filter with the model's f and h, whose gain is a network's in place of one that follows from Q and R.
+    """A filter with the model's f and h, and a network in place of the gain that follows from Q and R.
 
         x~ = f(x', u),  v = z - h(x~),  x = x~ + K v
         K = K_0 + D_x N(z - z', v, x' - x'', x' - x~') D_v^-1
@@ -76,12 +76,12 @@ class KalmanNet(LearnedEstimator):
 
     def _corrected(self, predicted: Tensor, memory: tuple, z: Tensor, last: Tensor) -> Correction:
         """The correction of predictions x~ (B, n) by measurements (B, m), after the last estimates (B, n)."""
-        equations, (moved, corrected, before) = self.equations, memory[:3]
-        seen = ~torch.isnan(z)
-        innovation = _known(equations.of_measurement(z - equations.measured(predicted)), seen)
-        measured = _known(equations.of_measurement(z - before), seen & ~torch.isnan(before))
+        equations, (change, corrected, before) = self.equations, memory[:3]
+        present = ~torch.isnan(z)
+        innovation = _known(equations.of_measurement(z - equations.measured(predicted)), present)
+        measured = _known(equations.of_measurement(z - before), present & ~torch.isnan(before))
         of_z = torch.cat([measured / self.scale_measured, innovation / self.scale_innovation], -1)
-        features = tuple(map(compressed, (moved / self.scale_moved, corrected / self.scale_corrected, of_z)))
+        features = tuple(map(compressed, (change / self.scale_moved, corrected / self.scale_corrected, of_z)))
         output, hidden = self.gain(memory[3 : 3 + HIDDEN], *features)
         learned = self.scale_error[:, None] * output.unflatten(-1, self.scale_gain.shape)
         gain = self.scale_gain + learned / self.scale_innovation
@@ -89,14 +89,16 @@ class KalmanNet(LearnedEstimator):
         mean = equations.of_state(predicted + correction)
         lost = ~torch.isfinite(mean).all(-1, keepdim=True)
         mean = torch.where(lost, self.prior_mean, mean)
-        changes = (torch.where(lost, 0.0, one) for one in (equations.of_state(mean - last), correction, *hidden))
-        moved, corrected, *hidden = changes
-        track = Track(mean, None, innovation, None, (moved, corrected, z, *hidden))
+        changes = (
+            torch.where(lost, 0.0, tensor) for tensor in (equations.of_state(mean - last), correction, *hidden)
+        )
+        change, corrected, *hidden = changes
+        track = Track(mean, None, innovation, None, (change, corrected, z, *hidden))
         return Correction(track, gain, features, lost)
 
 
 class RecursiveKalmanNet(KalmanNet):
-    """A KalmanNet with a covariance, whose noise a second network gives in Joseph's form.
+    """A KalmanNet with a covariance in Joseph's form, whose noise term is the output of a second network.
 
         P = (I - K H) F P' F' (I - K H)' + B B'
 
@@ -131,22 +133,22 @@ class RecursiveKalmanNet(KalmanNet):
         cov = jacobian @ track.cov @ jacobian.mT
         return self._with_cov(self._next(track, u, z), predicted, cov, track.memory[-HIDDEN:])
 
-    def _with_cov(self, found: Correction, predicted: Tensor, cov: Tensor, hidden: tuple) -> Track:
+    def _with_cov(self, correction: Correction, predicted: Tensor, cov: Tensor, hidden: tuple) -> Track:
         with torch.no_grad():
             slopes = self.equations.measured_with_jacobian(predicted)[1]
-        output, hidden = self.root(hidden, *found.features)
+        output, hidden = self.root(hidden, *correction.features)
         n = self.model.n
         rows, columns = torch.tril_indices(n, n)
         on_diagonal = rows == columns
         root = torch.zeros_like(cov)
         root[..., rows, columns] = self.scale_error[rows] * torch.where(on_diagonal, softplus(output), output)
-        seen = ~torch.isnan(found.track.memory[2])
-        kept = torch.eye(n, dtype=cov.dtype) - found.gain @ torch.where(seen[..., None], slopes, 0.0)
-        cov = kept @ cov @ kept.mT + root @ root.mT
-        cov = torch.where(found.lost[..., None], self.prior_cov, 0.5 * (cov + cov.mT))
-        return found.track._replace(cov=cov, memory=(*found.track.memory, *hidden))
+        present = ~torch.isnan(correction.track.memory[2])
+        factor = torch.eye(n, dtype=cov.dtype) - correction.gain @ torch.where(present[..., None], slopes, 0.0)
+        cov = factor @ cov @ factor.mT + root @ root.mT
+        cov = torch.where(correction.lost[..., None], self.prior_cov, 0.5 * (cov + cov.mT))
+        return correction.track._replace(cov=cov, memory=(*correction.track.memory, *hidden))
 
 
-def _known(difference: Tensor, seen: Tensor) -> Tensor:
-    """A difference of measurements, zero where one is missing; no derivative comes from there."""
-    return torch.where(seen, torch.where(seen, difference, 0.0), 0.0)
+def _known(difference: Tensor, present: Tensor) -> Tensor:
+    """A difference of measurements, with value and derivatives of zero where one is missing."""
+    return torch.where(present, torch.where(present, difference, 0.0), 0.0)

@@ -69,18 +69,18 @@ class GainNetwork(nn.Module):
         return tuple(torch.zeros(batch, size, dtype=torch.float64) for size in self.sizes)
 
     def forward(
-        self, hidden: tuple[Tensor, ...], moved: Tensor, corrected: Tensor, measured: Tensor
+        self, hidden: tuple[Tensor, ...], change: Tensor, corrected: Tensor, measured: Tensor
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The output (B, outputs) and the next hidden states.
 
         Args:
             hidden: of the step before.
-            moved: change of the estimate over the last step, (B, n).
+            change: of the estimate over the last step, (B, n).
             corrected: the last correction of an estimate, (B, n).
             measured: change of the measurement and innovation, (B, 2 m).
         """
         q, p, s = hidden
-        q = self.q(self.of_moved(moved), q)
+        q = self.q(self.of_moved(change), q)
         p = self.p(torch.cat([q, self.of_corrected(corrected)], -1), p)
         s = self.s(torch.cat([self.from_p(p), self.of_measured(measured)], -1), s)
         output = self.last(self.wide(torch.cat([p, s], -1)))
@@ -123,10 +123,10 @@ class GatedRecurrentUnit(LearnedEstimator):
         return self._moved(track.memory[0], u, z)
 
     def _moved(self, hidden: Tensor, u: Tensor, z: Tensor) -> Track:
-        seen = ~torch.isnan(z)
-        measured = torch.where(seen, (z - self.scale_measurement_mean) / self.scale_measurement, 0.0)
-        given = torch.cat([(u - self.scale_input_mean) / self.scale_input, measured, seen.double()], -1)
-        hidden = self.cell(given, hidden)
-        standardised = self.last(torch.cat([hidden, given], -1))
+        present = ~torch.isnan(z)
+        measured = torch.where(present, (z - self.scale_measurement_mean) / self.scale_measurement, 0.0)
+        features = torch.cat([(u - self.scale_input_mean) / self.scale_input, measured, present.double()], -1)
+        hidden = self.cell(features, hidden)
+        standardised = self.last(torch.cat([hidden, features], -1))
         mean = self.equations.of_state(self.scale_state_mean + self.scale_state * standardised)
         return Track(mean, None, None, None, (hidden,))

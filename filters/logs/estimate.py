@@ -184,22 +184,22 @@ def estimate_with(
     if log.stamps is not None:
         if smoother:
             raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")
-        found, restarts = by_the_clock(filter_, data[0][0], log, noise)
+        estimates, restarts = by_the_clock(filter_, data[0][0], log, noise)
     elif isinstance(filter_, ForeignFilter):
-        found, restarts = run(filter_, *data), None
+        estimates, restarts = run(filter_, *data), None
     else:
-        found, restarts = _stepped(filter_, *data)
-    means, covs = smoothed(filter_, *data, lag)[0] if smoother else (found.means, found.covs)
-    likelihoods = found.log_likelihoods[0]
+        estimates, restarts = _stepped(filter_, *data)
+    means, covs = smoothed(filter_, *data, lag)[0] if smoother else (estimates.means, estimates.covs)
+    likelihoods = estimates.log_likelihoods[0]
     return LogEstimate(
         log,
         filter_,
         means[0],
         covs[0],
-        np.where(np.isnan(log.measurements), np.nan, found.innovations[0]),
-        found.innovation_covs[0],
+        np.where(np.isnan(log.measurements), np.nan, estimates.innovations[0]),
+        estimates.innovation_covs[0],
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
-        int(found.divergences[0]),
+        int(estimates.divergences[0]),
         smoother,
         noise,
         restarts,

@@ -100,54 +100,60 @@ MARGIN = 0.06  # of an axis above and below what it shows
 DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
 
-def log_figure(path: str | Path, found: LogEstimate, title: str, told: LogAlarms | None = None) -> Path:
+def log_figure(path: str | Path, estimate: LogEstimate, title: str, alarms: LogAlarms | None = None) -> Path:
     """Save what `draw_log` draws; return the path."""
-    return save_figure(draw_log(found, title, told=told), path)
+    return save_figure(draw_log(estimate, title, alarms=alarms), path)
 
 
-def draw_log(found: LogEstimate, title: str, *, states: bool = True, told: LogAlarms | None = None) -> Figure:
+def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: LogAlarms | None = None) -> Figure:
     """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
     A measurement of a state or an output stands there as dots. References come first; of many states and outputs
     the first six are drawn. Bands of the first rows, in which a filter settles from its prior, do not widen the
     axes. The first alarm of a stretch is a line in the innovations, the stretch shaded.
     """
-    model, references, colour = found.model, compared(found), colour_of(found.filter.name)
-    values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
-    shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
-    shown = [key for key in values if key in shown] if states else []
-    heights = [TALL] * len(shown) + [LOW if shown else TALL] * len(found.log.measured)
+    model, references, colour = estimate.model, compared(estimate), colour_of(estimate.filter.name)
+    values = [f"{STATE}:{quantity.symbol}" for quantity in model.states] + [
+        f"{OUTPUT}:{symbol}" for symbol in model.outputs
+    ]
+    plotted = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
+    plotted = [key for key in values if key in plotted] if states else []
+    heights = [TALL] * len(plotted) + [LOW if plotted else TALL] * len(estimate.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     tidy(axes)
-    times = found.log.start + found.log.times
-    labels = {f"{STATE}:{one.symbol}": one for one in model.states}
-    labels |= {f"{OUTPUT}:{symbol}": one.quantity for symbol, one in model.outputs.items()}
-    for axis, key in zip(axes, shown, strict=False):
-        mean, std = estimated(found, key)
-        line = found.log.references[key] if key in references else mean
+    times = estimate.log.start + estimate.log.times
+    labels = {f"{STATE}:{quantity.symbol}": quantity for quantity in model.states}
+    labels |= {f"{OUTPUT}:{symbol}": output.quantity for symbol, output in model.outputs.items()}
+    for axis, key in zip(axes, plotted, strict=False):
+        mean, std = estimated(estimate, key)
+        line = estimate.log.references[key] if key in references else mean
         line = wrapped(line) if labels[key].angle else line
         _limit(axis, mean, std, line)
         breaks = with_breaks if labels[key].angle else lambda *lines: lines
         if key in references:
             axis.plot(*breaks(times, line), label="reference, not seen", **TRUTH)
-        for seen in _measurements_of(found, mean):
-            axis.scatter(times, wrapped(seen) if labels[key].angle else seen, **DOTS)
+        for measured in _measurements_of(estimate, mean):
+            axis.scatter(times, wrapped(measured) if labels[key].angle else measured, **DOTS)
         own_times, mean, std = breaks(times, mean, std)
         _band(axis, own_times, mean, std, colour)
-        axis.plot(own_times, mean, color=colour, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
+        axis.plot(
+            own_times, mean, color=colour, linewidth=1.0, label="smoother" if estimate.smoothed else "estimate"
+        )
         axis.set_ylabel(labels[key].plot_label.replace(" $", "\n$"))
-    for j, (axis, one) in enumerate(zip(axes[len(shown) :], found.log.measured, strict=True)):
-        std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
+    for j, (axis, quantity) in enumerate(zip(axes[len(plotted) :], estimate.log.measured, strict=True)):
+        std = np.sqrt(np.maximum(estimate.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std, colour)
-        _limit(axis, np.zeros_like(std), std, found.innovations[:, j])
-        axis.plot(times, found.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
-        for some in episodes(told.alarms, told.monitor.memory) if told else ():
-            if some[0].channel == j:
-                span = min(one.since for one in some), some[-1].step
+        _limit(axis, np.zeros_like(std), std, estimate.innovations[:, j])
+        axis.plot(times, estimate.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
+        for episode in episodes(alarms.alarms, alarms.monitor.memory) if alarms else ():
+            if episode[0].channel == j:
+                span = min(alarm.since for alarm in episode), episode[-1].step
                 axis.axvspan(*times[list(span)], color=ALARM, alpha=0.2, linewidth=0, zorder=0)
-                axis.axvline(times[some[0].step], color=ALARM, linewidth=1.2, label="alarm")
-        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{verbatim(one.unit)}]" if one.unit else ""))
+                axis.axvline(times[episode[0].step], color=ALARM, linewidth=1.2, label="alarm")
+        axis.set_ylabel(
+            f"innovation of\n{quantity.symbol}" + (f"\n[{verbatim(quantity.unit)}]" if quantity.unit else "")
+        )
     axes[0].set_title(verbatim(title, most=TITLE), fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
@@ -159,16 +165,16 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True, told: LogAl
     return figure
 
 
-def _measurements_of(found: LogEstimate, values: np.ndarray) -> list[np.ndarray]:
+def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarray]:
     """The measured channels whose part of h(x) is a state or an output with these values, by some estimates."""
-    model, some = found.model, np.linspace(0, len(values) - 1, 40).astype(int)
-    states = found.means[some] if is_array(model.n) else [tuple(row) for row in found.means[some].tolist()]
+    model, rows = estimate.model, np.linspace(0, len(values) - 1, 40).astype(int)
+    states = estimate.means[rows] if is_array(model.n) else [tuple(row) for row in estimate.means[rows].tolist()]
     try:
         expected = np.array([model.functions.observe(x, model.given_constants) for x in states])
     except (ValueError, ArithmeticError):  # of estimates at which h has no value, where Python raises
         return []
-    same = np.isclose(expected, values[some, None], rtol=1e-9, atol=1e-12, equal_nan=True).all(axis=0)
-    return [found.log.measurements[:, j] for j in np.flatnonzero(same)]
+    same = np.isclose(expected, values[rows, None], rtol=1e-9, atol=1e-12, equal_nan=True).all(axis=0)
+    return [estimate.log.measurements[:, j] for j in np.flatnonzero(same)]
 
 
 def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray, colour: str) -> None:
@@ -180,8 +186,8 @@ def _limit(axis, middle: np.ndarray, std: np.ndarray, line: np.ndarray) -> None:
     """Let an axis show both lines and, of the band, what is behind the first rows."""
     reach = TWO_SIDED * std[min(SKIPPED, len(std) // 4) :]
     ends = middle[len(std) - len(reach) :]
-    shown = np.concatenate((middle, line, ends - reach, ends + reach))
-    shown = shown[np.isfinite(shown)]
-    if shown.size and np.ptp(shown) > 0.0:
-        room = MARGIN * np.ptp(shown)
-        axis.set_ylim(shown.min() - room, shown.max() + room)
+    limits = np.concatenate((middle, line, ends - reach, ends + reach))
+    limits = limits[np.isfinite(limits)]
+    if limits.size and np.ptp(limits) > 0.0:
+        room = MARGIN * np.ptp(limits)
+        axis.set_ylim(limits.min() - room, limits.max() + room)

@@ -46,13 +46,13 @@ class LogFindings(NamedTuple):
     references: tuple[Residual, ...]  # by reference channel that the model has
 
 
-def findings(found: LogEstimate, skip: int | None = None) -> LogFindings:
+def findings(estimate: LogEstimate, skip: int | None = None) -> LogFindings:
     """The findings of an estimate of a log.
 
         mean NIS = sum nu' S^-1 nu / sum m_k,  95 % band: chi^2 of sum m_k degrees of freedom, over these
 
     Args:
-        found: from `filters.logs.estimate.estimate`.
+        estimate: from `filters.logs.estimate.estimate`.
         skip: first rows that do not count; 50, or a quarter of a short log, if None.
 
     Raises:
@@ -60,61 +60,65 @@ def findings(found: LogEstimate, skip: int | None = None) -> LogFindings:
 
     Source: Bar-Shalom, Li, Kirubarajan (2001), section 5.4 (time-average NIS of one run).
     """
-    log, rows = found.log, found.log.steps + 1
+    log, rows = estimate.log, estimate.log.steps + 1
     first = at_least("skip", min(SKIPPED, rows // 4) if skip is None else skip, 0, rows - 1)
-    innovations, covs = found.innovations[first:], found.innovation_covs[first:]
+    innovations, covs = estimate.innovations[first:], estimate.innovation_covs[first:]
     present = ~np.isnan(innovations)
-    some, count = (~np.isnan(log.measurements[first:])).any(axis=1), int(present.sum())
+    measured, count = (~np.isnan(log.measurements[first:])).any(axis=1), int(present.sum())
     nis, band, white = np.nan, (np.nan, np.nan), None
-    if found.filter.has_covariance and np.isfinite(covs[present.any(axis=1)]).any():
+    if estimate.filter.has_covariance and np.isfinite(covs[present.any(axis=1)]).any():
         e = whitened(np.where(present, innovations, 0.0), covs)
         nis = float((np.where(present, e, 0.0) ** 2).sum() / count)
         band = float(chdtri(count, 0.975) / count), float(chdtri(count, 0.025) / count)
         white = whiteness_of(e[None], present[None]) if len(e) > LAGS else None
     predictions = [_residual(quantity, -innovations[:, j]) for j, quantity in enumerate(log.measured)]
-    references = [_residual(log.referred[key], reference_errors(found, key)[first:]) for key in compared(found)]
+    references = [
+        _residual(log.referred[key], reference_errors(estimate, key)[first:]) for key in compared(estimate)
+    ]
     return LogFindings(
         first,
-        int(some.sum()),
+        int(measured.sum()),
         nis,
         band,
         white,
         tuple(predictions),
-        float(found.log_likelihoods[first:].sum()),
+        float(estimate.log_likelihoods[first:].sum()),
         tuple(references),
     )
 
 
-def compared(found: LogEstimate) -> list[str]:
+def compared(estimate: LogEstimate) -> list[str]:
     """The reference channels of a log that the filter's model has as a state or as an output."""
-    states, outputs = {one.symbol for one in found.model.states}, set(found.model.outputs)
+    states, outputs = {state.symbol for state in estimate.model.states}, set(estimate.model.outputs)
     known = {STATE: states}
     return [
-        key for key in found.log.references if key.partition(":")[2] in known.get(key.partition(":")[0], outputs)
+        key
+        for key in estimate.log.references
+        if key.partition(":")[2] in known.get(key.partition(":")[0], outputs)
     ]
 
 
-def estimated(found: LogEstimate, channel: str) -> tuple[np.ndarray, np.ndarray]:
+def estimated(estimate: LogEstimate, channel: str) -> tuple[np.ndarray, np.ndarray]:
     """The estimate of a reference channel, (K + 1,), and its standard deviation."""
     kind, _, symbol = channel.partition(":")
     if kind != STATE:
-        return found.output(symbol)
-    place = [one.symbol for one in found.model.states].index(symbol)
-    return found.means[:, place], found.stds[:, place]
+        return estimate.output(symbol)
+    i = [state.symbol for state in estimate.model.states].index(symbol)
+    return estimate.means[:, i], estimate.stds[:, i]
 
 
-def reference_errors(found: LogEstimate, channel: str) -> np.ndarray:
+def reference_errors(estimate: LogEstimate, channel: str) -> np.ndarray:
     """Estimate less reference, (K + 1,), angles the short way round; NaN where the reference has no sample."""
-    values, reference = estimated(found, channel)[0], found.log.references[channel]
-    return difference(values[:, None], reference[:, None], (found.log.referred[channel].angle,))[:, 0]
+    values, reference = estimated(estimate, channel)[0], estimate.log.references[channel]
+    return difference(values[:, None], reference[:, None], (estimate.log.referred[channel].angle,))[:, 0]
 
 
 def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
-    there = errors[~np.isnan(errors)]
-    if not there.size:
+    present = errors[~np.isnan(errors)]
+    if not present.size:
         return Residual(quantity, np.nan, np.nan, 0)
-    largest = float(abs(there).max()) or 1.0  # by which sums stay finite where a model blows up
-    return Residual(quantity, root_mean_square(there), float((there / largest).mean() * largest), there.size)
+    largest = float(abs(present).max()) or 1.0  # by which sums stay finite where a model blows up
+    return Residual(quantity, root_mean_square(present), float((present / largest).mean() * largest), present.size)
 
 
 # The results of a filter's run over a log, in words.
@@ -123,42 +127,47 @@ def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 
 
-def verdict(found: LogEstimate, told: LogFindings) -> list[str]:
+def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
     """Findings in the log, then what the innovations say about filter and model.
 
     Where a prediction is a thousand times further off than the channel moves, the model blows up between samples,
     and its Q and R are not to blame.
     """
-    said = sentences(found.log.findings) + ([found.restarts.sentence] if found.restarts else [])
-    spoilt = [one for one in found.log.findings if one.kind in SPOILING]
-    if any(one.kind == GAP for one in spoilt):
-        said.append("At a gap the filter predicts with the last input held.")
-    if not told.rows:
+    messages = sentences(estimate.log.findings) + ([estimate.restarts.sentence] if estimate.restarts else [])
+    spoilt = [finding for finding in estimate.log.findings if finding.kind in SPOILING]
+    if any(finding.kind == GAP for finding in spoilt):
+        messages.append("At a gap the filter predicts with the last input held.")
+    if not log_findings.rows:
         return [
-            *said,
-            f"Nothing was measured in the rows that count, from {told.first} on: there are no innovations.",
+            *messages,
+            f"Nothing was measured in the rows that count, from {log_findings.first} on: "
+            "there are no innovations.",
         ]
-    if all(isnan(one.rmse) for one in told.predictions):
+    if all(isnan(residual.rmse) for residual in log_findings.predictions):
         silent = "This estimator gives no innovation, so there is no NIS, no whiteness and no likelihood."
-        return [*said, silent]
-    names = [one.name for one in found.log.measured]
-    blown = blow_up_sentence(found.innovations[told.first :], found.log.measurements, names, found.log.dt)
+        return [*messages, silent]
+    names = [quantity.name for quantity in estimate.log.measured]
+    blown = blow_up_sentence(
+        estimate.innovations[log_findings.first :], estimate.log.measurements, names, estimate.log.dt
+    )
     if blown:
-        return [*said, blown]
-    if isnan(told.mean_nis):
-        return [*said, "This filter gives no covariance, so there is no NIS and no likelihood."]
-    low, high = told.nis_band
-    some = "The mean NIS is in its 95 % band."
-    if told.mean_nis > high:
-        some = "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
-    elif told.mean_nis < low:
-        some = "The innovations are smaller than the filter expects: its Q or R is too large."
-    if told.whiteness is not None and told.whiteness.p_value < ALPHA:
-        some += " They are not white: a better model could predict a part of them."
+        return [*messages, blown]
+    if isnan(log_findings.mean_nis):
+        return [*messages, "This filter gives no covariance, so there is no NIS and no likelihood."]
+    low, high = log_findings.nis_band
+    conclusion = "The mean NIS is in its 95 % band."
+    if log_findings.mean_nis > high:
+        conclusion = (
+            "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
+        )
+    elif log_findings.mean_nis < low:
+        conclusion = "The innovations are smaller than the filter expects: its Q or R is too large."
+    if log_findings.whiteness is not None and log_findings.whiteness.p_value < ALPHA:
+        conclusion += " They are not white: a better model could predict a part of them."
     if spoilt:
-        kinds = list(dict.fromkeys(one.kind for one in spoilt))
-        some += f" First mend what was found in the log ({', '.join(kinds)}): it spoils these numbers."
-    return [*said, some]
+        kinds = list(dict.fromkeys(finding.kind for finding in spoilt))
+        conclusion += f" First mend what was found in the log ({', '.join(kinds)}): it spoils these numbers."
+    return [*messages, conclusion]
 
 
 # Alarms of a monitor over a log, and the channel without which they are gone.
@@ -175,19 +184,19 @@ class LogAlarms(NamedTuple):
     @property
     def at_fault(self) -> int | None:
         """The channel without which the fewest alarms are left, if at most half are; None without one."""
-        found = self.without
-        if not found or not self.alarms:
+        counts = self.without
+        if not counts or not self.alarms:
             return None
-        order = sorted(range(len(found)), key=found.__getitem__)
-        clear = len(order) < 2 or found[order[0]] < found[order[1]]
-        return order[0] if clear and 2 * found[order[0]] <= len(_statistical(self.alarms)) else None
+        order = sorted(range(len(counts)), key=counts.__getitem__)
+        clear = len(order) < 2 or counts[order[0]] < counts[order[1]]
+        return order[0] if clear and 2 * counts[order[0]] <= len(_statistical(self.alarms)) else None
 
 
-def alarms_of(found: LogEstimate, monitor: Monitor, first: int = 0, *, isolate: bool = False) -> LogAlarms:
+def alarms_of(estimate: LogEstimate, monitor: Monitor, first: int = 0, *, isolate: bool = False) -> LogAlarms:
     """The alarms of an estimate of a log.
 
     Args:
-        found: from `filters.logs.estimate.estimate`.
+        estimate: from `filters.logs.estimate.estimate`.
         monitor: the tests.
         first: the row at which they begin, once the filter has settled.
         isolate: whether to run the filter without each channel, too, and count the alarms of the others.
@@ -195,102 +204,106 @@ def alarms_of(found: LogEstimate, monitor: Monitor, first: int = 0, *, isolate: 
     Raises:
         ValueError: for a filter without a covariance, and to isolate the only channel.
     """
-    if not found.filter.has_covariance:
-        raise ValueError(f"a monitor needs a filter with a covariance, but {found.filter.name!r} has none")
-    measurements = found.log.measurements
+    if not estimate.filter.has_covariance:
+        raise ValueError(f"a monitor needs a filter with a covariance, but {estimate.filter.name!r} has none")
+    measurements = estimate.log.measurements
     without = None
     if isolate:
         channels = measurements.shape[1]
         if channels < 2:
             raise ValueError("a faulty channel can be isolated among two or more, but the filter has one")
-        without = tuple(len(_statistical(_without(found, monitor, first, one))) for one in range(channels))
-    return LogAlarms(monitor, first, tuple(_alarms(found, monitor, first)), without)
+        without = tuple(
+            len(_statistical(_without(estimate, monitor, first, channel))) for channel in range(channels)
+        )
+    return LogAlarms(monitor, first, tuple(_alarms(estimate, monitor, first)), without)
 
 
-def _alarms(found: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
-    seen = found.innovations[first:], found.innovation_covs[first:], found.log.measurements[first:]
-    return [one._replace(step=one.step + first, since=one.since + first) for one in monitor.alarms(*seen)]
+def _alarms(estimate: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
+    tested = estimate.innovations[first:], estimate.innovation_covs[first:], estimate.log.measurements[first:]
+    return [
+        alarm._replace(step=alarm.step + first, since=alarm.since + first) for alarm in monitor.alarms(*tested)
+    ]
 
 
-def _without(found: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
-    """Alarms of a filter that does not see a channel."""
-    measurements = found.log.measurements.copy()
+def _without(estimate: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
+    """Alarms of the other channels if the filter runs without one."""
+    measurements = estimate.log.measurements.copy()
     measurements[:, channel] = np.nan
-    again = estimate_with(found.filter, replace(found.log, measurements=measurements), noise=found.noise)
-    return [one for one in _alarms(again, monitor, first) if one.channel != channel]
+    again = estimate_with(estimate.filter, replace(estimate.log, measurements=measurements), noise=estimate.noise)
+    return [alarm for alarm in _alarms(again, monitor, first) if alarm.channel != channel]
 
 
 def _statistical(alarms: Sequence[Alarm]) -> list[Alarm]:
-    return [one for one in alarms if one.test not in ("stuck", "missing")]
+    return [alarm for alarm in alarms if alarm.test not in ("stuck", "missing")]
 
 
 def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
     """Alarms of a channel that follow each other within some steps, by their first."""
-    found: list[list[Alarm]] = []
-    for one in alarms:
-        last = next((some for some in reversed(found) if some[-1].channel == one.channel), None)
-        if last is not None and one.step - last[-1].step <= memory:
-            last.append(one)
+    result: list[list[Alarm]] = []
+    for alarm in alarms:
+        last = next((episode for episode in reversed(result) if episode[-1].channel == alarm.channel), None)
+        if last is not None and alarm.step - last[-1].step <= memory:
+            last.append(alarm)
         else:
-            found.append([one])
-    return found
+            result.append([alarm])
+    return result
 
 
-def episode_sentence(some: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
+def episode_sentence(episode: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
     """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
 
     It begins with its first alarm; where the sensor is stuck or missing, with that, which explains the others.
     """
-    one = next((alarm for alarm in some if alarm.test in ("stuck", "missing")), some[0])
+    cause = next((alarm for alarm in episode if alarm.test in ("stuck", "missing")), episode[0])
     unit = f" {channel.unit}" if channel.unit else ""
     what = {
-        "outlier": f"an outlier {one.size:+.3g}{unit} off",
-        "variance": f"noise with {one.size:.2g} times the expected variance",
+        "outlier": f"an outlier {cause.size:+.3g}{unit} off",
+        "variance": f"noise with {cause.size:.2g} times the expected variance",
         "stuck": "equal readings",
         "missing": "no readings",
-    }.get(one.test, f"a bias of {one.size:+.3g}{unit}")
+    }.get(cause.test, f"a bias of {cause.size:+.3g}{unit}")
     dt = float(np.median(np.diff(times)))
-    at = [time_text(times[step], dt, 5) for step in (one.since, one.step, some[-1].step)]
-    since = "" if one.test == "outlier" else f" since {at[0]} s, found"
-    found = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[one.step])} ({one.test})"
-    others = list(dict.fromkeys(alarm.test for alarm in some if alarm is not one))
-    if not others:
-        return found
-    more = len(some) - 1
-    return f"{found}; {more} more alarm{'s' * (more > 1)} until {at[2]} s ({', '.join(others)})"
+    at = [time_text(times[step], dt, 5) for step in (cause.since, cause.step, episode[-1].step)]
+    since = "" if cause.test == "outlier" else f" since {at[0]} s, found"
+    sentence = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[cause.step])} ({cause.test})"
+    tests = list(dict.fromkeys(alarm.test for alarm in episode if alarm is not cause))
+    if not tests:
+        return sentence
+    more = len(episode) - 1
+    return f"{sentence}; {more} more alarm{'s' * (more > 1)} until {at[2]} s ({', '.join(tests)})"
 
 
 # An estimate of a log as columns of a file.
 
 
-def columns_of(found: LogEstimate, told: LogAlarms | None = None) -> dict[str, np.ndarray]:
+def columns_of(estimate: LogEstimate, alarms: LogAlarms | None = None) -> dict[str, np.ndarray]:
     """Columns (K + 1,) by header: time, inputs and measurements, then the filter's output, all by symbol.
 
-    Of a state or output "omega_m" it is "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; of a channel "thrust"
-    "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N". With
-    a monitor "alarm_thrust" counts the tests that raise an alarm at a row.
+    For a state or output "omega_m" headers are "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; for a channel
+    "thrust" "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; for a reference
+    "reference_T_N". With a monitor, "alarm_thrust" counts the tests that raise an alarm at a row.
     """
-    log, model = found.log, found.model
+    log, model = estimate.log, estimate.model
     columns = {"time_s": log.start + log.times}
-    for one, values in zip(log.input_quantities, log.inputs.T, strict=True):
-        columns[header_of("input", one)] = np.append(values, np.nan)
-    for one, values in zip(log.measured, log.measurements.T, strict=True):
-        columns[header_of("measured", one)] = values
-    for key in compared(found):
+    for quantity, values in zip(log.input_quantities, log.inputs.T, strict=True):
+        columns[header_of("input", quantity)] = np.append(values, np.nan)
+    for quantity, values in zip(log.measured, log.measurements.T, strict=True):
+        columns[header_of("measured", quantity)] = values
+    for key in compared(estimate):
         columns[header_of("reference", log.referred[key])] = log.references[key]
-    for one, mean, std in zip(model.states, found.means.T, found.stds.T, strict=True):
-        columns[header_of("", one)], columns[header_of("std", one)] = mean, std
+    for quantity, mean, std in zip(model.states, estimate.means.T, estimate.stds.T, strict=True):
+        columns[header_of("", quantity)], columns[header_of("std", quantity)] = mean, std
     for symbol, output in model.outputs.items():
-        quantity = output.quantity._replace(symbol=symbol)
-        columns[header_of("", quantity)], columns[header_of("std", quantity)] = found.output(symbol)
-    deviations = np.sqrt(np.maximum(np.einsum("kii->ki", found.innovation_covs), 0.0))
-    for one, values, std in zip(log.measured, found.innovations.T, deviations.T, strict=True):
-        columns[header_of("innovation", one)], columns[header_of("innovation_std", one)] = values, std
-    if told is not None:
-        for channel, one in enumerate(log.measured):
-            rows = [alarm.step for alarm in told.alarms if alarm.channel == channel]
+        named = output.quantity._replace(symbol=symbol)
+        columns[header_of("", named)], columns[header_of("std", named)] = estimate.output(symbol)
+    deviations = np.sqrt(np.maximum(np.einsum("kii->ki", estimate.innovation_covs), 0.0))
+    for quantity, values, std in zip(log.measured, estimate.innovations.T, deviations.T, strict=True):
+        columns[header_of("innovation", quantity)], columns[header_of("innovation_std", quantity)] = values, std
+    if alarms is not None:
+        for channel, quantity in enumerate(log.measured):
+            rows = [alarm.step for alarm in alarms.alarms if alarm.channel == channel]
             counts = np.bincount(rows, minlength=log.steps + 1)
-            columns[header_of("alarm", one._replace(unit=""))] = counts.astype(np.float64)
+            columns[header_of("alarm", quantity._replace(unit=""))] = counts.astype(np.float64)
     return columns
 
 

@@ -20,7 +20,7 @@ from thruster_env.core.compiled import CompiledOrPython, inlined
 if TYPE_CHECKING:
     from filters.filter import Filter
 
-TESTS = ("outlier", "cusum", "glr", "variance", "stuck", "missing")  # by their place in what `recursion` raises
+TESTS = ("outlier", "cusum", "glr", "variance", "stuck", "missing")  # in the order of `recursion`
 MEANING = {
     "outlier": "a measurement that cannot be",
     "cusum": "a bias",
@@ -43,12 +43,12 @@ class Alarm(NamedTuple):
 
     @property
     def meaning(self) -> str:
-        """What is wrong with the channel."""
+        """The likely fault of the channel."""
         return MEANING[self.test]
 
 
 class Health(NamedTuple):
-    """What the tests say at a step."""
+    """The verdict of the tests at a step."""
 
     ok: bool  # no alarm was raised within the last `Monitor.memory` steps, and no channel is stuck or missing
     alarms: tuple[Alarm, ...]  # raised at this step
@@ -66,8 +66,8 @@ class Monitor:
         missing   steps in a row without a reading
 
     The first four have thresholds such that all of them, of all channels together, raise one false alarm in
-    `steps_between` steps on average, a quarter each. That holds where innovations are white, as those of a filter
-    are whose model is right; otherwise there are more. After an alarm a test begins anew.
+    `steps_between` steps on average, a quarter each. That holds for white innovations, those of a filter with the
+    right model; otherwise there are more. After an alarm a test restarts.
 
     Attributes:
         steps_between: steps between two false alarms.
@@ -122,7 +122,7 @@ class Monitor:
         return _limits(self, channels)
 
     def watch(self, channels: int) -> Watch:
-        """The tests of one belief of so many channels, before its first step."""
+        """The tests of one belief with this number of channels, before its first step."""
         return Watch(self, channels)
 
     def alarms(self, innovations: np.ndarray, covs: np.ndarray, measurements: np.ndarray) -> list[Alarm]:
@@ -133,7 +133,7 @@ class Monitor:
             covs: (K, m, m).
             measurements: (K, m), NaN where nothing was measured.
         """
-        v, s, z = (np.ascontiguousarray(as_floats(one)) for one in (innovations, covs, measurements))
+        v, s, z = (np.ascontiguousarray(as_floats(array)) for array in (innovations, covs, measurements))
         steps, m = z.shape
         shape = steps, len(TESTS), m
         raised, since, sizes = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
@@ -145,15 +145,15 @@ class Monitor:
         ]
 
 
-def monitor_of(given: Monitor | Mapping | float | None) -> Monitor | None:
+def monitor_of(argument: Monitor | Mapping | float | None) -> Monitor | None:
     """A monitor from what users write: one, its attributes, its steps between false alarms, or True; else None."""
-    if given is None or given is False or isinstance(given, Monitor):
-        return given or None
-    if isinstance(given, Mapping):
-        for name in given:
+    if argument is None or argument is False or isinstance(argument, Monitor):
+        return argument or None
+    if isinstance(argument, Mapping):
+        for name in argument:
             one_of("an attribute of a monitor", name, tuple(Monitor.__dataclass_fields__))
-        return Monitor(**given)
-    return Monitor() if given is True else Monitor(steps_between=given)
+        return Monitor(**argument)
+    return Monitor() if argument is True else Monitor(steps_between=argument)
 
 
 def watch_of(monitor: Monitor | None, filter_: Filter) -> Watch | None:
@@ -172,9 +172,9 @@ def _limits(monitor: Monitor, channels: int) -> np.ndarray:
     low, high = float(chdtri(block, 1.0 - 0.5 * chance)), float(chdtri(block, 0.5 * chance))
     first = [0.5 * monitor.bias, cusum_threshold(each, 0.5 * monitor.bias), glr_threshold(each, monitor.window)]
     of_outliers = [chi_square(STATISTICAL * monitor.steps_between, count) for count in range(1, channels + 1)]
-    found = np.array([*first, low, high, block, monitor.stuck, monitor.missing, *of_outliers], dtype=np.float64)
-    found.flags.writeable = False
-    return found
+    limits = np.array([*first, low, high, block, monitor.stuck, monitor.missing, *of_outliers], dtype=np.float64)
+    limits.flags.writeable = False
+    return limits
 
 
 @cache
@@ -228,8 +228,8 @@ class Watch:
                 for test, i in np.argwhere(raised)
             )
             self._last = self._k
-            for one in alarms:
-                self.latest[one.channel] = one
+            for alarm in alarms:
+                self.latest[alarm.channel] = alarm
         ok = not dead and (self._last is None or self._k - self._last >= self.monitor.memory)
         self._k += 1
         return Health(ok, alarms)
@@ -252,8 +252,8 @@ def monitor_for(measurements: np.ndarray, monitor: Monitor | None = None) -> Mon
     """
     monitor, equal, gone = monitor or Monitor(), 0, 0
     for run in as_floats(measurements):
-        there = ~np.isnan(run)
-        rows = int(np.flatnonzero(there.any(axis=1)).max(initial=-1)) + 1
+        present = ~np.isnan(run)
+        rows = int(np.flatnonzero(present.any(axis=1)).max(initial=-1)) + 1
         for z in run[:rows].T:
             readings = z[~np.isnan(z)]
             equal = max(equal, _longest(readings[1:] == readings[:-1]) + 1)
@@ -285,13 +285,13 @@ def tuned_monitor(path: str | Path) -> Monitor:
     Raises:
         ValueError: for a file that cannot be read, or has none, as those of before version 0.1.
     """
-    given = read_tuned_file(path).get("monitor")
-    if given is None:
+    stored = read_tuned_file(path).get("monitor")
+    if stored is None:
         raise ValueError(f"a tuned file must have a monitor (tune again, or give the steps), but {path} has none")
-    if not isinstance(given, Mapping):
-        raise ValueError(f"the monitor of a tuned file must be a mapping, but {path} has {short_repr(given)}")
+    if not isinstance(stored, Mapping):
+        raise ValueError(f"the monitor of a tuned file must be a mapping, but {path} has {short_repr(stored)}")
     try:
-        found = monitor_of({name: value for name, value in given.items() if name != THRESHOLDS})
+        monitor = monitor_of({name: value for name, value in stored.items() if name != THRESHOLDS})
     except ValueError as error:
         raise ValueError(f"{error} (in the tuned file {path})") from None
-    return found or Monitor()
+    return monitor or Monitor()

@@ -77,13 +77,13 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
                 raised[VARIANCE, i], since[VARIANCE, i] = True, k - block + 1.0
                 sizes[VARIANCE, i] = state[i, SQUARES] / block
             state[i, SQUARES] = state[i, COUNT] = 0.0
-        place = int(state[i, NEXT])
-        state[i, RING + place] = e
-        state[i, NEXT] = float((place + 1) % window)
+        newest = int(state[i, NEXT])
+        state[i, RING + newest] = e
+        state[i, NEXT] = float((newest + 1) % window)
         state[i, FILLED] = min(state[i, FILLED] + 1.0, float(window))
         sum_of_last, best, length = 0.0, 0.0, 0
         for j in range(int(state[i, FILLED])):
-            sum_of_last += state[i, RING + (place - j) % window]
+            sum_of_last += state[i, RING + (newest - j) % window]
             ratio = sum_of_last * sum_of_last / (j + 1.0)
             if ratio > best:
                 best, length = ratio, j + 1

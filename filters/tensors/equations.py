@@ -66,9 +66,9 @@ HAS_SLOPE: dict[str, Callable] = {
 OF_ZERO = frozenset(HAS_SLOPE) - {"arccosh", "arctanh"}  # of these, operations that have one of a positive number
 
 
-def _divisor(one: Number) -> Number:
+def _divisor(number: Number) -> Number:
     """The number that decides whether an operation has a finite slope."""
-    return one.of[-1 if one.operation == "/" else 0]
+    return number.of[-1 if number.operation == "/" else 0]
 
 
 def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
@@ -85,14 +85,14 @@ def order_of(wanted: Sequence[Number]) -> list[Number]:
 
 
 def values_of(
-    wanted: Sequence[Number], order: Sequence[Number], given: Mapping[Any, Tensor], like: Tensor
+    wanted: Sequence[Number], order: Sequence[Number], known: Mapping[Any, Tensor], like: Tensor
 ) -> list[Tensor | float]:
-    """Values of numbers, of tensors for those that are given by their names; of constants floats.
+    """Values of numbers: tensors, and floats for constants.
 
     Args:
         wanted: numbers of one graph.
         order: `order_of(wanted)`.
-        given: tensors whose shapes broadcast.
+        known: tensors of the given numbers by their names; their shapes broadcast.
         like: a tensor of the dtype and on the device of all.
     """
     values: dict[int, Tensor | float] = {}
@@ -100,60 +100,64 @@ def values_of(
     def tensor(value: Tensor | float) -> Tensor:
         return value if isinstance(value, Tensor) else like.new_tensor(value)
 
-    for one in order:
-        arguments = [values[a.place] for a in one.of]
-        if one.operation == "given":
-            values[one.place] = given[one.arguments[0]]
-        elif one.value is not None:
-            values[one.place] = one.value if like.dtype == torch.float64 else as_single(one.value)
-        elif one.operation in HAS_SLOPE and not (one.operation in OF_ZERO and _divisor(one).sign == POSITIVE):
-            function = WORK.get(one.operation) or getattr(torch, one.operation)
-            values[one.place] = with_finite_slope(one.operation, function, [*map(tensor, arguments)])
-        elif one.operation in WORK:
-            values[one.place] = WORK[one.operation](*arguments)
+    for number in order:
+        arguments = [values[a.place] for a in number.of]
+        if number.operation == "given":
+            values[number.place] = known[number.arguments[0]]
+        elif number.value is not None:
+            values[number.place] = number.value if like.dtype == torch.float64 else as_single(number.value)
+        elif number.operation in HAS_SLOPE and not (
+            number.operation in OF_ZERO and _divisor(number).sign == POSITIVE
+        ):
+            function = WORK.get(number.operation) or getattr(torch, number.operation)
+            values[number.place] = with_finite_slope(number.operation, function, [*map(tensor, arguments)])
+        elif number.operation in WORK:
+            values[number.place] = WORK[number.operation](*arguments)
         else:
-            values[one.place] = getattr(torch, NAMES.get(one.operation, one.operation))(*map(tensor, arguments))
-    return [values[one.place] for one in wanted]
+            values[number.place] = getattr(torch, NAMES.get(number.operation, number.operation))(
+                *map(tensor, arguments)
+            )
+    return [values[number.place] for number in wanted]
 
 
 POINTS = 64  # at which functions of tensors are compared with those of floats
 
 
-def sizes_of(others: int, shape: Shape) -> tuple[int, ...]:
+def sizes_of(further_arguments: int, shape: Shape) -> tuple[int, ...]:
     """How many components the arguments (x, u, c) or (x, c) have."""
-    return (shape.n, shape.inputs, shape.constants) if others == 2 else (shape.n, shape.constants)
+    return (shape.n, shape.inputs, shape.constants) if further_arguments == 2 else (shape.n, shape.constants)
 
 
 class OfGraph:
     """An equation whose function can be traced; the Jacobian shares with the value what it can."""
 
-    def __init__(self, function: Callable, jacobian: Callable | None, others: int, shape: Shape):
+    def __init__(self, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape):
         """Trace the function, and raise whatever it raises of numbers that are not known yet."""
-        value, matrix, *_ = Traced(function, jacobian, others, shape).parts
+        value, matrix, *_ = Traced(function, jacobian, further_arguments, shape).parts
         graph = Graph(MOST)
         x, *rest = (
             np.array([graph.given((part, k)) for k in range(size)], dtype=object)
-            for part, size in enumerate(sizes_of(others, shape))
+            for part, size in enumerate(sizes_of(further_arguments, shape))
         )
-        self._value = [graph.number(one) for one in value(x, *rest)]
-        self._both = self._value + [graph.number(one) for one in matrix(x, None, *rest).ravel()]
+        self._value = [graph.number(entry) for entry in value(x, *rest)]
+        self._both = self._value + [graph.number(entry) for entry in matrix(x, None, *rest).ravel()]
         self._orders = [order_of(wanted) for wanted in (self._value, self._both)]
 
-    def of_points(self, x: Tensor, *others: Tensor) -> Tensor:
+    def of_points(self, x: Tensor, *arguments: Tensor) -> Tensor:
         """The values (..., rows, points) at points (..., n, points)."""
-        found = self._stacked(self._value, self._orders[0], _components_of_points(x, *others))
-        return found.movedim(-1, -2)
+        values = self._stacked(self._value, self._orders[0], _components_of_points(x, *arguments))
+        return values.movedim(-1, -2)
 
-    def with_jacobian(self, x: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    def with_jacobian(self, x: Tensor, *arguments: Tensor) -> tuple[Tensor, Tensor]:
         """The value (..., rows), and dy/dx (..., rows, n), at x (..., n)."""
-        both = self._stacked(self._both, self._orders[1], _components(x, *others))
+        both = self._stacked(self._both, self._orders[1], _components(x, *arguments))
         rows = len(self._value)
         return both[..., :rows], both[..., rows:].unflatten(-1, (rows, x.shape[-1]))
 
     @staticmethod
     def _stacked(wanted: Sequence[Number], order: Sequence[Number], parts: list[tuple[Tensor, ...]]) -> Tensor:
-        given = {(p, k): one for p, part in enumerate(parts) for k, one in enumerate(part)}
-        return stacked(values_of(wanted, order, given, parts[0][0]), parts)
+        components = {(p, k): component for p, part in enumerate(parts) for k, component in enumerate(part)}
+        return stacked(values_of(wanted, order, components, parts[0][0]), parts)
 
 
 ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
@@ -192,8 +196,8 @@ class _FiniteSlopes(TorchFunctionMode):
 
     def __torch_function__(self, function, types, arguments=(), named=None):
         name = ROOTS.get(getattr(function, "__name__", ""))
-        tensors = [one for one in arguments if isinstance(one, Tensor)]
-        if name is None or named or not all(one.is_floating_point() for one in tensors):
+        tensors = [tensor for tensor in arguments if isinstance(tensor, Tensor)]
+        if name is None or named or not all(tensor.is_floating_point() for tensor in tensors):
             return function(*arguments, **(named or {}))
         return with_finite_slope(name, function, arguments)
 
@@ -209,40 +213,40 @@ class Called:
         self._unproven = {self._function, self._entries}  # functions that have not yet been called with a batch
         self._of_floats = of_floats
 
-    def _value(self, x: Tensor, *others: Tensor) -> Tensor:
-        return self._called(self._function, _components(x, *others))
+    def _value(self, x: Tensor, *arguments: Tensor) -> Tensor:
+        return self._called(self._function, _components(x, *arguments))
 
-    def of_points(self, x: Tensor, *others: Tensor) -> Tensor:
+    def of_points(self, x: Tensor, *arguments: Tensor) -> Tensor:
         """The values (..., rows, points) at points (..., n, points)."""
-        return self._called(self._function, _components_of_points(x, *others)).movedim(-1, -2)
+        return self._called(self._function, _components_of_points(x, *arguments)).movedim(-1, -2)
 
-    def with_jacobian(self, x: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    def with_jacobian(self, x: Tensor, *arguments: Tensor) -> tuple[Tensor, Tensor]:
         """The value (..., rows), and dy/dx (..., rows, n), at x (..., n)."""
         if self._jacobian is not None:
-            matrix = self._called(self._entries, _components(x, *others))
-            return self._value(x, *others), matrix.unflatten(-1, (-1, x.shape[-1]))
+            matrix = self._called(self._entries, _components(x, *arguments))
+            return self._value(x, *arguments), matrix.unflatten(-1, (-1, x.shape[-1]))
         x, columns = x.contiguous(), []  # jvp takes no tensor that is one number many times
         for unit in torch.eye(x.shape[-1], dtype=x.dtype, device=x.device):
             tangent = unit.expand_as(x).contiguous()
-            value, column = torch.func.jvp(lambda x: self._value(x, *others), (x,), (tangent,))[:2]
+            value, column = torch.func.jvp(lambda x: self._value(x, *arguments), (x,), (tangent,))[:2]
             columns.append(column)
         return value, torch.stack(columns, -1)
 
-    def _entries(self, *given) -> list[Tensor | float]:
+    def _entries(self, *arguments) -> list[Tensor | float]:
         """The Jacobian's entries, by rows."""
-        return [entry for row in self._jacobian(*given) for entry in row]  # type: ignore[misc]
+        return [entry for row in self._jacobian(*arguments) for entry in row]  # type: ignore[misc]
 
     def _called(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> Tensor:
         x, *u, c = parts
-        u = [tuple(one.expand_as(x[0]) for one in part) for part in u]  # so that they can be stacked with x
+        u = [tuple(tensor.expand_as(x[0]) for tensor in part) for part in u]  # so that they can be stacked with x
         states, *inputs = (torch.stack(part) if is_array(len(part)) else part for part in (x, *u))
         try:
             if function in self._unproven:
                 self._prove(function, parts)  # which is refused at each call, or passes once
                 self._unproven.discard(function)
             with _FiniteSlopes():
-                found = function(states, *inputs, self._constants(c))
-            return stacked(found, parts)
+                values = function(states, *inputs, self._constants(c))
+            return stacked(values, parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise ValueError(
                 f"{self._name} must accept tensors, or consist of arithmetic without branches, but raised "
@@ -251,25 +255,25 @@ class Called:
 
     def _prove(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> None:
         """Raise TypeError if a function asks a state for a number: for one trajectory it would be answered."""
-        *given, c = parts
-        size = sum(map(len, given))
+        *components, c = parts
+        size = sum(map(len, components))
         values = torch.as_tensor(np.sin(np.outer(np.arange(1.0, size + 1.0), 0.1 + np.arange(POINTS))))
-        values = (values * torch.logspace(-1.0, 1.0, POINTS)).to(c[0] if c else given[0][0])
+        values = (values * torch.logspace(-1.0, 1.0, POINTS)).to(c[0] if c else components[0][0])
         rows = list(values.unbind(0))
-        *arguments, constants = [*_split(rows, [*map(len, given)]), self._constants(c)]
+        *arguments, constants = [*_split(rows, [*map(len, components)]), self._constants(c)]
         try:
             with _NoNumberAsked(ASKING | LEAVING if self._of_floats else ASKING):
-                found = [*function(*arguments, constants)]
+                results = [*function(*arguments, constants)]
         except TypeError as error:
             if "asked for one number" in str(error):
                 raise
             return
         except Exception:  # other limits of a function are its own: it may be meant for one trajectory
             return
-        if self._of_floats and function is self._function and all(one.numel() == 1 for one in c):
-            self._compare(found, values, [*map(len, given)], [float(one) for one in c])
+        if self._of_floats and function is self._function and all(constant.numel() == 1 for constant in c):
+            self._compare(results, values, [*map(len, components)], [float(constant) for constant in c])
 
-    def _compare(self, found: list, values: Tensor, sizes: list[int], c: list[float]) -> None:
+    def _compare(self, results: list, values: Tensor, sizes: list[int], c: list[float]) -> None:
         """Raise TypeError unless tensors (rows of points) have the values of floats, where these are finite."""
         for k, point in enumerate(values.double().T.tolist()):
             arguments = _split(point, sizes)
@@ -277,7 +281,9 @@ class Called:
                 expected = np.array(self._function(*arguments, self._constants(c)), dtype=np.float64)
             except (ArithmeticError, ValueError):
                 continue
-            tensors = np.array([float(one.expand(POINTS)[k]) if isinstance(one, Tensor) else one for one in found])
+            tensors = np.array(
+                [float(result.expand(POINTS)[k]) if isinstance(result, Tensor) else result for result in results]
+            )
             if np.isfinite(expected).all() and not np.allclose(tensors, expected, rtol=1e-4, atol=1e-5):
                 raise TypeError("of tensors it has other values than of floats: a sum of comparisons is no number")
 
@@ -290,55 +296,55 @@ class Called:
 
 def _split(values: list, sizes: Sequence[int]) -> list:
     """Values as the arguments of a function, of so many components, as a model's function takes them."""
-    found, first = [], 0
+    arguments, first = [], 0
     for size in sizes:
         part = values[first : first + size]
         stack: Callable = torch.stack if part and isinstance(part[0], Tensor) else np.array
-        found.append(stack(part) if is_array(size) else tuple(part))
+        arguments.append(stack(part) if is_array(size) else tuple(part))
         first += size
-    return found
+    return arguments
 
 
 def _components(*arguments: Tensor) -> list[tuple[Tensor, ...]]:
-    return [one.unbind(-1) for one in arguments]
+    return [tensor.unbind(-1) for tensor in arguments]
 
 
-def _components_of_points(x: Tensor, *others: Tensor) -> list[tuple[Tensor, ...]]:
-    return [x.unbind(-2), *(one[..., None].unbind(-2) for one in others)]
+def _components_of_points(x: Tensor, *arguments: Tensor) -> list[tuple[Tensor, ...]]:
+    return [x.unbind(-2), *(tensor[..., None].unbind(-2) for tensor in arguments)]
 
 
 def stacked(values: Sequence[Tensor | float], parts: list[tuple[Tensor, ...]]) -> Tensor:
     """Components of a result as one tensor (..., rows), for the batch of all arguments."""
-    like, known = parts[0][0], [one for part in parts for one in part]
-    shapes = (one.shape for one in (*known, *values) if isinstance(one, Tensor))
+    like, known = parts[0][0], [tensor for part in parts for tensor in part]
+    shapes = (tensor.shape for tensor in (*known, *values) if isinstance(tensor, Tensor))
     batch = torch.broadcast_shapes(*shapes)
-    rows = (one if isinstance(one, Tensor) else like.new_tensor(one) for one in values)
-    return torch.stack([one.expand(batch) for one in rows], -1)
+    rows = (value if isinstance(value, Tensor) else like.new_tensor(value) for value in values)
+    return torch.stack([row.expand(batch) for row in rows], -1)
 
 
 def equation_of(
     name: str,
     of_model: tuple[Callable, Callable | None],
-    given: tuple[Callable | None, Callable | None],
-    others: int,
+    user_functions: tuple[Callable | None, Callable | None],
+    further_arguments: int,
     shape: Shape,
 ) -> Equation:
-    """The equation of a model's function and Jacobian, or of those that are given in their place.
+    """The equation of a model's function and Jacobian, or of functions of tensors in their place.
 
     Args:
         name: of the function in the model.
         of_model: its function, and its Jacobian or None.
-        given: functions of tensors; None for the model's.
-        others: how many arguments it has beside x.
+        user_functions: function and Jacobian of tensors; None for the model's.
+        further_arguments: how many arguments it has besides x.
         shape: of the model.
     """
-    function, jacobian = given
+    function, jacobian = user_functions
     if function is not None:
         return Called(name, function, jacobian, shape)
     if jacobian is not None:
         raise ValueError(f"{name}_jacobian must come with {name}, but got it alone")
     try:
-        return OfGraph(*of_model, others, shape)
+        return OfGraph(*of_model, further_arguments, shape)
     except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
         if reason := needs_floats(*of_model):
             raise ValueError(f"{name} must accept tensors, but {reason}") from None

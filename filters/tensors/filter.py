@@ -32,10 +32,9 @@ class TensorBelief(NamedTuple):
         mean: of the states, (..., n), in the units of the model.
         cov: covariances of the errors, (..., n, n).
         divergences: restarts from the prior, (...,).
-        kept: what else the filter keeps, by the names of its page, such as an estimate of R; of an ensemble its
-            `members` (..., n, N).
-        key: on which an ensemble's random numbers depend, (..., 2) whole numbers.
-        step: steps predicted, on which they depend, too.
+        kept: the page's extras by name, such as an estimate of R; of an ensemble its `members` (..., n, N).
+        key: (..., 2) whole numbers, which determine an ensemble's random numbers together with `step`.
+        step: steps predicted.
     """
 
     mean: Tensor
@@ -112,44 +111,44 @@ class _Likelihood(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, filter_, u, z, q, r):
-        noise = [one.detach().cpu().double().numpy() for one in (q, r)]
+        noise = [cov.detach().cpu().double().numpy() for cov in (q, r)]
         model = filter_.model.replace(process_noise_cov=noise[0], measurement_noise_cov=noise[1])
         counts = [
-            len(lower_pairs(len(one))) * moves for one, moves in zip(noise, ctx.needs_input_grad[3:], strict=True)
+            len(lower_pairs(len(cov))) * moves for cov, moves in zip(noise, ctx.needs_input_grad[3:], strict=True)
         ]
-        q_slopes, r_slopes = (np.zeros((sum(counts), *one.shape)) for one in noise)
+        q_slopes, r_slopes = (np.zeros((sum(counts), *cov.shape)) for cov in noise)
         q_slopes[: counts[0]], r_slopes[counts[0] :] = (
-            _units(len(one))[:k] for one, k in zip(noise, counts, strict=True)
+            _units(len(cov))[:k] for cov, k in zip(noise, counts, strict=True)
         )
-        found = likelihood(model, u, z, q_slopes, r_slopes, filter=filter_)
-        ctx.save_for_backward(q, r, q.new_tensor(found.gradients))
+        result = likelihood(model, u, z, q_slopes, r_slopes, filter=filter_)
+        ctx.save_for_backward(q, r, q.new_tensor(result.gradients))
         ctx.counts = counts
-        return q.new_tensor(found.values)
+        return q.new_tensor(result.values)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, of_values):
         q, r, gradients = ctx.saved_tensors
         entries = (of_values @ gradients).split(ctx.counts)
-        return None, None, None, *(_symmetric(one, like) for one, like in zip(entries, (q, r), strict=True))
+        return None, None, None, *(_symmetric(slopes, like) for slopes, like in zip(entries, (q, r), strict=True))
 
 
 def _units(size: int) -> np.ndarray:
     """Symmetric matrices (pairs, size, size) with ones at a pair of places, the directions of `lower_pairs`."""
-    found = np.zeros((len(lower_pairs(size)), size, size))
-    for unit, (i, j) in zip(found, lower_pairs(size), strict=True):
+    units = np.zeros((len(lower_pairs(size)), size, size))
+    for unit, (i, j) in zip(units, lower_pairs(size), strict=True):
         unit[i, j] = unit[j, i] = 1.0
-    return found
+    return units
 
 
 def _symmetric(entries: Tensor, like: Tensor) -> Tensor | None:
     """The gradient G with dL = <G, dS>, of slopes along pairs of places; None if there are none."""
     if not len(entries):
         return None
-    found = torch.zeros_like(like)
+    matrix = torch.zeros_like(like)
     rows, columns = torch.tensor(lower_pairs(len(like)), device=like.device).T
-    found[rows, columns] = entries
-    return 0.5 * (found + found.mT)  # halves beside the diagonal, for which there are two places
+    matrix[rows, columns] = entries
+    return 0.5 * (matrix + matrix.mT)  # halves beside the diagonal, for which there are two places
 
 
 DIMENSIONS = {
@@ -165,10 +164,10 @@ DIMENSIONS = {
 class TensorFilter:
     """A filter on batches of tensors, which torch differentiates; `filters.torch` makes one.
 
-    Its estimates are those of `filters.run` to rounding: angles, substeps, missing channels and restarts are the
-    same, and an ensemble's random numbers. It has derivatives along everything that is a tensor: the attributes
-    below, inputs, measurements, and whatever its functions contain; random numbers stay as they are. A trajectory
-    that restarts from the prior has estimates; its gradient is NaN.
+    Its estimates are those of `filters.run` to rounding: angles, substeps, missing channels, restarts and an
+    ensemble's random numbers are the same. It has derivatives along every tensor: the attributes below, inputs,
+    measurements, and parameters of its functions. Random numbers do not depend on these. A trajectory that
+    restarts from the prior has estimates; its gradient is NaN.
 
     Attributes:
         process_noise_cov: Q (n, n), or one for each trajectory (..., n, n); of a step, as the model's.
@@ -232,13 +231,13 @@ class TensorFilter:
         self._model, self._own = paged.kernel_model, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
         transition, by_transition, observe, by_observe = self._given
-        motion = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
-        sight = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
+        f_equation = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
+        h_equation = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
         if isinstance(paged, EnsembleFilter):
             check_page_is_all(paged, "on tensors")
-            self._stages: Stages = EnsembleStages(motion, sight, shape, paged.page_with())
+            self._stages: Stages = EnsembleStages(f_equation, h_equation, shape, paged.page_with())
         else:
-            self._stages = Stages(motion, sight, shape, paged.written_page)
+            self._stages = Stages(f_equation, h_equation, shape, paged.written_page)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but graphs, which are made again."""
@@ -250,21 +249,24 @@ class TensorFilter:
         self._make()
 
     def replace(self, **numbers: Any) -> Self:
-        """The filter with other numbers, such as `process_noise_cov=Q`, along which derivatives go on.
+        """The filter with other numbers, such as `process_noise_cov=Q`, along which it is differentiated.
 
         Raises:
             ValueError: for a name that is none of a filter's numbers, or a value whose shape does not fit.
         """
-        found = object.__new__(type(self))
-        vars(found).update(vars(self))
+        replaced = object.__new__(type(self))
+        vars(replaced).update(vars(self))
         own_names = tuple(name for name in self._own if hasattr(self.filter, name))
         for name, value in numbers.items():
             if one_of("a number of a filter", name, (*DIMENSIONS, *own_names)) in own_names:
-                found._changed = {**found._changed, name: self._tensor(name, value, np.shape(self._own[name]))}
+                replaced._changed = {
+                    **replaced._changed,
+                    name: self._tensor(name, value, np.shape(self._own[name])),
+                }
             else:
-                own = getattr(self, name)
-                setattr(found, name, self._tensor(name, value, own.shape[-DIMENSIONS[name] :]))
-        return found
+                before = getattr(self, name)
+                setattr(replaced, name, self._tensor(name, value, before.shape[-DIMENSIONS[name] :]))
+        return replaced
 
     def init(self, batch: int | tuple[int, ...] = (), key: Any = (0, 0)) -> TensorBelief:
         """The prior, for a batch of so many trajectories, or of such a shape.
@@ -273,19 +275,21 @@ class TensorFilter:
             batch: its size or shape.
             key: two whole numbers, or (..., 2) for a batch, on which an ensemble's random numbers depend.
         """
-        whole, key = (batch,) if isinstance(batch, int) else tuple(batch), np.asarray(key, dtype=np.float64)
+        shape, key = (batch,) if isinstance(batch, int) else tuple(batch), np.asarray(key, dtype=np.float64)
         if key.shape[-1:] != (2,):
             raise ValueError(f"a key must be two whole numbers, (..., 2), but got shape {key.shape}")
         if self.filter.size:
-            whole = torch.broadcast_shapes(whole, key.shape[:-1])
-        return self._prior(whole, key, 0)
+            shape = torch.broadcast_shapes(shape, key.shape[:-1])
+        return self._prior(shape, key, 0)
 
     def _prior(self, batch: tuple[int, ...], key: np.ndarray, step: int) -> TensorBelief:
-        whole = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
+        shape = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
         mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
-        prior = mean.expand(*whole, -1), self.prior_cov.expand(*whole, -1, -1)
-        mean, cov, kept = self._stages.start(self._known(), prior, self._normals(key, step))
-        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device), kept, key, step)
+        prior = mean.expand(*shape, -1), self.prior_cov.expand(*shape, -1, -1)
+        mean, cov, extras = self._stages.start(self._known(), prior, self._normals(key, step))
+        return TensorBelief(
+            mean, cov, torch.zeros(shape, dtype=torch.int64, device=mean.device), extras, key, step
+        )
 
     def _normals(self, key: np.ndarray, step: int) -> Draw:
         return normals_of(key, step, self.filter.size, self.prior_mean)
@@ -295,8 +299,8 @@ class TensorFilter:
         u = self._finite("u", u, (self._model.inputs,))
         known, step = (belief.mean, belief.cov, belief.kept), belief.step + 1
         draw, substeps = self._normals(belief.key, step), self._model.substeps
-        mean, cov, kept = self._stages.predict(self._known(), known, u, substeps, draw)
-        return TensorBelief(mean, cov, belief.divergences, kept, belief.key, step)
+        mean, cov, extras = self._stages.predict(self._known(), known, u, substeps, draw)
+        return TensorBelief(mean, cov, belief.divergences, extras, belief.key, step)
 
     def update(self, belief: TensorBelief, z: Any) -> tuple[TensorBelief, TensorInnovation]:
         """The belief after measurements z (..., m), NaN where missing, and the innovations.
@@ -306,7 +310,7 @@ class TensorFilter:
         z = self._finite("z", z, (self._model.m,), missing_allowed=True)
         known = belief.mean, belief.cov, belief.kept
         draw = self._normals(belief.key, belief.step)
-        (mean, cov, kept), (v, s, level) = self._stages.update(self._known(), known, z, draw)
+        (mean, cov, extras), (v, s, level) = self._stages.update(self._known(), known, z, draw)
         lost = ~_all_finite(mean, cov, v, s, level)
         batch = lost.shape
         counted = belief.divergences.expand(batch) + lost
@@ -316,8 +320,8 @@ class TensorFilter:
             cov, s = where(lost, prior.cov, cov, 2), where(lost, self.measurement_noise_cov, s, 2)
             level = torch.where(lost, 0.0, level)
             sizes = self._stages.kept
-            kept = {name: where(lost, prior.kept[name], one, sizes[name]) for name, one in kept.items()}
-        belief = TensorBelief(mean, cov, counted, kept, belief.key, belief.step)
+            extras = {name: where(lost, prior.kept[name], extra, sizes[name]) for name, extra in extras.items()}
+        belief = TensorBelief(mean, cov, counted, extras, belief.key, belief.step)
         return belief, TensorInnovation(v, s, level)
 
     def run(self, inputs: Any = None, measurements: Any = None, keys: Any = None) -> TensorEstimates:
@@ -343,13 +347,13 @@ class TensorFilter:
         batch = z.shape[:-2]
         if keys is None:
             keys = filter_keys(range(prod(batch))).reshape(*batch, 2) if self.filter.size else (0, 0)
-        belief, told = self.init(batch, keys), []
+        belief, outputs = self.init(batch, keys), []
         for k in range(z.shape[-2]):
             if k > 0:
                 belief = self.predict(belief, u[..., k - 1, :])
             belief, innovation = self.update(belief, z[..., k, :])
-            told.append((belief.mean, belief.cov, *innovation))
-        means, covs, values, innovation_covs, levels = zip(*told, strict=True)
+            outputs.append((belief.mean, belief.cov, *innovation))
+        means, covs, values, innovation_covs, levels = zip(*outputs, strict=True)
         return TensorEstimates(
             torch.stack(means, -2),
             torch.stack(covs, -3),
@@ -372,11 +376,11 @@ class TensorFilter:
         Raises:
             ValueError: if shapes do not fit, or the filter has functions or other numbers than its model.
         """
-        others = {name: getattr(self, name) for name in ("prior_mean", "prior_cov", "constants")}
+        changeable = {name: getattr(self, name) for name in ("prior_mean", "prior_cov", "constants")}
         if (
             any(self._given)
             or self._changed
-            or not all(_is(one, getattr(self._model, name)) for name, one in others.items())
+            or not all(_is(tensor, getattr(self._model, name)) for name, tensor in changeable.items())
         ):
             raise ValueError(
                 "the compiled log-likelihood needs the model's own functions, prior and constants, but got "
@@ -389,9 +393,9 @@ class TensorFilter:
         """Tensors of the numbers that pages read."""
         self._check_what_follows()
         memory, like = self._stages.memory, self.prior_mean
-        own = {
-            one: torch.as_tensor(value, dtype=like.dtype, device=like.device)
-            for one, value in zip(memory.own, {**self._own, **self._changed}.values(), strict=False)
+        own_parameters = {
+            matrix: torch.as_tensor(value, dtype=like.dtype, device=like.device)
+            for matrix, value in zip(memory.own, {**self._own, **self._changed}.values(), strict=False)
         }
         numbers = {
             memory.Q: self.process_noise_cov,
@@ -401,8 +405,8 @@ class TensorFilter:
         }
         covs = {memory.Q_root: self.process_noise_cov, memory.prior_root: self.prior_cov}
         covs[memory.R_root] = self.measurement_noise_cov
-        numbers |= {one: root(cov) for one, cov in covs.items() if one in self._stages.reads}
-        return {one.operation: value for one, value in (own | numbers).items()}
+        numbers |= {matrix: root(cov) for matrix, cov in covs.items() if matrix in self._stages.reads}
+        return {matrix.operation: value for matrix, value in (own_parameters | numbers).items()}
 
     def _check_what_follows(self) -> None:
         """Raise ValueError for other numbers, or derivatives, that the filter's parameters do not follow."""
@@ -418,31 +422,31 @@ class TensorFilter:
         """A value as a tensor (..., *shape) of the filter's dtype and on its device."""
         like = self.prior_mean
         try:
-            found = torch.as_tensor(as_numbers(value), dtype=like.dtype, device=like.device)
+            tensor = torch.as_tensor(as_numbers(value), dtype=like.dtype, device=like.device)
         except (TypeError, ValueError, RuntimeError):
             raise ValueError(f"{name} must be a tensor of numbers, but got {short_repr(value)}") from None
-        if found.shape[found.ndim - len(shape) :] != shape:
+        if tensor.shape[tensor.ndim - len(shape) :] != shape:
             wanted = ", ".join(("...", *map(str, shape)))
-            raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(found.shape)}")
-        return found
+            raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(tensor.shape)}")
+        return tensor
 
     def _finite(self, name: str, value: Any, shape: tuple[int, ...], *, missing_allowed: bool = False) -> Tensor:
         """The same; ValueError for infinite numbers, and NaN unless it may be missing."""
-        found = self._tensor(name, value, shape)
-        wrong = torch.isinf(found) if missing_allowed else ~torch.isfinite(found)
+        tensor = self._tensor(name, value, shape)
+        wrong = torch.isinf(tensor) if missing_allowed else ~torch.isfinite(tensor)
         if wrong.any():
             rule = "finite or NaN" if missing_allowed else "finite"
-            raise ValueError(f"{name} must be {rule}, but got {short_repr(found[wrong][0].item())}")
-        return found
+            raise ValueError(f"{name} must be {rule}, but got {short_repr(tensor[wrong][0].item())}")
+        return tensor
 
 
-def _all_finite(mean: Tensor, cov: Tensor, *others: Tensor) -> Tensor:
+def _all_finite(mean: Tensor, cov: Tensor, *innovation: Tensor) -> Tensor:
     """Which beliefs (...,) and innovations consist of finite numbers, with variances that are not negative."""
-    v, s, level = others
+    v, s, level = innovation
     sums = mean.abs().sum(-1) + cov.abs().sum((-2, -1)) + v.abs().sum(-1) + s.abs().sum((-2, -1)) + level.abs()
     return sums.isfinite() & (torch.diagonal(cov, dim1=-2, dim2=-1) >= 0).all(-1)
 
 
-def _is(one: Tensor, value: Any) -> bool:
+def _is(tensor: Tensor, value: Any) -> bool:
     """Whether a tensor is a model's own number, and no derivative is asked for."""
-    return not one.requires_grad and torch.equal(one, one.new_tensor(value))
+    return not tensor.requires_grad and torch.equal(tensor, tensor.new_tensor(value))

@@ -1,8 +1,7 @@
 """A page's stages as functions of tensors: of a belief, an input, a measurement, and the numbers of a model.
 
-torch's autograd then differentiates it. A vector of which each member of an ensemble has one is a matrix
-(..., rows, members). An operation that nothing is said of here, such as a function of the model, computes on
-tensors itself.
+torch's autograd then differentiates it. A vector of each member of an ensemble is a matrix (..., rows, members).
+An operation without a rule here, such as a function of the model, computes on tensors itself.
 """
 
 from __future__ import annotations
@@ -29,37 +28,37 @@ from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_P
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import LANES, Shape, padded
 
-# What pages of filters say, worked out of tensors: a batch (..., rows, columns) in the place of each matrix.
+# Values of a page's matrices: a batch of tensors (..., rows, columns) for each matrix.
 
 
 def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:
     """Values of matrices of a graph, in an order of `matrices.in_order`, given those that are known.
 
     Args:
-        order: all that is wanted, after what it is made of.
+        order: the wanted matrices, each after its arguments.
         known: tensors (..., *shape) for matrices that are given.
         like: a tensor of the dtype and on the device of all.
     """
     values: dict[Matrix, Any] = dict(known)
-    for one in order:
-        if one not in values:
-            arguments = (_with(a, one, values) if isinstance(a, Matrix) else a for a in one.arguments)
-            if one.operation in CONSTANT:
-                size = one.arguments[0].shape
-                values[one] = torch.as_tensor(one.operation.compute(np.zeros(size)), dtype=like.dtype).to(
+    for matrix in order:
+        if matrix not in values:
+            arguments = (_with(a, matrix, values) if isinstance(a, Matrix) else a for a in matrix.arguments)
+            if matrix.operation in CONSTANT:
+                size = matrix.arguments[0].shape
+                values[matrix] = torch.as_tensor(matrix.operation.compute(np.zeros(size)), dtype=like.dtype).to(
                     like.device
                 )
-            elif one.operation in OF_SHAPE:
-                values[one] = OF_SHAPE[one.operation](len(one.shape) + one.member, *arguments)
+            elif matrix.operation in OF_SHAPE:
+                values[matrix] = OF_SHAPE[matrix.operation](len(matrix.shape) + matrix.member, *arguments)
             else:
-                values[one] = RULES.get(one.operation, one.operation.compute)(*arguments)
+                values[matrix] = RULES.get(matrix.operation, matrix.operation.compute)(*arguments)
     return values
 
 
-def _with(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
+def _with(a: Matrix, result: Matrix, values: Mapping[Matrix, Any]) -> Any:
     """The value of an argument; a number, or a vector beside those of members, gets the result's dimensions."""
-    found, missing = values[a], len(one.shape) + one.member - len(a.shape) - a.member
-    return found[(..., *[None] * missing)] if one.operation in BY_ENTRIES and missing else found
+    value, missing = values[a], len(result.shape) + result.member - len(a.shape) - a.member
+    return value[(..., *[None] * missing)] if result.operation in BY_ENTRIES and missing else value
 
 
 def _wrapped(x: Tensor) -> Tensor:
@@ -73,12 +72,12 @@ def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
 def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
     """The quotient C S^-1 by L L' = S."""
     right = c.mT if dimensions == 2 else c[..., None]
-    found = torch.cholesky_solve(right, root)
-    return found.mT if dimensions == 2 else found[..., 0]
+    solution = torch.cholesky_solve(right, root)
+    return solution.mT if dimensions == 2 else solution[..., 0]
 
 
-def _only(dimensions: int, seen: Tensor, a: Tensor) -> Tensor:
-    return torch.where(seen if dimensions == 1 else seen[..., None], a, 0.0)
+def _only(dimensions: int, mask: Tensor, a: Tensor) -> Tensor:
+    return torch.where(mask if dimensions == 1 else mask[..., None], a, 0.0)
 
 
 def wrapped_where(x: Tensor, angles: tuple[bool, ...]) -> Tensor:
@@ -104,9 +103,9 @@ def _symmetric(a: Tensor) -> Tensor:
     return 0.5 * (a + a.mT)
 
 
-def _uncorrelated(seen: Tensor, r: Tensor) -> Tensor:
+def _uncorrelated(mask: Tensor, r: Tensor) -> Tensor:
     alone = torch.eye(r.shape[-1], dtype=torch.bool, device=r.device)
-    return torch.where(seen[..., :, None] & seen[..., None, :] | alone, r, 0.0)
+    return torch.where(mask[..., :, None] & mask[..., None, :] | alone, r, 0.0)
 
 
 def factor(s: Tensor) -> Tensor:
@@ -115,11 +114,11 @@ def factor(s: Tensor) -> Tensor:
     return torch.where((failed == 0)[..., None, None], lower, math.nan)
 
 
-def density(v: Tensor, root: Tensor, seen: Tensor) -> Tensor:
+def density(v: Tensor, root: Tensor, mask: Tensor) -> Tensor:
     """Log N(v; 0, L L') of the entries that are seen, for L = root, (...)."""
     scaled = _forward_quotient(root, v)
     logs = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)) + densities.LEVEL
-    return -0.5 * (scaled * scaled).sum(-1) - torch.where(seen, logs, 0.0).sum(-1)
+    return -0.5 * (scaled * scaled).sum(-1) - torch.where(mask, logs, 0.0).sum(-1)
 
 
 def _forward_quotient(lower: Tensor, v: Tensor) -> Tensor:
@@ -167,7 +166,7 @@ def _triangle(a: Tensor) -> Tensor:
 
 def _joined(dimension: int, a: Tensor, b: Tensor) -> Tensor:
     batch = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    return torch.cat([one.expand(*batch, -1, -1) for one in (a, b)], dimension)
+    return torch.cat([tensor.expand(*batch, -1, -1) for tensor in (a, b)], dimension)
 
 
 def _hats(u: Tensor, nodes: Tensor) -> Tensor:
@@ -187,10 +186,10 @@ def _deviations(x: Tensor) -> Tensor:
 
 def _stretches(before: Tensor, after: Tensor, part: Tensor) -> Tensor:
     """`members.stretches`; where nothing is left there is no slope."""
-    there = after > 0
-    ratio = torch.where(there & (before > 0), before, 1.0) / torch.where(there, after, 1.0)
+    positive = after > 0
+    ratio = torch.where(positive & (before > 0), before, 1.0) / torch.where(positive, after, 1.0)
     lost = torch.where(before > 0, ratio.sqrt(), 0.0) - 1.0
-    return torch.where(there, 1.0 + part[..., None] * lost, 1.0)
+    return torch.where(positive, 1.0 + part[..., None] * lost, 1.0)
 
 
 def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
@@ -231,7 +230,7 @@ RULES: dict[Operation, Callable] = {
     operations.present: lambda z: z == z,
     operations.uncorrelated: _uncorrelated,
     operations.factor: factor,
-    operations.inverse: lambda root, seen: torch.cholesky_inverse(root),
+    operations.inverse: lambda root, mask: torch.cholesky_inverse(root),
     densities.density: density,
     densities.dot: lambda a, b: (a * b).sum(-1),
     points.root: root,
@@ -243,7 +242,7 @@ RULES: dict[Operation, Callable] = {
     scalars.exceeds: lambda a, value: a > value,
     scalars.is_number: lambda a: a == a,
     scalars.trace: lambda a: torch.diagonal(a, dim1=-2, dim2=-1).sum(-1),
-    scalars.count: lambda seen: seen.sum(-1),  # a whole number, which leaves the precision of others
+    scalars.count: lambda mask: mask.sum(-1),  # a whole number, which leaves the precision of others
     scalars.exponential: torch.exp,
     scalars.at_most: lambda v, value: torch.clamp(v, max=value),
     scalars.at_least: lambda a, value: torch.where(a > value, a, value),
@@ -312,7 +311,7 @@ class TensorModel(PagedModel):
 
 
 class _Operations:
-    """An equation as operations on Matrices; its value and its Jacobian are worked out together."""
+    """An equation as operations on Matrices; its value and its Jacobian are evaluated together."""
 
     def __init__(self, equation: Equation, rows: int, n: int):
         self.both = Operation(equation.with_jacobian, lambda *_: (), never)
@@ -321,10 +320,10 @@ class _Operations:
         self.value = Operation(lambda both: both[0], lambda _: (rows,), never)
         self.matrix = Operation(lambda both: both[1], lambda _: (rows, n), never)
 
-    def value_at(self, x: Matrix, *others: Matrix) -> Matrix:
+    def value_at(self, x: Matrix, *arguments: Matrix) -> Matrix:
         if x.member:
-            return self.of_members(x, *others)
-        return self.value(self.both(x, *others)) if len(x.shape) == 1 else self.of_points(x, *others)
+            return self.of_members(x, *arguments)
+        return self.value(self.both(x, *arguments)) if len(x.shape) == 1 else self.of_points(x, *arguments)
 
 
 class _Part:
@@ -333,22 +332,22 @@ class _Part:
     def __init__(self, stage: Stage):
         self._wanted = dict(stage.stores[0])
         self._order = in_order(list(self._wanted.values()))
-        self.given = [one for one in self._order if isinstance(one.operation, Place)]
+        self.given = [matrix for matrix in self._order if isinstance(matrix.operation, Place)]
 
     def __call__(self, tensors: Mapping[Place, Tensor], like: Tensor) -> dict[Place, Tensor]:
-        found = work_out(self._order, {one: tensors[one.operation] for one in self.given}, like)
-        return {place: found[one] for place, one in self._wanted.items()}
+        values = work_out(self._order, {matrix: tensors[matrix.operation] for matrix in self.given}, like)
+        return {target: values[matrix] for target, matrix in self._wanted.items()}
 
 
 def normals_of(key: np.ndarray, step: int, size: int, like: Tensor) -> Draw:
-    """What draws normals (..., rows, size) of a stream for keys (..., 2), those of `filters.run`."""
+    """A function that draws normals (..., rows, size) of a stream for keys (..., 2), those of `filters.run`."""
     width = padded(size, LANES)
 
     def draw(stream: int, rows: int) -> Tensor:
         words = (key[..., k, None] for k in range(2))
-        found = np.stack(normal_block(np.arange(rows * width // 4), step, stream, *words), axis=-1)
-        found = found.reshape(*key.shape[:-1], rows, width)[..., :size]
-        return torch.as_tensor(found, dtype=like.dtype, device=like.device)
+        normals = np.stack(normal_block(np.arange(rows * width // 4), step, stream, *words), axis=-1)
+        normals = normals.reshape(*key.shape[:-1], rows, width)[..., :size]
+        return torch.as_tensor(normals, dtype=like.dtype, device=like.device)
 
     return draw
 
@@ -356,12 +355,12 @@ def normals_of(key: np.ndarray, step: int, size: int, like: Tensor) -> Draw:
 class Stages:
     """The functions of a page, for a model's equations.
 
-    A belief is mean, covariance and what is kept, by names; `draw(stream, rows)` are an ensemble's normals.
+    A belief is mean, covariance and extras by name; `draw(stream, rows)` returns an ensemble's normals.
 
     Attributes:
-        memory: where a filter's numbers lie.
-        reads: which of them the page reads.
-        kept: dimensions of what a filter keeps, beside those of a batch.
+        memory: the layout of a filter's numbers.
+        reads: the matrices that the page reads.
+        kept: dimensions of the extras, besides those of a batch.
     """
 
     memory: NumbersMemory
@@ -371,15 +370,15 @@ class Stages:
         self.memory = memory = RowMemory(shape, page)
         stages = stages_of(page, memory, TensorModel(f, h, memory))
         parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
-        self.reads = {one for part in parts for one in part.given}
+        self.reads = {matrix for part in parts for matrix in part.given}
         self._belief, self._told = memory.belief, memory.told
-        self._kept = {name: one.operation for name, one in memory.kept.items()}
-        self.kept = {name: len(one.shape) for name, one in memory.kept.items()}
+        self._kept = {name: matrix.operation for name, matrix in memory.kept.items()}
+        self.kept = {name: len(matrix.shape) for name, matrix in memory.kept.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The belief at the prior, of its mean and covariance."""
-        found = self._start(numbers, prior[0])
-        return *prior, {name: found[place] for name, place in self._kept.items()}
+        started = self._start(numbers, prior[0])
+        return *prior, {name: started[source] for name, source in self._kept.items()}
 
     def predict(
         self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int, draw: Draw
@@ -394,38 +393,45 @@ class Stages:
         """The belief after the measurement z; then the innovation, its covariance and its log density."""
         tensors = self._tensors(numbers, belief, z)
         tensors |= self._update(tensors, belief[0])
-        return self._belief_of(tensors), [tensors[place] for place in self._told]
+        return self._belief_of(tensors), [tensors[source] for source in self._told]
 
-    def _tensors(self, numbers: Mapping[Place, Tensor], belief: tuple, given: Tensor) -> dict[Place, Tensor]:
-        *known, kept = belief
-        rows = dict(zip(self._belief, known, strict=True)) | {self._kept[name]: one for name, one in kept.items()}
-        return {**numbers, **rows, Place("given", 0): given}
+    def _tensors(self, numbers: Mapping[Place, Tensor], belief: tuple, argument: Tensor) -> dict[Place, Tensor]:
+        *known, extras = belief
+        rows = dict(zip(self._belief, known, strict=True)) | {
+            self._kept[name]: extra for name, extra in extras.items()
+        }
+        return {**numbers, **rows, Place("given", 0): argument}
 
     def _belief_of(self, tensors: Mapping[Place, Tensor]) -> tuple:
         return *(tensors[at] for at in self._belief), {name: tensors[at] for name, at in self._kept.items()}
 
 
 class EnsembleStages(Stages):
-    """The same of an ensemble, which keeps its members (..., n, N)."""
+    """The stages of an ensemble, which keeps its members (..., n, N)."""
 
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
         """Make graphs of matrices of the page."""
         self.memory = memory = MembersMemory(shape, page)
-        parts = {name: _Part(one) for name, one in members_stages(page, memory, TensorModel(f, h, memory)).items()}
+        parts = {
+            name: _Part(stage) for name, stage in members_stages(page, memory, TensorModel(f, h, memory)).items()
+        }
         self._parts = parts
-        self.reads = {one for part in parts.values() for one in part.given}
+        self.reads = {matrix for part in parts.values() for matrix in part.given}
         self._belief, self._told = memory.belief, memory.told
-        kept = {"members": memory.x, **memory.kept}
-        self._kept = {name: one.operation for name, one in kept.items()}
-        self.kept = {name: len(one.shape) + one.member for name, one in kept.items()}
+        matrices = {"members": memory.x, **memory.kept}
+        self._kept = {name: matrix.operation for name, matrix in matrices.items()}
+        self.kept = {name: len(matrix.shape) + matrix.member for name, matrix in matrices.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The members at the prior, their mean and covariance."""
         tensors = {**numbers, NORMALS: draw(FILTER_PRIOR, self.memory.shape.n)}
-        mean, cov, kept = self._after(tensors, ("start", "summarise"), prior[0])
+        mean, cov, extras = self._after(tensors, ("start", "summarise"), prior[0])
         batch = prior[0].shape[:-1]
-        kept = {name: one.expand(*batch, *one.shape[one.ndim - self.kept[name] :]) for name, one in kept.items()}
-        return mean.expand(*batch, -1), cov.expand(*batch, -1, -1), kept
+        extras = {
+            name: extra.expand(*batch, *extra.shape[extra.ndim - self.kept[name] :])
+            for name, extra in extras.items()
+        }
+        return mean.expand(*batch, -1), cov.expand(*batch, -1, -1), extras
 
     def predict(
         self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int, draw: Draw
@@ -438,10 +444,10 @@ class EnsembleStages(Stages):
     def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:
         """The belief after the measurement z; then the innovation, its covariance and its log density."""
         tensors = self._tensors(numbers, belief, z)
-        if any(one.operation == NORMALS for one in self._parts["update"].given):
+        if any(matrix.operation == NORMALS for matrix in self._parts["update"].given):
             tensors[NORMALS] = draw(FILTER_MEASUREMENT, self.memory.shape.m)
-        found = self._after(tensors, ("update",), belief[0])
-        return found, [tensors[place] for place in self._told]
+        updated = self._after(tensors, ("update",), belief[0])
+        return updated, [tensors[source] for source in self._told]
 
     def _after(self, tensors: dict[Place, Tensor], names: Sequence[str], like: Tensor) -> tuple:
         for name in names:

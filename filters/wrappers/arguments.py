@@ -2,8 +2,8 @@
 
     x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
 
-The method `measured_inputs(model)` of an env says which of its channels are such inputs a, and which are the
-model's measurements z. A filter predicts with the last measured a, and updates with z.
+The method `measured_inputs(model)` of an env splits its channels into such inputs a and the model's measurements
+z. A filter predicts with the last measured a, and updates with z.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
         return "the model", model
     module, _, name = str(model).partition(":")
     try:
-        found = getattr(importlib.import_module(module), name)
+        factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError):
         raise ValueError(
             f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
         ) from None
-    return f"model {model!r}", found
+    return f"model {model!r}", factory
 
 
 def offered(env, name: str) -> Any:
@@ -69,15 +69,15 @@ def offered(env, name: str) -> Any:
     return getattr(env.unwrapped, name, None)
 
 
-def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
+def made_model(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
     """The model made with some arguments; ValueError if there is none."""
     try:
-        found = make(**arguments)
+        model = make(**arguments)
     except TypeError as error:
         raise ValueError(f"{what} must take the given arguments: {error}") from None
-    if not isinstance(found, StateSpaceModel):
-        raise ValueError(f"{what} must be a StateSpaceModel, but it is {short_repr(found)}")
-    return found
+    if not isinstance(model, StateSpaceModel):
+        raise ValueError(f"{what} must be a StateSpaceModel, but it is {short_repr(model)}")
+    return model
 
 
 # The filter of a tuned file, with the model of the env or of the caller.
@@ -86,10 +86,10 @@ def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
     """Make the filter of a tuned file, for a model that takes the tuned Q, R and parameters.
 
-    Names in the file are never imported: the model is the env's own, or given by the caller, and must be
-    the file's. A file that contains its plant as data is compared with the env's plant, if no model is
-    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files older than version
-    4 are compared only by the plant.
+    Names in the file are never imported: the model is the env's or the caller's, and must equal the file's. If the
+    file contains its plant as data, it must match the env's plant (unless the caller passes a model) and the
+    model's states, inputs and sensors; otherwise also dt and the model's digest. For files older than version 4
+    only the plant is compared.
 
     Args:
         env: the wrapped env.
@@ -108,20 +108,20 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
     dt = None if plant is not None else sample_time(env)
     factors = [f"{name} {value:g}" for name, value in entry["model"].get(FACTORS, {}).items() if value != 1.0]
     if factors:
-        said = f"{file} was tuned on a model that is wrong on purpose: here, too, its filter assumes"
-        warnings.warn(f"{said} {', '.join(factors)} times the plant's own", stacklevel=4)
+        message = f"{file} was tuned on a model that is wrong on purpose: here, too, its filter assumes"
+        warnings.warn(f"{message} {', '.join(factors)} times the plant's own", stacklevel=4)
 
-    def fits(found: StateSpaceModel) -> None:
+    def fits(candidate: StateSpaceModel) -> None:
         if tuned_for is not None:
             with compared(content, file):
-                check_same_quantities(tuned_for, found, dt, file)
+                check_same_quantities(tuned_for, candidate, dt, file)
 
     by_digest = tuned_for is not None and plant is None
-    found = _with_numbers(*maker_of(env, model), entry["model"], fits, by_digest)
+    tuned = _with_numbers(*maker_of(env, model), entry["model"], fits, by_digest)
     if tuned_for is not None and by_digest:
         with compared(content, file):
-            check_same_model(tuned_for, found, dt, file)
-    return make_filter(entry["name"], found, **entry["numbers"])
+            check_same_model(tuned_for, tuned, dt, file)
+    return make_filter(entry["name"], tuned, **entry["numbers"])
 
 
 def sample_time(env) -> float | None:
@@ -137,26 +137,26 @@ def _with_numbers(
     fits: Callable[[StateSpaceModel], None],
     by_digest: bool,
 ) -> StateSpaceModel:
-    """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
+    """A model with the numbers of a tuned file: Q and R, the factor on P_0, and further arguments of its maker.
 
-    Constants that the file has as states become states. Other parameters are left out only where the model's
-    digest then shows whether that makes another model.
+    Constants that the file has as states become states. Parameters that the maker does not take are left out only
+    if a comparison of digests follows, which would detect another model.
     """
-    unknown = {name: Unknown.of_numbers(*one) for name, one in numbers.get(AUGMENTED, {}).items()}
+    unknown = {name: Unknown.of_numbers(*prior) for name, prior in numbers.get(AUGMENTED, {}).items()}
 
-    def augmented(found: StateSpaceModel) -> StateSpaceModel:
-        return augmented_model(found, unknown) if unknown else found
+    def augmented(plain: StateSpaceModel) -> StateSpaceModel:
+        return augmented_model(plain, unknown) if unknown else plain
 
     if isinstance(make, StateSpaceModel):
-        found = augmented(make)
-        fits(found)
-        return _with_noise(found, numbers)
-    own = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR, AUGMENTED)}
+        model = augmented(make)
+        fits(model)
+        return _with_noise(model, numbers)
+    arguments = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR, AUGMENTED)}
     if by_digest:
-        own = {name: value for name, value in own.items() if name in _arguments_of(make)}
-    plain = augmented(made(what, make, own))
-    fits(plain)  # before Q and R of other sizes are
-    return _with_noise(plain, numbers) if by_digest or unknown else made(what, make, numbers)
+        arguments = {name: value for name, value in arguments.items() if name in _arguments_of(make)}
+    plain = augmented(made_model(what, make, arguments))
+    fits(plain)  # before Q and R, whose sizes may differ
+    return _with_noise(plain, numbers) if by_digest or unknown else made_model(what, make, numbers)
 
 
 def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
@@ -167,7 +167,7 @@ def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
 
 
 def _arguments_of(make: Callable) -> set[str]:
-    """Names of the arguments that a function takes, none if it does not tell."""
+    """Names of a function's arguments; none if it has no signature."""
     try:
         return set(inspect.signature(make).parameters)
     except (TypeError, ValueError):  # some are written in C
@@ -231,14 +231,14 @@ def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> S
     """The given model, one made by "module:factory", or the env's own; see `EstimateState`."""
     what, make = maker_of(env, model)
     if not isinstance(make, StateSpaceModel):
-        return made(what, make, arguments)
+        return made_model(what, make, arguments)
     if arguments:
         raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
     return make
 
 
 class ModelInSpec:
-    """A model as an env's spec stores it. JSON refuses it with its class's name, which says what to do."""
+    """A model as an env's spec stores it. JSON's error shows the class's name, which states the remedy."""
 
     def __init__(self, content):
         self.content = content
@@ -280,8 +280,8 @@ HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or N
 
 def split_of(env, model: StateSpaceModel) -> Split:
     """The split of an env's channels for a model; without the hook all channels are measurements."""
-    found = getattr(env.unwrapped, HOOK, lambda model: None)(model)
-    return Split((), tuple(range(model.m)), model.m) if found is None else found
+    declared = getattr(env.unwrapped, HOOK, lambda model: None)(model)
+    return Split((), tuple(range(model.m)), model.m) if declared is None else declared
 
 
 class WithMeasuredInputs:
@@ -290,13 +290,13 @@ class WithMeasuredInputs:
     If such a measurement is missing, the last one is used, and zero before the first.
 
     Attributes:
-        used: the inputs of the last step, the action and what was measured.
+        used: the inputs of the last step: the action and the measured inputs.
     """
 
     used: np.ndarray | None = None
 
     def __init__(self, runs, split: Split):
-        """Take what runs the filter, a session or beliefs; `start` comes next."""
+        """Take a session or beliefs, which run the filter; `start` comes next."""
         self._runs, self._inputs, self._measurements = runs, list(split.inputs), list(split.measurements)
         self._last: np.ndarray | None = None
 

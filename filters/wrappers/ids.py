@@ -69,13 +69,13 @@ def modelled_ids() -> list[str]:
     packages = {point.value for point in importlib.metadata.entry_points(group=PLANTS)}
     for package in sorted(packages):
         importlib.import_module(package)
-    found = []
+    ids = []
     for env_id, spec in registry.items():
         entry = spec.entry_point
         if isinstance(entry, str) and entry.partition(".")[0].partition(":")[0] in packages:
             if hasattr(load_env_creator(entry), "state_space_model"):
-                found.append(env_id)
-    return found
+                ids.append(env_id)
+    return ids
 
 
 def register_filtered_envs() -> None:

@@ -98,11 +98,17 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     ):
         """Build model and filter; see the class for the arguments."""
         model = model.content if isinstance(model, ModelInSpec) else model
-        held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
+        model_in_spec = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
         filter = filter.content if isinstance(filter, EstimatorInSpec) else filter
         filter, tuned = given_filter(filter, tuned)
-        kept = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
-        recorded = {"filter": kept, "observation": observation, "model": held, "tuned": tuned, **numbers}
+        filter_in_spec = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
+        recorded = {
+            "filter": filter_in_spec,
+            "observation": observation,
+            "model": model_in_spec,
+            "tuned": tuned,
+            **numbers,
+        }
         recorded |= {"model_arguments": model_arguments, "smoothing_lag": smoothing_lag}
         watches = monitor_of(monitor)
         recorded["monitor"] = watches and watches.as_mapping()
@@ -196,8 +202,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if self._lagged:
             info["smoothed"], info["smoothed_cov"] = session.smoothed()
         if self._watch is not None:
-            seen = as_floats(z)[self._measurements]
-            info["health"] = self._watch.step(info["innovation"], info["innovation_cov"], seen)
+            measured = as_floats(z)[self._measurements]
+            info["health"] = self._watch.step(info["innovation"], info["innovation_cov"], measured)
         if self._form == "estimate" and not self._appended:
             return mean.astype(FLOAT32)
         parts = [mean]

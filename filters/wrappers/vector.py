@@ -95,8 +95,8 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
         watches = monitor_of(monitor)
-        found = [watch_of(watches, self.filter) for _ in range(self.num_envs)]
-        self._watches = [one for one in found if one is not None]  # of all copies, or of none
+        watches_of_copies = [watch_of(watches, self.filter) for _ in range(self.num_envs)]
+        self._watches = [watch for watch in watches_of_copies if watch is not None]  # of all copies, or of none
         self._reports: list = [None] * self.num_envs
         self._measured = list(split.measurements)
         self._done = np.zeros(self.num_envs, dtype=bool)
@@ -163,10 +163,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         final_info = info.setdefault("final_info", {})
         last = np.where(done[:, None], self._measurements(observations, final_info), z)
         self._advance(u, last)
-        seen = self._observe(observations, last, final_info, done)
+        last_observations = self._observe(observations, last, final_info, done)
         info["final_obs"] = final.copy()
         for i in np.flatnonzero(done):
-            info["final_obs"][i] = seen[i]
+            info["final_obs"][i] = last_observations[i]
 
     def _measurements(self, observations, info) -> np.ndarray:
         z = info.get("measurement")
@@ -192,8 +192,8 @@ class EstimateStates(gym.vector.VectorWrapper):
         """Report copies of a mask; those of `stepped` (N,), by default all, have a new measurement."""
         n, m, beliefs = self._n, self.filter.model.m, self._beliefs
         mean, cov = beliefs.part("mean", n), beliefs.part("cov", n, n)
-        there = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
-        stepped = there if stepped is None else stepped
+        reported = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
+        stepped = reported if stepped is None else stepped
         added = {
             "estimate": mean,
             "estimate_cov": cov,
@@ -204,14 +204,14 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self._lagged:
             added["smoothed"], added["smoothed_cov"] = beliefs.smoothed()
         if self._watches:
-            added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there, stepped)
+            added["health"] = self._health(added["innovation"], added["innovation_cov"], z, reported, stepped)
         info |= added
-        info |= {f"_{key}": there for key in added}
-        counts, given = added["estimate_divergences"], z[:, self._measured]
-        restarts = self._restarts.note(stepped, counts, (mean, cov), self._used, given)
+        info |= {f"_{key}": reported for key in added}
+        counts, measured = added["estimate_divergences"], z[:, self._measured]
+        restarts = self._restarts.note(stepped, counts, (mean, cov), self._used, measured)
         if restarts is not None:
-            said = np.array([one is not None for one in restarts])
-            info |= {"estimate_restarts": restarts, "_estimate_restarts": said}
+            restarted = np.array([sentence is not None for sentence in restarts])
+            info |= {"estimate_restarts": restarts, "_estimate_restarts": restarted}
         parts = [mean]
         if self._form == "belief":
             parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
@@ -222,11 +222,11 @@ class EstimateStates(gym.vector.VectorWrapper):
             parts.append(observations[:, -self._appended :])
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _health(self, innovations: np.ndarray, covs: np.ndarray, z: np.ndarray, there, stepped) -> np.ndarray:
+    def _health(self, innovations: np.ndarray, covs: np.ndarray, z: np.ndarray, reported, stepped) -> np.ndarray:
         """Reports (N,) of the monitors, without a new measurement the last; None of copies that are not there."""
-        found = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(there):
+        reports = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(reported):
             if stepped[i]:
                 self._reports[i] = self._watches[i].step(innovations[i], covs[i], z[i, self._measured])
-            found[i] = self._reports[i]
-        return found
+            reports[i] = self._reports[i]
+        return reports
