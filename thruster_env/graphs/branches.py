@@ -1,28 +1,27 @@
-"""A function that decides, of numbers that are not known yet: called once for each outcome of its decisions.
+"""Functions with branches on unknown numbers: called once for each outcome of their decisions, with derivatives.
 
     if x[0] > 0.0:                    y = where(x[0] > 0.0, math.sqrt(x[0]), 0.0)
         y = math.sqrt(x[0])
     else:
         y = 0.0
 
-A condition asks its graph, which answers yes at first. Then the function is called again with the last answer
-turned round, and so on, and between the results there is a choice. A loop that decides how long it goes on has no
-end here; it raises TypeError, as what has too many outcomes does. Where a function itself raises an exception, as
-`assert` does, the result is NaN, as that of arithmetic is in machine code where Python raises.
+At a condition the graph first answers yes. Then the function is called again with the last answer inverted, and
+so on, and a `where` joins the results. A loop whose length depends on an unknown number never ends that way; it
+raises TypeError, as does a function with too many outcomes. If the function itself raises an exception, as
+`assert` does, the result is NaN, as in machine code for arithmetic at which Python raises.
 
-Beside each number y of a graph stands y', worked out by the chain rule from those of its arguments. Numbers
-that do not move have none, so that nothing is multiplied by zero, and what the derivative shares with the value
-is there once:
+Each number y of a graph has a slope y', by the chain rule from the slopes of its arguments. Numbers that do not
+move have none, so nothing is multiplied by zero. Terms that the derivative shares with the value exist once:
 
     x' = 1:  (sin(x) * x)' = cos(x) * x + sin(x)     # sin(x) is the number of the value's own graph
 
-Forwards, because a filter's parameters are few, and because Fisher's information asks how each innovation
-changes along each of them, which the other direction does not find.
+This is forward mode, because a filter's parameters are few, and because Fisher's information needs the slope of
+each innovation along each of them, which reverse mode does not give.
 
-Where a number is finite, so is its slope. A root at zero has none, or an infinite one: it is 0 there, which lies
-between those of both sides, and so the slope of sqrt(v v) v is 0 at v = 0, as that of |v| v is. What fades
-faster than its argument grows, 1/(1 + exp(x)) where exp(x) is infinite, has the slope 0, and not 0 times infinity.
-Choices say this, as their derivatives are choices again: the rule holds for slopes of slopes.
+If a number is finite, so is its slope. A root has the slope 0 at zero, between the slopes of both sides, so the
+slope of sqrt(v v) v is 0 at v = 0, like that of |v| v. A function that fades faster than its argument grows, such
+as 1/(1 + exp(x)) where exp(x) is infinite, has the slope 0, and not 0 times infinity. These rules are `where`s,
+whose derivatives are `where`s again, so they hold for slopes of slopes, too.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ MOST_DECISIONS = 64  # in one call
 
 
 def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarray:
-    """What a function of no arguments makes of numbers of a graph, an array (...) of objects, on all its branches.
+    """The result (...) of a function without arguments, as numbers of a graph, joined over all its branches.
 
     Raises:
         TypeError: if it decides too often, or its results have different shapes.
@@ -68,36 +67,38 @@ def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarra
             return answers[condition.place]
 
         graph.decide = decide
-        found: np.ndarray | None = None
+        result: np.ndarray | None = None
         try:
-            found = function()
+            result = function()
         except Exception as error:
             if not answers or not _is_raised_there(error):
                 raise
             failure = error
         for k, condition in reversed([*enumerate(asked)]):
-            before = {one.place: True for one in asked[:k]}
+            before = {earlier.place: True for earlier in asked[:k]}
             other = outcome(known | before | {condition.place: False})
-            if found is None or other is None:
-                known_one = found if other is None else other
-                if known_one is None:
+            if result is None or other is None:
+                known_result = result if other is None else other
+                if known_result is None:
                     continue
-                found, other = (np.full_like(known_one, np.nan) if one is None else one for one in (found, other))
-            if other.shape != found.shape:
-                raise TypeError(f"branches must have results of one shape, but got {found.shape}, {other.shape}")
-            pairs = zip(found.ravel(), other.ravel(), strict=True)
+                result, other = (
+                    np.full_like(known_result, np.nan) if side is None else side for side in (result, other)
+                )
+            if other.shape != result.shape:
+                raise TypeError(f"branches must have results of one shape, but got {result.shape}, {other.shape}")
+            pairs = zip(result.ravel(), other.ravel(), strict=True)
             chosen = [where(condition, a, b) for a, b in pairs]
-            found = np.array([*chosen, None], dtype=object)[:-1].reshape(found.shape)
-        return found
+            result = np.array([*chosen, None], dtype=object)[:-1].reshape(result.shape)
+        return result
 
     before, graph.decide = graph.decide, None
     try:
-        found = outcome({})
+        result = outcome({})
     finally:
         graph.decide = before
-    if found is None:
+    if result is None:
         raise failure or TypeError("a function must have a result")
-    return found
+    return result
 
 
 def _is_raised_there(error: Exception) -> bool:
@@ -123,16 +124,16 @@ def added(*slopes: Slope) -> Slope:
 
 
 def along(numbers: Sequence[Number], moves: Mapping[int, Slope]) -> list[Slope]:
-    """Derivatives of numbers in the direction in which the numbers at some places of their graph move.
+    """Directional derivatives of numbers, given the slopes of some numbers of their graph.
 
     Args:
         numbers: to be differentiated.
-        moves: by the place of each number that moves, its change, or None; what such are made of does not matter.
+        moves: the slope of each number that moves, or None, by its place; its arguments are not differentiated.
     """
     slopes: dict[int, Slope] = dict(moves)
     for number in needed_by(numbers, moves):
         if number.place not in slopes:
-            of = [slopes[one.place] for one in number.of]
+            of = [slopes[argument.place] for argument in number.of]
             slopes[number.place] = _RULES[number.operation](number, *number.of, *of) if any_of(of) else None
     return [slopes[number.place] for number in numbers]
 
@@ -143,7 +144,7 @@ def any_of(slopes: Sequence[Slope]) -> bool:
 
 
 def times(slope: Slope, factor: Callable[[], Number | float]) -> Slope:
-    """A slope times a factor, which is worked out only if there is a slope."""
+    """A slope times a factor, which is evaluated only if there is a slope."""
     return None if slope is None else slope * factor()
 
 
@@ -158,8 +159,8 @@ def _unless_zero(x, slope: Slope) -> Slope:
 
 def _fading(slope: Slope, x: Number, factor: Callable[[], Number]) -> Slope:
     """The slope of a function of x times its derivative, which vanishes where x becomes infinite."""
-    found = times(slope, factor)
-    return _unless_zero(factor(), found) if found is not None and x.may_overflow else found
+    product = times(slope, factor)
+    return _unless_zero(factor(), product) if product is not None and x.may_overflow else product
 
 
 def _of_quotient(y, a, b, da, db):
@@ -197,8 +198,8 @@ def _bell(x: Number) -> Number:
     return (2.0 / math.sqrt(math.pi)) * (-x * x).exp()
 
 
-def _none(y, *others):
-    """Of what is constant but for jumps."""
+def _none(y, *arguments):
+    """No slope, for functions that are constant except for jumps."""
     return None
 
 

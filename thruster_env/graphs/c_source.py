@@ -4,7 +4,7 @@
     const double t1 = 0.5 * t0;
     x[0] = t1;
 
-Constants stand where they are used, with as many digits as tell them from their neighbours.
+Constants are literals, with as many digits as distinguish them from neighbouring floats.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ def statements_of_members(parts: Cut, size: int, rows: Mapping[str, tuple[str, i
     for turn in parts.turns:
         once.write([], turn.works, [])
         for body in turn.bodies:
-            sums = [once.named(one) for one in body.sums]
+            sums = [once.named(number) for number in body.sums]
             once.lines += [f"{once.kind} {name} = {literal(0.0, single)};" for name in sums]
             each = _Writer(single, rows, once)
             each.write(body.reads, body.works, body.stores)
             totals = zip(sums, body.sums, strict=True)
-            each.lines += [f"{name} += {each.names[one.of[0].place]};" for name, one in totals]
+            each.lines += [f"{name} += {each.names[number.of[0].place]};" for name, number in totals]
             inside = [f"    {line}" for line in each.lines]
             once.lines += [f"for (int j = 0; j < {size}; j++) {{", *inside, "}"]
     once.write([], [], parts.stores)
@@ -79,9 +79,9 @@ class _Writer:
         self.kind, self._letter = "float" if single else "double", "t" if around is None else "m"
         self._count = 0
 
-    def named(self, one: Number) -> str:
+    def named(self, number: Number) -> str:
         """A new name for a number."""
-        name = self.names[one.place] = f"{self._letter}{self._count}"
+        name = self.names[number.place] = f"{self._letter}{self._count}"
         self._count += 1
         return name
 
@@ -92,42 +92,44 @@ class _Writer:
         stores: Iterable[tuple[Place, Number]],
     ) -> None:
         """Read numbers, work some out, and store some."""
-        for place, one in reads:
-            self.lines.append(f"const {self.kind} {self.named(one)} = {self._lies(place)};")
-        for one in (one for one in works if one.place not in self.names):  # sums are known
-            if one.value is not None:
-                self.names[one.place] = literal(one.value, self._single)
-            elif one.operation == "call":
-                self._call(one)
+        for source, number in reads:
+            self.lines.append(f"const {self.kind} {self.named(number)} = {self._lies(source)};")
+        for number in (number for number in works if number.place not in self.names):  # sums are known
+            if number.value is not None:
+                self.names[number.place] = literal(number.value, self._single)
+            elif number.operation == "call":
+                self._call(number)
             else:
-                whose = "int" if one.operation in CONDITIONS else self.kind
-                value = _expression(one, self.names, self._single)
-                self.lines.append(f"const {whose} {self.named(one)} = {value};")
-        self.lines += [f"{self._lies(place)} = {self.names[one.place]};" for place, one in stores]
+                whose = "int" if number.operation in CONDITIONS else self.kind
+                value = _expression(number, self.names, self._single)
+                self.lines.append(f"const {whose} {self.named(number)} = {value};")
+        self.lines += [f"{self._lies(target)} = {self.names[number.place]};" for target, number in stores]
 
-    def _call(self, one: Number) -> None:
-        name, count, *_ = one.arguments
-        given, found = ", ".join(self.names[a.place] for a in one.of), self.named(one)
-        self.lines.append(f"const {self.kind} of_{found}[{len(one.of)}] = {{{given}}};")
-        self.lines += [f"{self.kind} {found}[{count}];", f"{name}(of_{found}, {found});"]
+    def _call(self, number: Number) -> None:
+        name, count, *_ = number.arguments
+        arguments, result = ", ".join(self.names[a.place] for a in number.of), self.named(number)
+        self.lines.append(f"const {self.kind} of_{result}[{len(number.of)}] = {{{arguments}}};")
+        self.lines += [f"{self.kind} {result}[{count}];", f"{name}(of_{result}, {result});"]
 
-    def _lies(self, place: Place) -> str:
-        if place.array not in self._rows:
-            return str(place)
-        name, length = self._rows[place.array]
-        return f"{name}[{place.at * length} + j]" if place.at else f"{name}[j]"
+    def _lies(self, source: Place) -> str:
+        if source.array not in self._rows:
+            return str(source)
+        name, length = self._rows[source.array]
+        return f"{name}[{source.at * length} + j]" if source.at else f"{name}[j]"
 
 
 def functions_called_by(programs: Iterable[Program], single: bool) -> list[str]:
     """The functions of C that programs call, each once: work(given, found) in rounds."""
-    calls = {one.arguments[0] for program in programs for one in program.works if one.operation == "call"}
+    calls = {number.arguments[0] for program in programs for number in program.works if number.operation == "call"}
     return [_in_rounds(str(name), single) for name in sorted(calls)]
 
 
 def _in_rounds(name: str, single: bool) -> str:
     first, again, last, rounds, size = CALLED_IN_ROUNDS[name]()
     kind = "float" if single else "double"
-    texts = ["\n".join(f"        {line}" for line in statements_of(one, single)) for one in (first, again, last)]
+    texts = [
+        "\n".join(f"        {line}" for line in statements_of(program, single)) for program in (first, again, last)
+    ]
     return f"""\
 static void {name}(const {kind} *given, {kind} *found)
 {{
@@ -146,19 +148,19 @@ static void {name}(const {kind} *given, {kind} *found)
 """
 
 
-def _expression(one: Number, names: dict[int, str], single: bool) -> str:
-    values = [names[a.place] if isinstance(a, Number) else str(int(a)) for a in one.arguments]
-    if one.operation == "==" and values[0] == values[1]:
+def _expression(number: Number, names: dict[int, str], single: bool) -> str:
+    values = [names[a.place] if isinstance(a, Number) else str(int(a)) for a in number.arguments]
+    if number.operation == "==" and values[0] == values[1]:
         return f"!isnan({values[0]})"
-    if one.operation == "entry":
+    if number.operation == "entry":
         return "{}[{}]".format(*values)
-    if one.operation in OF_TWO:
-        return f"{values[0]} {OF_TWO[one.operation]} {values[1]}"
-    if one.operation == "negative":
+    if number.operation in OF_TWO:
+        return f"{values[0]} {OF_TWO[number.operation]} {values[1]}"
+    if number.operation == "negative":
         return f"-{values[0]}"
-    if one.operation == "where":
+    if number.operation == "where":
         return f"{values[0]} ? {values[1]} : {values[2]}"
-    return f"{OTHER_NAMES.get(one.operation, one.operation)}{'f' * single}({', '.join(values)})"
+    return f"{OTHER_NAMES.get(number.operation, number.operation)}{'f' * single}({', '.join(values)})"
 
 
 def literal(value: float, single: bool = False) -> str:

@@ -1,10 +1,10 @@
-"""Operations on Numbers that make others than themselves: of constants, with zeros and ones, with signs.
+"""Simplification of operations on Numbers: of constants, with zeros and ones, with signs.
 
-A matrix of a model has zeros and ones in places that are known when it is traced. Products with them vanish
-here, so that no program multiplies by zero: of an A P A' with a sparse A little is left.
+Some entries of a model's matrices are zeros and ones when it is traced. Products with them vanish here, so no
+program multiplies by zero: little remains of A P A' with a sparse A.
 
-Numbers along which something is to be differentiated are left whole (`Graph.whole`): of a - b that moves
--(a - b) stays what it is, for b - a would not show that it moves.
+A number along which derivatives are taken is not taken apart (`Graph.whole`): if a - b moves, -(a - b) does not
+become b - a, which would not depend on it.
 
 Slopes ask for it: only a root that may be zero, or a quotient whose divisor may be infinite, needs a choice.
 """
@@ -30,9 +30,9 @@ UNKNOWN, NEVER_NEGATIVE, POSITIVE = range(3)
 
 
 def overflow_of(operation: str, of: Sequence[Number]) -> bool:
-    """Whether the result of an operation may be infinite for numbers of usual size, or is made of such."""
+    """Whether the result of an operation, or one of its arguments, may be infinite for numbers of usual size."""
     divided = operation == "/" and of[1].sign != POSITIVE and not of[1].value
-    return divided or operation in GROWING or any([one.may_overflow for one in of])
+    return divided or operation in GROWING or any([a.may_overflow for a in of])
 
 
 def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
@@ -44,7 +44,7 @@ def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
     if operation == "*":
         return max(NEVER_NEGATIVE, of[0].sign) if of[0] is of[1] else min(of[0].sign, of[1].sign)
     if operation in ("sqrt", "abs", "hypot"):
-        return max(NEVER_NEGATIVE, *[one.sign for one in of])
+        return max(NEVER_NEGATIVE, *[a.sign for a in of])
     if operation in ("exp", "exp2", "erfc"):
         return NEVER_NEGATIVE
     return {"cosh": POSITIVE, "cbrt": of[0].sign if of else UNKNOWN}.get(operation, UNKNOWN)
@@ -91,13 +91,13 @@ UNDEFINED = GROWING | {"/", "sqrt", "fmod", "tan", "arccosh"}
 
 
 def _may_have_no_value(a: Number) -> bool:
-    """Whether a number may be NaN or infinite where what it is made of is finite: zero times that is not zero."""
+    """Whether a number may be NaN or infinite for finite arguments: then zero times it is not zero."""
     waiting, known = [a], {a.place}
     while waiting:
-        one = waiting.pop()
-        if one.operation in UNDEFINED:
+        number = waiting.pop()
+        if number.operation in UNDEFINED:
             return True
-        new = [other for other in one.of if other.place not in known]
+        new = [other for other in number.of if other.place not in known]
         known |= {other.place for other in new}
         waiting += new
     return False
@@ -141,14 +141,14 @@ def product(a: Number, b: Number) -> Number:
     """A product: zero with zero, the other one with one; signs stand before it."""
     if a.value is not None and b.value is not None:
         return a.graph.constant(a.value * b.value)
-    for one, other in ((a, b), (b, a)):
-        if one.value is not None:
-            if one.value == 0.0 and not (a.graph.exact and _may_have_no_value(other)):
-                return one
-            if abs(one.value) == 1.0:
-                return other if one.value > 0 else negative(other)
-        elif _is(one, "negative"):
-            return negative(product(one.arguments[0], other))
+    for factor, other in ((a, b), (b, a)):
+        if factor.value is not None:
+            if factor.value == 0.0 and not (a.graph.exact and _may_have_no_value(other)):
+                return factor
+            if abs(factor.value) == 1.0:
+                return other if factor.value > 0 else negative(other)
+        elif _is(factor, "negative"):
+            return negative(product(factor.arguments[0], other))
     return a.graph.make("*", a, b)
 
 
@@ -185,9 +185,9 @@ def floor_quotient(a: Number, b: Number) -> Number:
     rest = worked_out("fmod", a, b)
     parts = divided(difference(a, rest), b)
     parts = _folded_choice(_turns(rest, b), difference(parts, a.graph.constant(1.0)), parts)
-    whole = worked_out("floor", parts)
-    found = _folded_choice(difference(parts, whole) > 0.5, total(whole, a.graph.constant(1.0)), whole)
-    return found if b.value is not None else _folded_choice(b == 0.0, divided(a, b), found)
+    floored = worked_out("floor", parts)
+    quotient = _folded_choice(difference(parts, floored) > 0.5, total(floored, a.graph.constant(1.0)), floored)
+    return quotient if b.value is not None else _folded_choice(b == 0.0, divided(a, b), quotient)
 
 
 def _turns(rest: Number, b: Number) -> Number | bool:

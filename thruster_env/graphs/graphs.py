@@ -1,4 +1,4 @@
-"""Numbers that are not known yet: what is done with them builds a graph, in which everything is worked out once.
+"""Unknown numbers: operations on them build a graph, in which every operation exists once.
 
 A `Number` stands for a float64. Operators and NumPy's functions of Numbers return Numbers, so that a plain
 function of floats, called with Numbers, writes down what it computes:
@@ -8,13 +8,14 @@ function of floats, called with Numbers, writes down what it computes:
     x * y + x * y        # one product, and one sum of it with itself
     0.0 * x + 1.0 * y    # y itself
 
-Three things keep the graph small. An operation on the same arguments is there already (`Graph.make`), products
-and sums in either order. What constants make is a constant, and zeros and ones of a matrix's structure vanish.
-A page's division by a number is a product with its reciprocal, of which there is one. Within `Graph.as_written`,
-where the functions of a model are traced, a division is one: 49/49 is 1, and 49 * (1/49) is less.
+Three rules keep the graph small. The same operation on the same arguments exists once (`Graph.make`), products
+and sums in either order. Operations on constants give constants, and zeros and ones of a matrix's structure
+vanish. A page's division by a number is a product with its reciprocal, which exists once. Within
+`Graph.as_written`, where functions of a model are traced, a division stays a division: 49/49 is 1, and
+49 * (1/49) is less.
 
-A comparison is a condition. In arithmetic it is 1.0 or 0.0, as in Python. What a Number cannot do is decide:
-`if x > 0.0` raises TypeError, unless both sides are asked for (`branches`). `where(condition, a, b)` works out
+A comparison is a condition. In arithmetic it is 1.0 or 0.0, as in Python. A Number cannot decide a branch:
+`if x > 0.0` raises TypeError, except in `branches`, which traces both sides. `where(condition, a, b)` evaluates
 both sides.
 """
 
@@ -108,17 +109,17 @@ class Graph:
     def make(self, operation: str, *arguments: Number | Hashable) -> Number:
         """The number that an operation makes of others; the same one if it has been made before."""
         key = (operation, *[a.place if isinstance(a, Number) else a for a in arguments])
-        found = self._made.get(key)
-        if found is None:
+        number = self._made.get(key)
+        if number is None:
             if len(self.numbers) >= self._most:
                 raise TooLarge(f"a graph must have at most {self._most} operations")
-            found = self._made[key] = Number(self, operation, arguments, len(self.numbers))
+            number = self._made[key] = Number(self, operation, arguments, len(self.numbers))
             if operation in TWO_SIDED:
-                self._made[(operation, key[2], key[1])] = found
-            self.numbers.append(found)
+                self._made[(operation, key[2], key[1])] = number
+            self.numbers.append(number)
         if self.exact and operation in JUMPS:
-            self._round_as_written(found)
-        return found
+            self._round_as_written(number)
+        return number
 
     @contextmanager
     def as_written(self) -> Iterator[None]:
@@ -130,19 +131,23 @@ class Graph:
             self.exact = was
 
     def _round_as_written(self, jump: Number) -> None:
-        """Have machine code neither reorder nor contract what a jump is made of, up to a function's arguments."""
+        """Forbid machine code to reorder or contract the operations that lead to a jump."""
         waiting = [jump]
         while waiting:
-            one = waiting.pop()
-            if not one.exact and one.place not in self.whole and one.operation not in ("given", "constant"):
-                one.exact = True
-                waiting += one.of
+            number = waiting.pop()
+            if (
+                not number.exact
+                and number.place not in self.whole
+                and number.operation not in ("given", "constant")
+            ):
+                number.exact = True
+                waiting += number.of
 
     def given(self, name: Hashable, *, member: bool = False) -> Number:
-        """A number that is known when the graph is worked out: its name, or where it lies."""
-        found = self.make("given", name)
-        found.member = member
-        return found
+        """A number that is an input of the program, by its name or its place."""
+        number = self.make("given", name)
+        number.member = member
+        return number
 
     def constant(self, value: float) -> Number:
         """A number that is known now."""
@@ -157,12 +162,12 @@ class Number:
     """A float64 that an operation makes of others.
 
     Attributes:
-        operation, arguments: what makes it, and of what: Numbers, or the name or value of one that is known.
+        operation, arguments: its operation and the arguments of that: Numbers, or a name or value.
         of: the Numbers among the arguments.
         place: its index in the graph.
-        value: what a constant is; None for others.
+        value: of a constant; None for others.
         member: whether it is one number for each member of an ensemble.
-        may_overflow, sign: what is known of its size, as `magnitudes` says.
+        may_overflow, sign: bounds on its size, from `folding.overflow_of` and `folding.sign_of`.
         exact: whether machine code rounds it as Python does.
     """
 
@@ -183,9 +188,9 @@ class Number:
     floor: Callable[[], Number]
     __hash__ = None  # type: ignore[assignment]  # a dictionary of a user's would be asked for a value not known yet
 
-    def __init__(self, graph: Graph, operation: str, arguments: tuple, place: int):
+    def __init__(self, graph: Graph, operation: str, arguments: tuple, index: int):
         """For `Graph.make` alone."""
-        self.graph, self.operation, self.arguments, self.place = graph, operation, arguments, place
+        self.graph, self.operation, self.arguments, self.place = graph, operation, arguments, index
         self.of: tuple[Number, ...] = tuple([a for a in arguments if isinstance(a, Number)])
         self.value = float.fromhex(arguments[0]) if operation == "constant" else None
         self.member: bool = operation not in REDUCTIONS and any([a.member for a in self.of])
@@ -269,10 +274,10 @@ class Number:
         return self._compared(">=", other)
 
     def __eq__(self, other):
-        return False if (found := self._compared("==", other)) is NotImplemented else found
+        return False if (condition := self._compared("==", other)) is NotImplemented else condition
 
     def __ne__(self, other):
-        return True if (found := self._compared("!=", other)) is NotImplemented else found
+        return True if (condition := self._compared("!=", other)) is NotImplemented else condition
 
     def _compared(self, operation: str, other):
         """A condition; of numbers that are known now whether it holds."""
@@ -303,10 +308,10 @@ class Number:
         if power in (0.5, -0.5):
             return self.sqrt() if power > 0 else 1.0 / self.sqrt()
         if power == int(power) and 0 < abs(power) <= 8:
-            found = math.prod([self] * int(abs(power)))
-            return found if power > 0 else 1.0 / found
-        one = self.graph.constant(1.0)
-        return one if power == 0 else worked_out("pow", self, self.graph.constant(power))
+            product = math.prod([self] * int(abs(power)))
+            return product if power > 0 else 1.0 / product
+        unit = self.graph.constant(1.0)
+        return unit if power == 0 else worked_out("pow", self, self.graph.constant(power))
 
     def __rpow__(self, base):
         return self._with(base) ** self
@@ -372,8 +377,8 @@ def _is_scalar(value) -> bool:
 
 
 def where(condition, a, b):
-    """`a` where the condition holds, else `b`, of numbers known or not; both are worked out."""
-    known = next((one for one in (condition, a, b) if isinstance(one, Number)), None)
+    """`a` where the condition holds, else `b`, of numbers known or not; both are evaluated."""
+    known = next((a for a in (condition, a, b) if isinstance(a, Number)), None)
     if not isinstance(condition, Number):
         return a if condition else b
     if condition.value is not None:
@@ -386,7 +391,7 @@ def where(condition, a, b):
 
 def arctan2(y, x):
     """The angle of a point (x, y), of numbers known or not."""
-    known = next((one for one in (y, x) if isinstance(one, Number)), None)
+    known = next((a for a in (y, x) if isinstance(a, Number)), None)
     if known is None:
         return np.arctan2(y, x)
     return worked_out("arctan2", known.graph.number(y), known.graph.number(x))
@@ -409,31 +414,31 @@ def size_of(a: Number) -> Number:
 
 
 def called(name: str, count: int, *numbers: Number) -> list[Number]:
-    """What a function that is compiled as it is makes of numbers; its name is that in `programs.CALLED`."""
+    """The results of a function that is compiled as it is, for numbers; its name is that in `programs.CALLED`."""
     graph = numbers[0].graph
     call = graph.make("call", name, count, *numbers)
     return [graph.make("entry", call, k) for k in range(count)]
 
 
 def needed_by(numbers: Iterable[Number], known: Container[int] = ()) -> list[Number]:
-    """Numbers and all that they are made of, in an order in which to work them out.
+    """Numbers and all their arguments, in the order of evaluation.
 
     Args:
-        numbers: that are wanted.
-        known: places in the graph of numbers that are known; what they are made of is not needed.
+        numbers: the wanted ones.
+        known: places in the graph of known numbers, whose arguments are not needed.
     """
-    seen: set[int] = set()
-    found = []
+    visited: set[int] = set()
+    ordered = []
     for last in numbers:
         waiting = [last]
         while waiting:
             number = waiting[-1]
-            missing = [] if number.place in known else [one for one in number.of if one.place not in seen]
-            if number.place in seen or not missing:
+            missing = [] if number.place in known else [a for a in number.of if a.place not in visited]
+            if number.place in visited or not missing:
                 waiting.pop()
-                if number.place not in seen:
-                    seen.add(number.place)
-                    found.append(number)
+                if number.place not in visited:
+                    visited.add(number.place)
+                    ordered.append(number)
             else:
                 waiting.extend(reversed(missing))
-    return found
+    return ordered

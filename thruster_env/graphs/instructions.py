@@ -1,12 +1,12 @@
 """Programs as instructions of LLVM, each for as many runs as lie side by side.
 
-numba takes a millisecond to type a line of text, and a program has hundreds. But all that numba has to know of
-a program is that it is called: its instructions are given to LLVM directly. They are instructions for vectors
-of numbers, one of each run, so that nobody has to find out whether some loop could be made of such.
+numba takes a millisecond to type a line of text, and a program has hundreds. But numba only needs to know that a
+program is called: its instructions go to LLVM directly. They work on vectors with one number of each run, so no
+compiler has to find out whether a loop can be vectorised.
 
-Numbers that are the same for all members are worked out once, before the loop that needs them. Sums are kept for
-each of the eight, and added when the loop ends. The table has columns for whole vectors: what lies in those behind
-the last member is worked out, too, but counts in no sum.
+Numbers that are the same for all members are evaluated once, before the loop that needs them. Each lane has its
+own sum, and the loop's end adds the lanes. The table has columns for full vectors: those behind the last member
+are evaluated, too, but count in no sum.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ class Writer:
         self.work(program.works)
         self.store(program.stores)
 
-    def read(self, places: Sequence[tuple[Place, Number]]) -> None:
+    def read(self, reads: Sequence[tuple[Place, Number]]) -> None:
         """Read numbers."""
-        for place, number in places:
-            self.values[number.place] = self._read(place)
+        for source, number in reads:
+            self.values[number.place] = self._read(source)
 
     def work(self, numbers: Sequence[Number]) -> None:
         """Work numbers out."""
@@ -88,10 +88,10 @@ class Writer:
             if number.place not in self.values:
                 self.values[number.place] = self._worked_out(number)
 
-    def store(self, places: Sequence[tuple[Place, Number]]) -> None:
+    def store(self, stores: Sequence[tuple[Place, Number]]) -> None:
         """Store numbers."""
-        for place, number in places:
-            self._builder.store(self.values[number.place], self.pointer_of(place), align=8)
+        for target, number in stores:
+            self._builder.store(self.values[number.place], self.pointer_of(target), align=8)
 
     def same_for_all(self, value: ir.Value, number: Number) -> ir.Value:
         """The vector of a number that is the same for all; a constant is one already."""
@@ -99,23 +99,23 @@ class Writer:
             return ir.Constant(self._vector, [number.value] * self._width)
         return self._to_all(value, ir.Constant(value.type, ir.Undefined))
 
-    def _pointer(self, place: Place) -> ir.Value:
-        of_all = place.array in SIDE_BY_SIDE
-        at = ir.Constant(LONG, place.at * (self._width if of_all else 1))
-        pointer = self._builder.gep(self._arrays[place.array], [at], source_etype=DOUBLE)
+    def _pointer(self, location: Place) -> ir.Value:
+        of_all = location.array in SIDE_BY_SIDE
+        at = ir.Constant(LONG, location.at * (self._width if of_all else 1))
+        pointer = self._builder.gep(self._arrays[location.array], [at], source_etype=DOUBLE)
         return self._builder.bitcast(pointer, self._vector.as_pointer()) if of_all else pointer
 
-    def _read(self, place: Place) -> ir.Value:
-        of_all = place.array in (*SIDE_BY_SIDE, *BY_MEMBERS)
-        value = self._builder.load(self.pointer_of(place), align=8, typ=self._vector if of_all else DOUBLE)
+    def _read(self, source: Place) -> ir.Value:
+        of_all = source.array in (*SIDE_BY_SIDE, *BY_MEMBERS)
+        value = self._builder.load(self.pointer_of(source), align=8, typ=self._vector if of_all else DOUBLE)
         if of_all:
             return value
         nothing = ir.Constant(self._vector, ir.Undefined)
         return self._to_all(self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing)
 
     def _to_all(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
-        places = ir.VectorType(ir.IntType(32), self._width)
-        return self._builder.shuffle_vector(value, nothing, ir.Constant(places, [0] * self._width))
+        lanes = ir.VectorType(ir.IntType(32), self._width)
+        return self._builder.shuffle_vector(value, nothing, ir.Constant(lanes, [0] * self._width))
 
     def _worked_out(self, number: Number) -> ir.Value:
         operation, builder = number.operation, self._builder
@@ -123,7 +123,7 @@ class Writer:
             return ir.Constant(self._vector, [number.value] * self._width)
         if operation in self.values_of:
             return self.values_of[operation]
-        values = [self.values[one.place] for one in number.of]
+        values = [self.values[argument.place] for argument in number.of]
         flags = EXACT if number.exact or operation == "/" and number.of[0].value != 1.0 else FLAGS
         if operation in OF_TWO:
             return getattr(builder, OF_TWO[operation])(*values, flags=flags)
@@ -160,7 +160,7 @@ class Writer:
             square = builder.fadd(times(a, a), times(b, b), flags=FLAGS)
             return square, self._called("sqrt", [square], FLAGS)
 
-        least, most, one, none, infinite = (
+        least, most, unit, none, infinite = (
             ir.Constant(self._vector, [value] * self._width) for value in (1e-280, 1e300, 1.0, 0.0, math.inf)
         )
         square, root = root_of_squares(x, y)
@@ -168,53 +168,53 @@ class Writer:
         x_size, y_size = (self._called("abs", [value], FLAGS) for value in (x, y))
         scale = builder.select(builder.fcmp_ordered(">", x_size, y_size), x_size, y_size)
         divides = builder.and_(builder.fcmp_ordered(">", scale, none), builder.fcmp_ordered("<", scale, infinite))
-        scale = builder.select(divides, scale, one)
+        scale = builder.select(divides, scale, unit)
         _, scaled = root_of_squares(*(builder.fdiv(value, scale, flags=EXACT) for value in (x, y)))
         return builder.select(usual, root, times(scale, scaled))
 
-    def _two_to(self, whole: ir.Value) -> ir.Value:
+    def _two_to(self, exponents: ir.Value) -> ir.Value:
         """2^k of whole numbers k, whose last bits become the exponent's."""
         builder, longs = self._builder, ir.VectorType(LONG, self._width)
         rounder, offset = (
             ir.Constant(kind, [value] * self._width)
             for kind, value in ((self._vector, ROUNDER), (longs, 1023 - ROUNDER_BITS))
         )
-        bits = builder.add(builder.bitcast(builder.fadd(whole, rounder), longs), offset)
+        bits = builder.add(builder.bitcast(builder.fadd(exponents, rounder), longs), offset)
         return builder.bitcast(builder.shl(bits, ir.Constant(longs, [52] * self._width)), self._vector)
 
     def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
-        """What a function of two arrays makes of numbers, run after run."""
+        """The results of a function of two arrays, run after run."""
         builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
         arrays = []
         for length in (len(values), count):
-            one, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
+            array, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
             data, eight = cgutils.alloca_once(builder, DOUBLE, size), ir.Constant(LONG, 8)
-            populate_array(one, data, (size,), (eight,), eight, None)
-            arrays.append(one)
+            populate_array(array, data, (size,), (eight,), eight, None)
+            arrays.append(array)
         signature, work = typing.signature(types.none, kind, kind), CALLED[name]
-        found = [ir.Constant(self._vector, ir.Undefined)] * count
+        results = [ir.Constant(self._vector, ir.Undefined)] * count
         for k in range(self._width):
             at = ir.Constant(ir.IntType(32), k)
             for i, value in enumerate(values):
                 pointer = builder.gep(arrays[0].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
                 builder.store(builder.extract_element(value, at), pointer)
-            context.compile_internal(builder, work, signature, [one._getvalue() for one in arrays])
+            context.compile_internal(builder, work, signature, [array._getvalue() for array in arrays])
             for i in range(count):
                 pointer = builder.gep(arrays[1].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
-                found[i] = builder.insert_element(found[i], builder.load(pointer, typ=DOUBLE), at)
-        return found
+                results[i] = builder.insert_element(results[i], builder.load(pointer, typ=DOUBLE), at)
+        return results
 
     def _called(self, name: str, values: list[ir.Value], flags: Sequence[str]) -> ir.Value:
         builder, module = self._builder, self._builder.module
         if name in OF_LLVM:
             function = _declared(module, f"llvm.{OF_LLVM[name]}.v{self._width}f64", self._vector, len(values))
             return builder.call(function, values, fastmath=flags)
-        function, found = _declared(module, IN_LIBRARY.get(name, name), DOUBLE, len(values)), values[0]
+        function, result = _declared(module, IN_LIBRARY.get(name, name), DOUBLE, len(values)), values[0]
         for k in range(self._width):
             at = ir.Constant(ir.IntType(32), k)
-            one = builder.call(function, [builder.extract_element(value, at) for value in values])
-            found = builder.insert_element(found, one, at)
-        return found
+            entry = builder.call(function, [builder.extract_element(value, at) for value in values])
+            result = builder.insert_element(result, entry, at)
+        return result
 
 
 def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
@@ -239,11 +239,12 @@ def teach_loops(work: Callable, program: Program, width: int, scratch: int) -> N
     def write(context, builder, signature, arguments):
         *kinds, kind = signature.args
         arrays = [
-            context.make_array(one)(context, builder, a) for one, a in zip(kinds, arguments[:-1], strict=True)
+            context.make_array(array_type)(context, builder, a)
+            for array_type, a in zip(kinds, arguments[:-1], strict=True)
         ]
         columns = builder.extract_value(arrays[OF_MEMBERS.index("table")].shape, 1)
         size = context.cast(builder, arguments[-1], kind, types.int64)
-        data = dict(zip(OF_MEMBERS, (one.data for one in arrays), strict=False))
+        data = dict(zip(OF_MEMBERS, (array.data for array in arrays), strict=False))
         _LoopWriter(context, builder, data, width, columns, size).write(cut(program, scratch))
         return context.get_dummy_value()
 
@@ -260,8 +261,8 @@ class _LoopWriter:
         self._once.values_of["size"] = self._as_vector(builder.sitofp(size, DOUBLE))
 
     def _as_vector(self, value: ir.Value) -> ir.Value:
-        one = ir.VectorType(DOUBLE, 1)
-        return self._builder.insert_element(ir.Constant(one, ir.Undefined), value, ir.Constant(INT, 0))
+        vector = ir.VectorType(DOUBLE, 1)
+        return self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
 
     def write(self, parts: Cut) -> None:
         """All of it."""
@@ -285,9 +286,11 @@ class _LoopWriter:
         at.add_incoming(ir.Constant(LONG, 0), before)
         vector = ir.VectorType(DOUBLE, width)
         sums = [builder.phi(vector) for _ in body.sums]
-        for one, of in zip(sums, body.sums, strict=True):
-            one.add_incoming(ir.Constant(vector, [-np.inf if of.operation == "largest" else 0.0] * width), before)
-        each.pointer_of = lambda place: self._pointer(place, at, vector)
+        for total, of in zip(sums, body.sums, strict=True):
+            total.add_incoming(
+                ir.Constant(vector, [-np.inf if of.operation == "largest" else 0.0] * width), before
+            )
+        each.pointer_of = lambda location: self._pointer(location, at, vector)
         each.read(body.reads)
         each.work(body.works)
         each.store(body.stores)
@@ -295,42 +298,44 @@ class _LoopWriter:
         if body.sums:
             left = self._to_all(builder.sub(self._size, at), ir.VectorType(LONG, width))
             counts = builder.icmp_signed("<", mask, left)
-            for one, total in zip(body.sums, sums, strict=True):
-                value = each.values[one.of[0].place]
-                if one.operation == "largest":
-                    more, found = value, builder.and_(counts, builder.fcmp_ordered(">", value, total))
+            for number, total in zip(body.sums, sums, strict=True):
+                value = each.values[number.of[0].place]
+                if number.operation == "largest":
+                    more, applies = value, builder.and_(counts, builder.fcmp_ordered(">", value, total))
                 else:
-                    more, found = builder.fadd(total, value, flags=FLAGS), counts
-                total.add_incoming(builder.select(found, more, total), builder.block)
+                    more, applies = builder.fadd(total, value, flags=FLAGS), counts
+                total.add_incoming(builder.select(applies, more, total), builder.block)
         at.add_incoming(following, builder.block)
         builder.cbranch(builder.icmp_signed("<", following, self._columns), inside, after)
-        ends = [(one, phi.incomings[-1][0]) for one, phi in zip(body.sums, sums, strict=True)]
+        ends = [(number, phi.incomings[-1][0]) for number, phi in zip(body.sums, sums, strict=True)]
         builder.position_at_end(after)
-        for one, value in ends:
-            of_all = self._largest(value) if one.operation == "largest" else self._added(value)
-            self._once.values[one.place] = self._as_vector(of_all)
+        for number, value in ends:
+            of_all = self._largest(value) if number.operation == "largest" else self._added(value)
+            self._once.values[number.place] = self._as_vector(of_all)
 
     def _same_for_all(self, each: Writer, body: Body) -> None:
         """Vectors of the numbers that a loop needs and that are the same for all members."""
         needed: dict[int, Number] = {}
-        for one in [*body.works, *(one.of[0] for one in body.sums)]:
-            needed |= {a.place: a for a in (*one.of, one) if not a.member}
-        needed |= {one.place: one for _, one in body.stores if not one.member}
-        for place, one in needed.items():
-            each.values[place] = each.same_for_all(self._once.values[place], one)
+        for number in [*body.works, *(number.of[0] for number in body.sums)]:
+            needed |= {a.place: a for a in (*number.of, number) if not a.member}
+        needed |= {number.place: number for _, number in body.stores if not number.member}
+        for index, number in needed.items():
+            each.values[index] = each.same_for_all(self._once.values[index], number)
 
     def _lanes(self) -> ir.Value:
         return ir.Constant(ir.VectorType(LONG, self._width), list(range(self._width)))
 
     def _to_all(self, value: ir.Value, vector: ir.VectorType) -> ir.Value:
-        one = self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
-        places = ir.Constant(ir.VectorType(INT, self._width), [0] * self._width)
-        return self._builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), places)
+        first = self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
+        lanes = ir.Constant(ir.VectorType(INT, self._width), [0] * self._width)
+        return self._builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), lanes)
 
-    def _pointer(self, place: Place, at: ir.Value, vector: ir.VectorType) -> ir.Value:
-        assert place.array in BY_MEMBERS
-        row = self._builder.mul(ir.Constant(LONG, place.at), self._columns)
-        pointer = self._builder.gep(self._arrays[place.array], [self._builder.add(row, at)], source_etype=DOUBLE)
+    def _pointer(self, location: Place, at: ir.Value, vector: ir.VectorType) -> ir.Value:
+        assert location.array in BY_MEMBERS
+        row = self._builder.mul(ir.Constant(LONG, location.at), self._columns)
+        pointer = self._builder.gep(
+            self._arrays[location.array], [self._builder.add(row, at)], source_etype=DOUBLE
+        )
         return self._builder.bitcast(pointer, vector.as_pointer())
 
     def _added(self, value: ir.Value) -> ir.Value:
@@ -341,6 +346,6 @@ class _LoopWriter:
 
     def _reduced(self, operation: str, values: list[ir.Value]) -> ir.Value:
         name, module = f"llvm.vector.reduce.{operation}.v{self._width}f64", self._builder.module
-        kind = ir.FunctionType(DOUBLE, [one.type for one in values])
+        kind = ir.FunctionType(DOUBLE, [value.type for value in values])
         function = module.globals.get(name) or ir.Function(module, kind, name)
         return self._builder.call(function, values, fastmath=FLAGS)

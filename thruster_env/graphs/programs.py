@@ -8,8 +8,8 @@ instructions (`instructions`). Elsewhere its text runs as Python, with NumPy's a
     t2 = t0 * t1
     rows[5] = t2
 
-Which program a compiled function contains is told by a digest of that text. It is part of the key under which
-machine code is kept, and the same in each process: no order in it depends on addresses or hashes.
+A digest of that text identifies the program within a compiled function. It is part of the key of cached machine
+code, and the same in each process: no order in it depends on addresses or hashes.
 """
 
 from __future__ import annotations
@@ -75,21 +75,27 @@ class Program(NamedTuple):
     @property
     def text(self) -> list[str]:
         """A line for each number."""
-        names = {one.place: f"t{k}" for k, one in enumerate([*(one for _, one in self.reads), *self.works])}
+        names = {
+            number.place: f"t{k}" for k, number in enumerate([*(number for _, number in self.reads), *self.works])
+        }
         copied = SIDE_BY_SIDE + BY_MEMBERS
-        lines = [f"{names[one.place]} = {'+' * (place.array in copied)}{place}" for place, one in self.reads]
-        for one in self.works:
-            values = [names[a.place] if isinstance(a, Number) else a for a in one.arguments]
-            lines.append(f"{names[one.place]} = {_expression(one.operation, values)}{'  # exact' * one.exact}")
-        return lines + [f"{place} = {names[one.place]}" for place, one in self.stores]
+        lines = [
+            f"{names[number.place]} = {'+' * (source.array in copied)}{source}" for source, number in self.reads
+        ]
+        for number in self.works:
+            values = [names[a.place] if isinstance(a, Number) else a for a in number.arguments]
+            lines.append(
+                f"{names[number.place]} = {_expression(number.operation, values)}{'  # exact' * number.exact}"
+            )
+        return lines + [f"{target} = {names[number.place]}" for target, number in self.stores]
 
 
 def _expression(operation: str, values: list[str]) -> str:
     if operation == "constant":
         return f"float.fromhex({values[0]!r})"
     if operation == "call":
-        name, count, *given = values
-        return f"called({name!r}, {count}, {', '.join(given)})"
+        name, count, *arguments = values
+        return f"called({name!r}, {count}, {', '.join(arguments)})"
     if operation == "entry":
         return "{}[{}]".format(*values)
     if operation in SPECIAL:
@@ -99,39 +105,39 @@ def _expression(operation: str, values: list[str]) -> str:
 
 
 def program_of(stores: Sequence[tuple[Place, Number]], known: Mapping[int, Place]) -> Program:
-    """The program that makes some stores, of numbers that are given by their places.
+    """The program that evaluates numbers and stores them.
 
     Args:
-        stores: what is to be stored, and where.
-        known: where numbers lie that another program has worked out, by their places in the graph.
+        stores: pairs of a place in memory and the number to store there.
+        known: places in memory of numbers that another program has evaluated, by their places in the graph.
     """
     reads, works = [], []
-    for one in needed_by([number for _, number in stores], known):
-        if one.operation == "given" or one.place in known:
-            reads.append((known.get(one.place) or one.arguments[0], one))
+    for needed in needed_by([number for _, number in stores], known):
+        if needed.operation == "given" or needed.place in known:
+            reads.append((known.get(needed.place) or needed.arguments[0], needed))
         else:
-            works.append(one)
+            works.append(needed)
     return Program(reads, works, list(stores))
 
 
-def values_of(numbers: Sequence[Number], given: np.ndarray) -> np.ndarray:
-    """Values of numbers at some points, (len(numbers), points), of those that are given in the array `numbers`.
+def values_of(numbers: Sequence[Number], points: np.ndarray) -> np.ndarray:
+    """Values of numbers at some points, (len(numbers), points), if the array `numbers` has these values.
 
     Args:
-        numbers: that are wanted.
-        given: (places, points).
+        numbers: the wanted ones.
+        points: values of the given numbers, (places, points).
     """
-    rows = np.empty((len(numbers), given.shape[1]))
-    program = program_of([(Place("rows", k), one) for k, one in enumerate(numbers)], {})
-    _in_python(program.text)(rows, rows, given, given)
+    rows = np.empty((len(numbers), points.shape[1]))
+    program = program_of([(Place("rows", k), number) for k, number in enumerate(numbers)], {})
+    _in_python(program.text)(rows, rows, points, points)
     return rows
 
 
 def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, scratch: int = 0) -> Callable:
-    """`work(*arrays)`, which does it for `width` runs, or members; compiled functions may call it, too.
+    """The function `work(*arrays)` of a program, for `width` runs or members; compiled functions may call it, too.
 
     Args:
-        program: what is done.
+        program: the program.
         width: of vectors.
         arrays: names of the arguments.
         scratch: the first row of the table that loops over members may use for themselves.
@@ -167,9 +173,9 @@ def _run(digest: str, width: int, *arrays) -> None:
     kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS)}[len(arrays)]
     work = _TEXTS[digest].in_python(kind)
     if kind is OF_MEMBERS:
-        *others, table, draws, size = arrays
+        *before, table, draws, size = arrays
         columns = table.shape[1]
-        work(*others, table, draws[: len(draws) // columns * columns].reshape(-1, columns), size)
+        work(*before, table, draws[: len(draws) // columns * columns].reshape(-1, columns), size)
         return
     named = zip(kind, arrays, strict=True)
     work(*(a.reshape(-1, width) if width > 1 and name in SIDE_BY_SIDE else a for name, a in named))
@@ -183,7 +189,7 @@ def _in_python(text: list[str], arrays: Sequence[str] = ARRAYS) -> Callable:
 
 
 def work_names() -> dict:
-    """What names in a program's text mean."""
+    """The functions by their names in a program's text."""
     return {
         **vars(np),
         "where": _chosen,
@@ -216,10 +222,10 @@ def _largest(row, size):
     return np.fmax.reduce(row[:size], initial=-np.inf) if np.ndim(row) else row
 
 
-def _called(name: str, count: int, *given):
-    found = np.empty(count, dtype=np.result_type(*given))
-    CALLED[name](np.array(given), found)
-    return found
+def _called(name: str, count: int, *arguments):
+    results = np.empty(count, dtype=np.result_type(*arguments))
+    CALLED[name](np.array(arguments), results)
+    return results
 
 
 def _teach(work: Callable, program: Program, width: int, arrays: Sequence[str], scratch: int) -> None:

@@ -1,9 +1,9 @@
 """Functions of a model that run as Python: called with Python's floats, they have the values of machine code.
 
-NumPy's scalars are not what a user wrote for: (x > 0) + (y > 0) is at most 1 of them, `case True` matches none of
-their truth values, and x/abs(x) is NaN where Python raises what the function may catch. Python's floats raise
-where machine code has infinity or NaN. So a function is called with Python's floats first. If it raises, or
-returns complex numbers, a copy of it is called with floats whose arithmetic is that of IEEE 754.
+With NumPy's scalars a user's function may differ: (x > 0) + (y > 0) is at most 1, `case True` never matches, and
+x/abs(x) is NaN where Python raises an exception that the function may catch. Python's floats raise where machine
+code has infinity or NaN. So the function is called with Python's floats first. If it raises or returns complex
+numbers, a copy of it is called with floats that follow IEEE 754.
 """
 
 from __future__ import annotations
@@ -65,16 +65,16 @@ class Float(float, metaclass=_OfFloats):
 def _method(name: str) -> Callable:
     of_python, of_numpy = getattr(float, name), getattr(np.float64, name)
 
-    def method(self, *others):
+    def method(self, *arguments):
         try:
-            found = of_python(self, *others)
+            result = of_python(self, *arguments)
         except ArithmeticError:
             if _is_caught():
                 raise
-            return _plain(of_numpy(np.float64(self), *others))
-        if type(found) is float:
-            return Float(found)
-        return _plain(of_numpy(np.float64(self), *others) if isinstance(found, complex) else found)
+            return _plain(of_numpy(np.float64(self), *arguments))
+        if type(result) is float:
+            return Float(result)
+        return _plain(of_numpy(np.float64(self), *arguments) if isinstance(result, complex) else result)
 
     return method
 
@@ -86,13 +86,13 @@ for _name in "neg pos abs".split():
     setattr(Float, f"__{_name}__", _method(f"__{_name}__"))
 
 
-def _plain(found: Any) -> Any:
+def _plain(result: Any) -> Any:
     """A result with Floats in place of floats, and Python's truth values in place of NumPy's."""
-    if isinstance(found, np.generic):
-        found = found.item()
-    if type(found) is tuple:
-        return tuple(map(_plain, found))
-    return Float(found) if type(found) is float else found
+    if isinstance(result, np.generic):
+        result = result.item()
+    if type(result) is tuple:
+        return tuple(map(_plain, result))
+    return Float(result) if type(result) is float else result
 
 
 def _is_caught() -> bool:
@@ -148,10 +148,10 @@ class Floats(np.ndarray):
         """Parts and results have the same entries."""
         self.kind = getattr(other, "kind", float)
 
-    def __getitem__(self, place):
+    def __getitem__(self, index):
         """An entry as a number of Python, or a part of the array."""
-        found = super().__getitem__(place)
-        return self._entry(found) if isinstance(found, np.generic) else found
+        entry = super().__getitem__(index)
+        return self._entry(entry) if isinstance(entry, np.generic) else entry
 
     def __iter__(self):
         """Entries, or rows."""
@@ -168,17 +168,17 @@ class Floats(np.ndarray):
 
 def with_floats(kind: Callable, arguments: Sequence) -> list:
     """Arguments of a function with floats of a kind in the places of floats; others as they are."""
-    found: list = []
-    for one in arguments:
-        if isinstance(one, tuple):
-            parts = [kind(part) if isinstance(part, float) else part for part in one]
-            found.append(type(one)(*parts) if hasattr(one, "_fields") else tuple(parts))
-        elif type(one) is np.ndarray and one.dtype == np.float64 and kind is not np.float64:
-            found.append(one.view(Floats))
-            found[-1].kind = kind
+    converted: list = []
+    for argument in arguments:
+        if isinstance(argument, tuple):
+            parts = [kind(part) if isinstance(part, float) else part for part in argument]
+            converted.append(type(argument)(*parts) if hasattr(argument, "_fields") else tuple(parts))
+        elif type(argument) is np.ndarray and argument.dtype == np.float64 and kind is not np.float64:
+            converted.append(argument.view(Floats))
+            converted[-1].kind = kind
         else:
-            found.append(one)
-    return found
+            converted.append(argument)
+    return converted
 
 
 def _is_real(value: Any) -> bool:
@@ -194,31 +194,31 @@ def _by_ieee(function: Callable, arguments: tuple) -> Any:
 
 @makes_functions
 def with_python_floats(function: Callable, arguments: str = "", sizes=(), form=0, shape=()) -> Callable:
-    """Return a function that calls another one with Python's floats, and is the other one where it is compiled.
+    """Return a function that calls another one with Python's floats; compiled code uses the original.
 
-    Where that raises what floats alone raise (1/0 is infinite in machine code, sqrt(-1) NaN), or returns complex
-    numbers, it has the value of IEEE 754, but for what the function catches. A function with a `~` gets NumPy's
-    scalars, of whose truth values it is the contrary, as in machine code; one with roots gets floats of IEEE 754
-    at once, as Python's root of a negative number is complex.
+    If the function raises an exception that only Python's floats raise (1/0 is infinite in machine code, sqrt(-1)
+    NaN), or returns complex numbers, the result follows IEEE 754, except for exceptions that the function catches.
+    A function with a `~` gets NumPy's scalars, for which `~` negates truth values as in machine code. A function
+    with roots gets floats of IEEE 754 at once, because Python's root of a negative number is complex.
 
-    If its arguments are named, with what `written_function` takes, compiled functions have what numba refuses from
-    its graph.
+    With the arguments of `written_function`, compiled code replaces a function that numba refuses by one from its
+    graph.
     """
     written = written_function(function, arguments, sizes, form, shape) if arguments else None
     inlined(function)
-    codes = [one.__code__ for one in functions_in(function)]
+    codes = [part.__code__ for part in functions_in(function)]
     kind = np.float64 if any(map(inverts, codes)) else Float if any(map(takes_roots, codes)) else float
 
     def called(*arguments):
         written  # noqa: B018 - part of the key of machine code
         failure: Exception = TypeError("a function of a model must return real numbers")
         try:
-            found = function(*with_floats(kind, arguments))
-            if _is_real(found):
-                return found
+            result = function(*with_floats(kind, arguments))
+            if _is_real(result):
+                return result
         except WITHOUT_VALUE as error:
             failure = error
-            if not any(isinstance(one, float) for one in arguments[0][:1]):  # Numbers or tensors
+            if not any(isinstance(component, float) for component in arguments[0][:1]):  # Numbers or tensors
                 raise
         with np.errstate(all="ignore"):
             for other in (_by_ieee, _by_numpy):
@@ -233,7 +233,7 @@ def with_python_floats(function: Callable, arguments: str = "", sizes=(), form=0
 
 
 def _by_numpy(function: Callable, arguments: tuple) -> Any:
-    """What a function makes of NumPy's scalars, of which 1/(x > 0) has a value; rests of conditions are wrong."""
-    if needs_python(function) or any(rounds(one.__code__) for one in functions_in(function)):
+    """The result for NumPy's scalars, for which 1/(x > 0) has a value; their `%` of conditions is wrong."""
+    if needs_python(function) or any(rounds(part.__code__) for part in functions_in(function)):
         raise TypeError
     return function(*with_floats(np.float64, arguments))

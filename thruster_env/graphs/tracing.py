@@ -1,14 +1,13 @@
-"""A plain function of floats, called with Numbers: what it computes becomes a graph.
+"""Tracing of plain functions of floats: called with Numbers, they build a graph.
 
-A user's function knows nothing of Numbers. It says `math.sin(x)`, which wants a float, or `max(x, 0.0)`, which
-decides. So a copy of it is made that finds our own functions under these names, and so are copies of all
-functions that it calls:
+A user's function calls `math.sin(x)`, which needs a float, or `max(x, 0.0)`, which decides. So `traced` copies it
+with our functions under these names, and copies all functions that it calls in the same way:
 
     traced(lambda x: max(math.sin(x[0]), 0.0))((number,))
 
-A function that decides for itself (`if x > 0.0`, `while error > 1e-9`), looks a number up in a table or hands
-it to something that wants a float raises TypeError on the way: it cannot be traced, and has to be called as it
-is, but for a few decisions, of which all sides can be traced (`branches`).
+A function that branches (`if x > 0.0`, `while error > 1e-9`), looks a number up in a table or passes it to a
+function of floats raises TypeError: it cannot be traced and is called as it is. The exception is a few branches,
+of which `branches` traces all sides.
 """
 
 from __future__ import annotations
@@ -53,22 +52,22 @@ def _operation(name: str) -> Callable:
 
 def _numbers(*values) -> list[Number]:
     """Values as Numbers of the graph of those that are."""
-    graph = next(one for one in values if isinstance(one, Number)).graph
-    return [graph.number(one) for one in values]
+    graph = next(value for value in values if isinstance(value, Number)).graph
+    return [graph.number(value) for value in values]
 
 
 def _largest(*numbers):
-    found, *others = numbers[0] if len(numbers) == 1 else numbers
-    for one in others:
-        found = where(one > found, one, found)
-    return found
+    largest, *rest = numbers[0] if len(numbers) == 1 else numbers
+    for number in rest:
+        largest = where(number > largest, number, largest)
+    return largest
 
 
 def _smallest(*numbers):
-    found, *others = numbers[0] if len(numbers) == 1 else numbers
-    for one in others:
-        found = where(one < found, one, found)
-    return found
+    smallest, *rest = numbers[0] if len(numbers) == 1 else numbers
+    for number in rest:
+        smallest = where(number < smallest, number, smallest)
+    return smallest
 
 
 def _extreme(choose: Callable) -> Callable:
@@ -82,9 +81,9 @@ def _extreme(choose: Callable) -> Callable:
     return function
 
 
-def _hypotenuse(x, y=0.0, *others):
-    found = worked_out("hypot", *_numbers(x, y))
-    return _hypotenuse(found, *others) if others else found
+def _hypotenuse(x, y=0.0, *rest):
+    length = worked_out("hypot", *_numbers(x, y))
+    return _hypotenuse(length, *rest) if rest else length
 
 
 def _clipped(x, a_min=None, a_max=None, *, min=None, max=None):
@@ -117,8 +116,8 @@ def _step(x, at_zero):
 
 def _log_of_sum(a, b):
     """log(exp(a) + exp(b)), with the slope of the mean where both are equal."""
-    found = where(a > b, a + (b - a).exp().log1p(), b + (a - b).exp().log1p())
-    return where((a == b) & (abs(a) == math.inf), a, found)
+    result = where(a > b, a + (b - a).exp().log1p(), b + (a - b).exp().log1p())
+    return where((a == b) & (abs(a) == math.inf), a, result)
 
 
 def _interpolated(x, xp, fp, left=None, right=None, period=None):
@@ -128,20 +127,20 @@ def _interpolated(x, xp, fp, left=None, right=None, period=None):
         raise TypeError(f"a traced table must have from 2 to {MOST_POINTS} increasing points and no period")
 
     def at(x):
-        found = where(x > xp[-1], fp[-1] if right is None else right, fp[-1])
+        value = where(x > xp[-1], fp[-1] if right is None else right, fp[-1])
         for j in reversed(range(len(xp) - 1)):
             line = (fp[j + 1] - fp[j]) / (xp[j + 1] - xp[j]) * (x - xp[j]) + fp[j]
-            found = where(x < xp[j + 1], line, found)
-        return where(x == x, where(x < xp[0], fp[0] if left is None else left, found), x)
+            value = where(x < xp[j + 1], line, value)
+        return where(x == x, where(x < xp[0], fp[0] if left is None else left, value), x)
 
     return _of_entries(at)(x)
 
 
 def _polynomial(p, x):
-    found, *others = p
-    for coefficient in others:
-        found = found * x + coefficient
-    return found
+    value, *rest = p
+    for coefficient in rest:
+        value = value * x + coefficient
+    return value
 
 
 def _variance(a, axis=None, dtype=None, out=None, ddof=0, keepdims=False):
@@ -180,8 +179,8 @@ def _without(a: np.ndarray, row: int, column: int) -> np.ndarray:
 def _solved(a, b):
     """X of A x = b, by the inverse's numerators and the determinant."""
     a, b = _square_matrix(a), np.asarray(b, dtype=object)
-    places = range(len(a))
-    numerators = [[(-1.0) ** (i + j) * _determinant(_without(a, j, i)) for j in places] for i in places]
+    indices = range(len(a))
+    numerators = [[(-1.0) ** (i + j) * _determinant(_without(a, j, i)) for j in indices] for i in indices]
     return np.array(numerators, dtype=object) @ b / _determinant(a)
 
 
@@ -189,7 +188,7 @@ def _norm(x, ord=None, axis=None, keepdims=False):
     x = np.asarray(x, dtype=object)
     if axis is not None or keepdims or ord is not None and (ord, x.ndim) not in ((2, 1), ("fro", 2)):
         raise TypeError("a traced norm must be that of a vector or Frobenius'")
-    return sum(one * one for one in x.ravel()).sqrt()
+    return sum(entry * entry for entry in x.ravel()).sqrt()
 
 
 def _condition(x):
@@ -315,7 +314,7 @@ BUILTINS = {
 
 
 def _in_place_of(module: types.ModuleType, name: str):
-    """What traced functions find under a name in `math` or NumPy."""
+    """The replacement for a function of `math` or NumPy in traced functions."""
     value, name = getattr(module, name), OTHER_NAMES.get(name, name)
     if value is np.linalg:
         return Module(np.linalg, _in_place_of)
@@ -339,11 +338,11 @@ def _of_entries(function: Callable) -> Callable:
     """A function of numbers as one of arrays, too."""
 
     def of_arrays(*arguments, **named):
-        if not any(isinstance(one, (np.ndarray, list, tuple)) for one in arguments):
+        if not any(isinstance(argument, (np.ndarray, list, tuple)) for argument in arguments):
             return function(*arguments, **named)
-        entries = np.frompyfunc(lambda *given: function(*given, **named), len(arguments), 1)
+        entries = np.frompyfunc(lambda *entry_arguments: function(*entry_arguments, **named), len(arguments), 1)
         with np.errstate(all="ignore"):  # of NaN among constants
-            return entries(*(np.asarray(one, dtype=object) for one in arguments))
+            return entries(*(np.asarray(argument, dtype=object) for argument in arguments))
 
     return of_arrays
 
@@ -355,7 +354,7 @@ def _has_numbers(value) -> bool:
 
 
 def traced(function: Callable) -> Callable:
-    """A copy of a function that takes Numbers; it raises TypeError where they do not do for floats.
+    """A copy of a function that takes Numbers; it raises TypeError where these cannot replace floats.
 
     Raises:
         TypeError: for a function that needs floats: it catches exceptions, or asks whether a comparison `is` True.
@@ -375,9 +374,9 @@ def traced(function: Callable) -> Callable:
 
 
 def _numbers_in(value) -> Iterator[Number]:
-    """Numbers among arguments, of which some are tuples or arrays of such."""
+    """The Numbers in a value, or in nested tuples, lists and arrays."""
     if isinstance(value, Number):
         yield value
     elif isinstance(value, (tuple, list)) or isinstance(value, np.ndarray) and value.dtype == object:
-        for one in value:
-            yield from _numbers_in(one)
+        for entry in value:
+            yield from _numbers_in(entry)

@@ -6,7 +6,7 @@
         logger.debug("gains %s", gains)                  t2 = t0 * t1
         return (gains["position"] * x[0],)               return (t2,)
 
-What such a function says to people, it says while it is traced and where it runs as Python.
+Such a function prints and logs only while it is traced and where it runs as Python.
 """
 
 from __future__ import annotations
@@ -50,33 +50,33 @@ def written_function(
         return None
     try:
         return _written(function, arguments, sizes, form, tuple(shape))
-    except Exception:  # whatever a user's function raises of numbers that it does not know
+    except Exception:  # whatever a user's function raises while it is traced
         return None
 
 
 def is_refused(function: Callable) -> bool:
-    """Whether numba would refuse a function, or take long over its dictionaries, by what its code says."""
+    """Whether numba would refuse a function, or take long over its dictionaries, judging by its code."""
     if not isinstance(function, types.FunctionType):
         return not hasattr(function, "py_func")
-    return any(_has_odd_code(one.__code__) or _reads_odd_values(one) for one in functions_in(function))
+    return any(_has_odd_code(part.__code__) or _reads_odd_values(part) for part in functions_in(function))
 
 
 def _has_odd_code(code: types.CodeType) -> bool:
     """Whether it has dictionaries, formats or imports, or lists or sets of texts, or lists in lists."""
     listed = list(dis.get_instructions(code))
-    within = (one for one in code.co_consts if isinstance(one, types.CodeType))
+    within = (constant for constant in code.co_consts if isinstance(constant, types.CodeType))
     return (
-        any(one.opname in REFUSED for one in listed)
-        or any(_is_odd_list(listed[:k], one) for k, one in enumerate(listed))
+        any(instruction.opname in REFUSED for instruction in listed)
+        or any(_is_odd_list(listed[:k], instruction) for k, instruction in enumerate(listed))
         or any(map(_has_odd_code, within))
     )
 
 
-def _is_odd_list(before: Sequence[dis.Instruction], one: dis.Instruction) -> bool:
+def _is_odd_list(before: Sequence[dis.Instruction], instruction: dis.Instruction) -> bool:
     """Whether an instruction makes a list or set of texts, or of lists."""
-    if one.opname in EXTENDING:
+    if instruction.opname in EXTENDING:
         return before[-1].opname == "LOAD_CONST" and not _is_of_numbers(before[-1].argval)
-    parts = before[-one.arg :] if one.opname in BUILDING and one.arg else []
+    parts = before[-instruction.arg :] if instruction.opname in BUILDING and instruction.arg else []
     texts = (part.argval for part in parts if part.opname == "LOAD_CONST")
     return not all(map(_is_of_numbers, texts)) or any(part.opname in (*BUILDING, *EXTENDING) for part in parts)
 
@@ -91,8 +91,13 @@ def _reads_odd_values(function: types.FunctionType) -> bool:
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     functions = types.FunctionType, types.BuiltinFunctionType, np.ufunc, type(np.where), type
     return any(
-        not (is_plain(one) or isinstance(one, functions) or hasattr(one, "py_func") or _is_module_of_numbers(one))
-        for one in (*cells, *(function.__globals__[name] for name in names if name in function.__globals__))
+        not (
+            is_plain(value)
+            or isinstance(value, functions)
+            or hasattr(value, "py_func")
+            or _is_module_of_numbers(value)
+        )
+        for value in (*cells, *(function.__globals__[name] for name in names if name in function.__globals__))
     )
 
 
@@ -102,24 +107,26 @@ def _is_module_of_numbers(value) -> bool:
 
 def _written(function: Callable, arguments: str, sizes: Sequence[int], form, shape: tuple[int, ...]) -> Callable:
     graph, ends = Graph(MOST), np.cumsum(sizes)[:-1]
-    places = [f"{name}[{i}]" for name, size in zip(arguments.split(", "), sizes, strict=True) for i in range(size)]
+    entries = [
+        f"{name}[{i}]" for name, size in zip(arguments.split(", "), sizes, strict=True) for i in range(size)
+    ]
 
     def result(of: Callable, numbers: np.ndarray) -> np.ndarray:
-        *others, c = (tuple(part.tolist()) for part in np.split(numbers, ends))
-        found = of(*others, c if isinstance(form, int) else form(*c))
-        rows = [[*row] for row in found] if len(shape) == 2 else [*found]
+        *vectors, c = (tuple(part.tolist()) for part in np.split(numbers, ends))
+        value = of(*vectors, c if isinstance(form, int) else form(*c))
+        rows = [[*row] for row in value] if len(shape) == 2 else [*value]
         return np.array([*rows, None], dtype=object)[:-1] if len(shape) == 1 else np.array(rows, dtype=object)
 
-    given = np.array([*(graph.given(Place("numbers", k)) for k in range(len(places))), None], dtype=object)[:-1]
+    inputs = np.array([*(graph.given(Place("numbers", k)) for k in range(len(entries))), None], dtype=object)[:-1]
     trace = traced(function)
-    found = on_every_side(lambda: result(trace, given), graph)
-    if found.shape != shape:
-        raise TypeError(f"a function must return values of shape {shape}, but got {found.shape}")
-    numbers = [graph.number(one) for one in found.ravel()]
-    _check(numbers, lambda point: result(function, point).astype(float).ravel(), len(places), ends[-1])
-    text = program_of([(Place("out", k), one) for k, one in enumerate(numbers)], {}).text
+    outputs = on_every_side(lambda: result(trace, inputs), graph)
+    if outputs.shape != shape:
+        raise TypeError(f"a function must return values of shape {shape}, but got {outputs.shape}")
+    numbers = [graph.number(output) for output in outputs.ravel()]
+    _check(numbers, lambda point: result(function, point).astype(float).ravel(), len(entries), ends[-1])
+    text = program_of([(Place("out", k), number) for k, number in enumerate(numbers)], {}).text
     text = [line.partition("  #")[0] for line in text]
-    text = [re.sub(r"\bnumbers\[(\d+)\]", lambda at: places[int(at[1])], line) for line in text]
+    text = [re.sub(r"\bnumbers\[(\d+)\]", lambda at: entries[int(at[1])], line) for line in text]
     text = [re.sub(r"float\.fromhex\('(.*?)'\)", lambda of: repr(float.fromhex(of[1])), line) for line in text]
     lines, ends_of = text[: -len(numbers)], [line.partition(" = ")[2] for line in text[-len(numbers) :]]
     out = tuple_of(ends_of)
@@ -138,11 +145,11 @@ def _check(numbers: Sequence[Number], values: Callable, count: int, first_consta
         point[first_constant:] = 0.1 + abs(point[first_constant:])
         try:
             with np.errstate(all="ignore"):
-                expected, found = values(point), values_of(numbers, point[:, None])[:, 0]
+                expected, actual = values(point), values_of(numbers, point[:, None])[:, 0]
         except (ArithmeticError, ValueError):
             continue
         if np.isfinite(expected).all():
-            agreed = np.allclose(found, expected, rtol=1e-9, atol=1e-9 * abs(expected).max(initial=0.0))
+            agreed = np.allclose(actual, expected, rtol=1e-9, atol=1e-9 * abs(expected).max(initial=0.0))
             if not agreed:
                 break
     if not agreed:

@@ -35,9 +35,9 @@ from thruster_env.model.state_space import StateSpaceModel
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
 
-def same_dt(one: float, other: float) -> bool:
+def same_dt(first: float, second: float) -> bool:
     """Whether two sample times [s] agree except for the rounding of stamps."""
-    return abs(one - other) <= SAME_DT * max(abs(one), abs(other))
+    return abs(first - second) <= SAME_DT * max(abs(first), abs(second))
 
 
 def noise_for_dt(
@@ -74,8 +74,8 @@ def noise_of_densities(densities: ArrayLike, slope: ArrayLike, dt: float) -> np.
 
     a, s = as_floats(slope), as_floats(densities)
     n = len(a)
-    found = expm(np.block([[-a, s], [np.zeros((n, n)), a.T]]) * positive("dt", dt))
-    q = found[n:, n:].T @ found[:n, n:]
+    exponential = expm(np.block([[-a, s], [np.zeros((n, n)), a.T]]) * positive("dt", dt))
+    q = exponential[n:, n:].T @ exponential[:n, n:]
     return 0.5 * (q + q.T)
 
 
@@ -90,13 +90,13 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
     q, units = correlations(covariance("process_noise_cov", process_noise_cov, n))
     slope, (rows, columns) = slope / units[:, None] * units, np.triu_indices(n)
     of_units = np.empty((len(rows), len(rows)))
-    for place, (i, j) in enumerate(zip(rows, columns, strict=True)):
+    for column, (i, j) in enumerate(zip(rows, columns, strict=True)):
         unit = np.zeros((n, n))
         unit[i, j] = unit[j, i] = 1.0
-        of_units[:, place] = noise_of_densities(unit, slope, dt)[rows, columns]
+        of_units[:, column] = noise_of_densities(unit, slope, dt)[rows, columns]
     s = np.zeros((n, n))
     s[rows, columns] = s[columns, rows] = np.linalg.solve(of_units, q[rows, columns])
-    given = short_repr(as_floats(process_noise_cov).tolist())
+    q_text = short_repr(as_floats(process_noise_cov).tolist())
     try:
         s = covariance("densities", s, n, variances=np.diag(q) / dt)
         without = np.diag(s) <= ROUNDING * np.diag(q) / dt  # all their noise is that of others, but for rounding
@@ -105,7 +105,7 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
     except ValueError:
         raise ValueError(
             "process_noise_cov must be that of white noise in continuous time (a state driven by others has part "
-            f"of their noise within a step), but got {given} for a step of {dt:g} s"
+            f"of their noise within a step), but got {q_text} for a step of {dt:g} s"
         ) from None
 
 
@@ -169,24 +169,23 @@ class ContinuousModel:
             ValueError: for a model of other rates, or a Q that no white noise gives.
         """
         _check_constants(model.constants)
-        names = {one.name for one in dataclasses.fields(model)}
-        kept = names - {"observe", "constants", "substeps", "process_noise_cov"}
-        given: dict[str, Any] = {
+        names = {field.name for field in dataclasses.fields(model)}
+        retained = names - {"observe", "constants", "substeps", "process_noise_cov"}
+        arguments: dict[str, Any] = {
             "rates": rates,
             "observe": model.observe,
             "constants": model.constants,
-            "arguments": {name: getattr(model, name) for name in kept},
+            "arguments": {name: getattr(model, name) for name in retained},
         }
         constants: Any = model.constants  # a NamedTuple
         step, n = constants.substep, model.n
-        plain = cls(**given, densities=np.zeros((n, n)), longest=step)
+        plain = cls(**arguments, densities=np.zeros((n, n)), longest=step)
         x, u = plain.point
-        moved, own = (f(x, u, model.constants) for f in (runge_kutta(rates, n), model.transition))
-        if not np.allclose(moved, own, rtol=1e-9, atol=1e-12):
+        propagated, expected = (f(x, u, model.constants) for f in (runge_kutta(rates, n), model.transition))
+        if not np.allclose(propagated, expected, rtol=1e-9, atol=1e-12):
             raise ValueError(
-                f"rates must be those of the model, whose step from {short_repr(x)} leads to {short_repr(own)}, "
-                f"but theirs "
-                f"leads to {short_repr(moved)}"
+                f"rates must be those of the model, whose step from {short_repr(x)} leads to "
+                f"{short_repr(expected)}, but theirs leads to {short_repr(propagated)}"
             )
         densities = densities_of(model.process_noise_cov, plain.slope, step * model.substeps)
         return dataclasses.replace(plain, densities=densities)
@@ -201,10 +200,10 @@ class ContinuousModel:
         if substeps is None:
             substeps = max(1, math.ceil(dt / self.longest - RATE_ROUNDING))
         substeps = at_least("substeps", substeps, 1, 10_000)
-        given: dict[str, Any] = {"transition": runge_kutta(self.rates, len(self.densities)), **self.arguments}
-        given["observe"] = self.observe
+        arguments: dict[str, Any] = {"transition": runge_kutta(self.rates, len(self.densities)), **self.arguments}
+        arguments["observe"] = self.observe
         return StateSpaceModel(
-            **given,
+            **arguments,
             constants=self.constants._replace(substep=dt / substeps),
             substeps=substeps,
             process_noise_cov=self.noise(dt),
@@ -220,10 +219,10 @@ class ContinuousModel:
     @property
     def point(self) -> tuple[tuple, tuple]:
         """State and input about which the rates are linearised."""
-        given = self.arguments
-        x, u = given.get("operating_state"), given.get("operating_input")
-        x = np.asarray(given["prior_mean"] if x is None else x, dtype=np.float64)
-        count = given.get("inputs") or len(given.get("input_quantities") or ())
+        arguments = self.arguments
+        x, u = arguments.get("operating_state"), arguments.get("operating_input")
+        x = np.asarray(arguments["prior_mean"] if x is None else x, dtype=np.float64)
+        count = arguments.get("inputs") or len(arguments.get("input_quantities") or ())
         u = np.zeros(count) if u is None else np.asarray(u, dtype=np.float64)
         return tuple(x.tolist()), tuple(u.tolist())
 
@@ -240,10 +239,10 @@ def continuous_of(offer: Any) -> ContinuousModel | None:
     if isinstance(offer, ContinuousModel) or not callable(offer) or hasattr(offer, "state_space_model"):
         return offer if isinstance(offer, ContinuousModel) else None
     try:
-        found = offer()
+        model = offer()
     except Exception:  # whoever needs the model says what is wrong
         return None
-    return found if isinstance(found, ContinuousModel) else None
+    return model if isinstance(model, ContinuousModel) else None
 
 
 def in_discrete_time(offer: Any) -> Any:
@@ -266,8 +265,12 @@ class AtDt:
     @property
     def __signature__(self) -> inspect.Signature:
         """That of the function, with dt."""
-        own = [one for one in inspect.signature(self.make).parameters.values() if one.kind is not one.VAR_KEYWORD]
-        return inspect.Signature([*own, inspect.Parameter("dt", inspect.Parameter.KEYWORD_ONLY)])
+        parameters = [
+            parameter
+            for parameter in inspect.signature(self.make).parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD
+        ]
+        return inspect.Signature([*parameters, inspect.Parameter("dt", inspect.Parameter.KEYWORD_ONLY)])
 
     def __call__(self, *, dt: float, **arguments: Any) -> StateSpaceModel:
         """The model of a sample time."""
@@ -282,5 +285,5 @@ def _check_constants(constants: Any) -> None:
 @makes_functions
 def _together(functions: tuple[Callable, ...]) -> Callable:
     """`observe(x, c)` of a function h_i(x, c) a channel."""
-    names: dict[str, Any] = {f"h_{i}": inlined(one) for i, one in enumerate(functions)}
+    names: dict[str, Any] = {f"h_{i}": inlined(function) for i, function in enumerate(functions)}
     return written_out("observe", "x, c", tuple_of(f"{name}(x, c)" for name in names), **names)

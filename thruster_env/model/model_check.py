@@ -20,18 +20,18 @@ from thruster_env.core.sources import as_value, is_array
 from thruster_env.graphs.python_floats import with_floats
 
 
-def checked_constants(given) -> tuple:
+def checked_constants(constants) -> tuple:
     """Return constants as a NamedTuple, as it is given, or a tuple of floats; raise ValueError for others."""
     try:
-        if isinstance(given, (dict, set, str)):
+        if isinstance(constants, (dict, set, str)):
             raise ValueError
-        values = as_floats(tuple(given))
+        values = as_floats(tuple(constants))
         if values.ndim != 1 or not np.isfinite(values).all():
             raise ValueError
     except (TypeError, ValueError):
         rule = "constants must be a NamedTuple or a tuple of finite numbers"
-        raise ValueError(f"{rule}, but got {short_repr(given)}") from None
-    return given if hasattr(given, "_fields") else tuple(values.tolist())
+        raise ValueError(f"{rule}, but got {short_repr(constants)}") from None
+    return constants if hasattr(constants, "_fields") else tuple(values.tolist())
 
 
 def check_functions(model) -> None:
@@ -52,7 +52,7 @@ def check_functions(model) -> None:
             _check_result(name, function, model, arguments, shape, rule)
 
 
-def _refuse_slopes(name: str, model, arguments: str, found: str) -> None:
+def _refuse_slopes(name: str, model, arguments: str, value_text: str) -> None:
     """Raise ValueError for a Jacobian that is not finite at the prior mean, if its function is."""
     function = getattr(model, name.removesuffix("_jacobian"))
     try:
@@ -62,18 +62,18 @@ def _refuse_slopes(name: str, model, arguments: str, found: str) -> None:
         return
     if np.isfinite(value).all():
         raise ValueError(
-            f"{name} must be finite at the prior mean with inputs of zero, as its function is, but got {found}: "
-            "return a limit there, or leave it out"
+            f"{name} must be finite at the prior mean with inputs of zero, as its function is, but got "
+            f"{value_text}: return a limit there, or leave it out"
         )
 
 
 def _arguments(names: str, model, x: np.ndarray) -> list:
-    given = {
+    arguments = {
         "x": as_value(x.tolist()),
         "u": as_value([0.0] * model.inputs),
         "c": model.given_constants,
     }
-    return with_floats(float, [given[name] for name in names.split(", ")])
+    return with_floats(float, [arguments[name] for name in names.split(", ")])
 
 
 def _check_arguments(name: str, function: Callable, arguments: str) -> None:
@@ -90,7 +90,7 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
 
 
 def _place(function: Callable) -> str:
-    """Where a function stands, in brackets; nothing where it does not tell, as one that is built from a text."""
+    """Name, file and line of a function, in brackets; empty without a file, as for generated code."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     if code is None or not Path(code.co_filename).is_file():
         return ""
@@ -119,9 +119,9 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             where = _place(function)
             raise ValueError(f"{name}{where} must work for {sizes}, but raised {error_line(error)}") from error
-        found = _shape(result)
-        if found != shape:
-            raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
+        result_shape = _shape(result)
+        if result_shape != shape:
+            raise ValueError(f"{name} must return {rule}, but returned {_said(result_shape, result)}")
         if must_be_known and np.isnan(as_floats(result)).any():
             raise ValueError(_not_nan(name, short_repr(result)))
         if at_mean and slopes and not by_complex_step(function) and not np.isfinite(as_floats(result)).all():
@@ -129,8 +129,8 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
         return
 
 
-def _not_nan(name: str, said: str) -> str:
-    return f"{name} must not be NaN at the prior mean with inputs of zero, but got {said}"
+def _not_nan(name: str, value_text: str) -> str:
+    return f"{name} must not be NaN at the prior mean with inputs of zero, but got {value_text}"
 
 
 def _shape(result) -> tuple[int, ...] | None:
@@ -209,18 +209,18 @@ def _points(sizes: tuple[int, ...]) -> list[list[tuple[float, ...]]]:
 
 def _values(function: Callable, model: StateSpaceModel, sizes: tuple[int, ...]) -> list:
     """What a function returns at the points, in digits, or what it raises."""
-    found: list = []
+    results: list = []
     for point in _points(sizes):
         try:
             with np.errstate(all="ignore"):
                 values = [float(value) for value in function(*map(as_value, point), model.given_constants)]
-        except Exception as error:  # a point where the model is not defined, which is a trait of it, too
-            found.append(type(error).__name__)
+        except Exception as error:  # the model is not defined at this point, which identifies it, too
+            results.append(type(error).__name__)
             continue
         numbers = [*values, *(x for vector in point for x in vector)]
         largest = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
-        found.append([_rounded(value, largest) for value in values])
-    return found
+        results.append([_rounded(value, largest) for value in values])
+    return results
 
 
 def _rounded(value: float, largest: float) -> str:

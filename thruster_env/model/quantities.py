@@ -72,17 +72,17 @@ class Quantities(NamedTuple):
     measurements: tuple[Quantity, ...]
 
 
-def count_of(given: Any) -> int:
+def count_of(names: Any) -> int:
     """The number of components for some quantities or names; one by default."""
-    return len(given) if _are_several(given) else 1
+    return len(names) if _are_several(names) else 1
 
 
-def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> tuple[Quantity, ...]:
+def quantities(kind: str, named: Any, count: int, letter: str, counted: str) -> tuple[Quantity, ...]:
     """Make quantities from `Quantity` values, tuples of their fields, or names; letter_1, letter_2, ... if None.
 
     Args:
         kind: their kind, for messages: "states".
-        given: a sequence with `count` entries, or None.
+        named: a sequence with `count` entries, or None.
         count: number of components.
         letter: default symbol of components without names.
         counted: the argument that defines their number, for messages: "prior_mean".
@@ -90,50 +90,52 @@ def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> 
     Raises:
         ValueError: if there are not `count` of them, symbols are equal, or a name, symbol, unit or angle is wrong.
     """
-    if given is None:
+    if named is None:
         return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))
-    if not _are_several(given) or len(given) != count:
+    if not _are_several(named) or len(named) != count:
         raise ValueError(
-            f"{kind} must be {count} quantities or names, as {counted} says, but got {short_repr(given)}"
+            f"{kind} must be {count} quantities or names, as {counted} says, but got {short_repr(named)}"
         )
-    found = tuple(_quantity(kind, one) for one in given)
-    symbols = [one.symbol for one in found]
+    checked = tuple(_quantity(kind, entry) for entry in named)
+    symbols = [quantity.symbol for quantity in checked]
     if len(set(symbols)) < count:
         raise ValueError(f"symbols of {kind} must differ from one another, but got {', '.join(symbols)}")
-    return found
+    return checked
 
 
-def _are_several(given: Any) -> bool:
-    return isinstance(given, Sequence) and not isinstance(given, str)
+def _are_several(names: Any) -> bool:
+    return isinstance(names, Sequence) and not isinstance(names, str)
 
 
-def _quantity(kind: str, given) -> Quantity:
+def _quantity(kind: str, entry) -> Quantity:
     try:
-        made = Quantity(given, given.replace(" ", "_")) if isinstance(given, str) else Quantity(*given)
+        quantity = Quantity(entry, entry.replace(" ", "_")) if isinstance(entry, str) else Quantity(*entry)
     except TypeError:
-        made = None
-    if made is None or not _is_valid(made):
+        quantity = None
+    if quantity is None or not _is_valid(quantity):
         rule = f"each of {kind} must be a name, or have name, symbol (letters, digits, _ and -), unit and angle"
-        raise ValueError(f"{rule}, and an angle the unit rad, but got {short_repr(given)}")
-    return made
+        raise ValueError(f"{rule}, and an angle the unit rad, but got {short_repr(entry)}")
+    return quantity
 
 
-def _is_valid(one: Quantity) -> bool:
-    texts = all(isinstance(text, str) for text in one[:3]) and isinstance(one.angle, bool)
-    plain = texts and one.symbol.replace("_", "").replace("-", "").isalnum()
-    return plain and (not one.angle or one.unit == "rad")
+def _is_valid(quantity: Quantity) -> bool:
+    texts = all(isinstance(text, str) for text in quantity[:3]) and isinstance(quantity.angle, bool)
+    plain = texts and quantity.symbol.replace("_", "").replace("-", "").isalnum()
+    return plain and (not quantity.angle or quantity.unit == "rad")
 
 
-def outputs(given: Mapping[str, Output | Sequence]) -> dict[str, Output]:
+def outputs(mapping: Mapping[str, Output | Sequence]) -> dict[str, Output]:
     """Outputs by symbol, each an `Output` or (quantity, function); ValueError states the rule and the value."""
-    if not isinstance(given, Mapping):
-        raise ValueError(f"outputs must map symbols to quantities and functions, but got {short_repr(given)}")
-    found = {}
-    for symbol, one in given.items():
-        if not isinstance(one, Sequence) or len(one) != 2 or not callable(one[1]):
-            raise ValueError(f"the output {symbol!r} must be a quantity and a function, but got {short_repr(one)}")
-        found[symbol] = Output(_quantity(f"outputs, {symbol}", one[0]), one[1])
-    return found
+    if not isinstance(mapping, Mapping):
+        raise ValueError(f"outputs must map symbols to quantities and functions, but got {short_repr(mapping)}")
+    checked = {}
+    for symbol, output in mapping.items():
+        if not isinstance(output, Sequence) or len(output) != 2 or not callable(output[1]):
+            raise ValueError(
+                f"the output {symbol!r} must be a quantity and a function, but got {short_repr(output)}"
+            )
+        checked[symbol] = Output(_quantity(f"outputs, {symbol}", output[0]), output[1])
+    return checked
 
 
 _GREEK = {

@@ -27,8 +27,8 @@ def split(model: StateSpaceModel, actions: int, channels: Sequence[str]) -> Spli
 
     None if there are no such inputs, or if one of them is no channel.
     """
-    told = [quantity.symbol for quantity in model.input_quantities[actions:]]
-    seen = [quantity.symbol for quantity in model.measurements]
-    if not told or not set(told + seen) <= set(channels):
+    inputs = [quantity.symbol for quantity in model.input_quantities[actions:]]
+    measurements = [quantity.symbol for quantity in model.measurements]
+    if not inputs or not set(inputs + measurements) <= set(channels):
         return None
-    return Split(tuple(map(channels.index, told)), tuple(map(channels.index, seen)), len(channels))
+    return Split(tuple(map(channels.index, inputs)), tuple(map(channels.index, measurements)), len(channels))

@@ -22,18 +22,18 @@ class Bound(NamedTuple):
     high: float
 
 
-def checked_bounds(given: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
-    """Bounds in the order of the states, from a mapping of symbols or indices to pairs, of which None is no bound.
+def checked_bounds(user_bounds: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
+    """Bounds in the order of the states, from a mapping of symbols or indices to pairs; None is no bound.
 
     Raises ValueError for another state, an angle, or a pair that is not increasing numbers.
     """
-    if not isinstance(given, Mapping):  # those of another model
-        given = {one[0]: one[1:] for one in given}
-    symbols, found = [one.symbol for one in states], []
-    for name, pair in given.items():
-        place = symbols.index(name) if name in symbols else name
-        if not isinstance(place, int) or not 0 <= place < len(states) or states[place].angle:
-            known = ", ".join(one.symbol for one in states if not one.angle)
+    if not isinstance(user_bounds, Mapping):  # those of another model
+        user_bounds = {bound[0]: bound[1:] for bound in user_bounds}
+    symbols, result = [state.symbol for state in states], []
+    for name, pair in user_bounds.items():
+        index = symbols.index(name) if name in symbols else name
+        if not isinstance(index, int) or not 0 <= index < len(states) or states[index].angle:
+            known = ", ".join(state.symbol for state in states if not state.angle)
             raise ValueError(f"bounds must be of states {known}, and not of angles, but got {short_repr(name)}")
         try:
             low, high = pair
@@ -41,11 +41,11 @@ def checked_bounds(given: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
         except (TypeError, ValueError):
             low = high = math.nan
         if not low < high or low == math.inf or high == -math.inf:
-            rule = f"bounds of {symbols[place]} must be two increasing numbers, of which one may be None"
+            rule = f"bounds of {symbols[index]} must be two increasing numbers, of which one may be None"
             raise ValueError(f"{rule}, but got {short_repr(pair)}")
         if low > -math.inf or high < math.inf:
-            found.append(Bound(place, low, high))
-    return tuple(sorted(found))
+            result.append(Bound(index, low, high))
+    return tuple(sorted(result))
 
 
 # Scales of a model's states, in which steps of central differences and regions about a mean are measured.
@@ -54,9 +54,9 @@ def checked_bounds(given: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
 def scales_of(model) -> np.ndarray:
     """Scale of each state of a model, (n,): its standard deviation in prior and Q together.
 
-    Of a state without both it is how far others of a known scale move it in a step: a position whose velocity is
-    uncertain. Else it is how far it moves by itself, or its prior mean's magnitude, or 1. So results do not depend
-    on units.
+    For a state without both, such as a position whose velocity is uncertain, it is how far states of known scale
+    move it in a step; else how far it moves by itself, or its prior mean's magnitude, or 1. So results do not
+    depend on units.
     """
     scales = np.sqrt(np.diag(model.prior_cov) + np.diag(model.process_noise_cov))
     if (scales > 0.0).all():
@@ -84,7 +84,7 @@ def _moved(model, x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             u = as_value([0.0] * model.inputs)
-            found = as_floats(model.transition(as_value(x.tolist()), u, model.given_constants))
+            propagated = as_floats(model.transition(as_value(x.tolist()), u, model.given_constants))
     except Exception:  # whatever a user's function raises; `model_check` says what is wrong
         return np.full(model.n, np.nan)
-    return found if found.shape == x.shape else np.full(model.n, np.nan)
+    return propagated if propagated.shape == x.shape else np.full(model.n, np.nan)

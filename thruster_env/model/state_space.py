@@ -154,10 +154,10 @@ class StateSpaceModel:
         vars(self).update({name: as_function(value) for name, value in state.items()})
 
     def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
-        """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""
-        given, function = getattr(self, f"{name}_jacobian"), getattr(self, name)
-        if given is not None and not by_complex_step(given):
-            return given
+        """The user's Jacobian, or one by complex steps, which `replace` makes anew."""
+        jacobian, function = getattr(self, f"{name}_jacobian"), getattr(self, name)
+        if jacobian is not None and not by_complex_step(jacobian):
+            return jacobian
         return complex_step(function, rows, columns, arguments)
 
     @property
@@ -173,7 +173,9 @@ class StateSpaceModel:
     @property
     def shape(self) -> Shape:
         """Sizes of the model, and other data needed to compile its code."""
-        states, channels = (tuple(one.angle for one in part) for part in (self.states, self.measurements))
+        states, channels = (
+            tuple(quantity.angle for quantity in part) for part in (self.states, self.measurements)
+        )
         return Shape(self.n, self.m, self.inputs, constants_form(self.constants), states, channels)
 
     @property
@@ -215,16 +217,16 @@ class StateSpaceModel:
     @property
     def _has_more(self) -> bool:
         """Whether a subclass checks or keeps more than the fields: it may depend on covariances, too."""
-        own = {one.name for one in dataclasses.fields(self)} | {"digest"}
-        return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= own
+        names = {attribute.name for attribute in dataclasses.fields(self)} | {"digest"}
+        return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= names
 
     def _with_noise(self, changes: Mapping[str, Any]) -> Self:
-        """`replace` of covariances, on which no function depends: so these are not tried again."""
+        """`replace` of covariances; no function depends on them, so none is tried again."""
         model = object.__new__(type(self))
-        for one in dataclasses.fields(self):
-            value = getattr(self, one.name)  # arrays and outputs could be changed: each model has its own
-            own = value.copy() if isinstance(value, np.ndarray | dict) else value
-            object.__setattr__(model, one.name, own)
+        for attribute in dataclasses.fields(self):
+            value = getattr(self, attribute.name)  # arrays and outputs could be changed: each model has its own
+            copied = value.copy() if isinstance(value, np.ndarray | dict) else value
+            object.__setattr__(model, attribute.name, copied)
         for name, value in changes.items():
             measured = name == "measurement_noise_cov"
             size = self.m if measured else self.n
