@@ -93,7 +93,7 @@ class Live:
         self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
         self._events: list[Event] = []
         self._raised: list[tuple[Alarm, ...]] = []  # by the monitor at each event
-        self._held = np.zeros(0)  # the input that acts
+        self._acting_input = np.zeros(0)  # since the last prediction
         self._length = self._step  # of the last step
         self._last: np.ndarray | None = None  # the input of a prediction that no update has followed
         self.time = math.nan
@@ -143,7 +143,7 @@ class Live:
         self._session.start(key, measured)
         self._first, self._last = FirstRestart(self._filter), None
         self._first.note(self._session, None, measured)
-        self._events, self._raised, self.time, self._held = [], [], time, np.zeros(0)
+        self._events, self._raised, self.time, self._acting_input = [], [], time, np.zeros(0)
         if self._watch is not None:
             self._watch.restart()
             self.health = self._watch.step(self.innovation, self.innovation_cov, measured)
@@ -183,7 +183,7 @@ class Live:
         time, measured = finite("time", time), self._measured(sensor, z)
         near = self._near(time)
         if time > self.time + near:
-            self._predict(time, self._held)
+            self._predict(time, self._acting_input)
         if time >= self.time - near:
             alarms = self._update(measured)
         elif time < self.time - self._late - near:
@@ -239,7 +239,7 @@ class Live:
             session.scale_process_noise(length / self._step)
         self._repeat(u, count)
         self._last = u
-        self.time, self._held = time, u
+        self.time, self._acting_input = time, u
 
     def _repeat(self, u: np.ndarray, count: int) -> None:
         """Predict under one input; if the result is not finite, repeat it and note the last finite belief."""

@@ -80,12 +80,12 @@ class FilterType(NamedTuple):
 
     name: Any  # as `filter_type` got it
     filter_class: type[Filter]  # the filter's class; `ForeignFilter` of an estimator
-    found: Any = None  # the user's object that the name stands for; None for a filter of `FILTERS`
+    estimator: Any = None  # the user's object that the name stands for; None for a filter of `FILTERS`
 
     @property
     def is_foreign(self) -> bool:
         """Whether it is a user's estimator or filter."""
-        return self.found is not None
+        return self.estimator is not None
 
     @property
     def is_estimator(self) -> bool:
@@ -110,7 +110,7 @@ class FilterType(NamedTuple):
     @property
     def declared(self) -> tuple:
         """The tunable parameters that an estimator declares, `Parameter`s; none by default."""
-        parameters = getattr(self.found, "parameters", ()) if self.is_estimator else ()
+        parameters = getattr(self.estimator, "parameters", ()) if self.is_estimator else ()
         is_list = isinstance(parameters, list | tuple)  # of a network in torch it is a method
         return tuple(parameters) if is_list else ()
 
@@ -124,7 +124,7 @@ class FilterType(NamedTuple):
     def make(self, model: StateSpaceModel, **numbers) -> Filter:
         """The filter for a model; see `make_filter`."""
         if self.is_foreign:
-            return as_filter(self.found, self.label, model, numbers)
+            return as_filter(self.estimator, self.label, model, numbers)
         for number in numbers:
             one_of(f"a number of filter {self.name!r}", number, self.numbers)
         if isinstance(model, AnyStepModel) and not self.filter_class.any_step:

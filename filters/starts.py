@@ -112,21 +112,21 @@ def restarts_of(
         if session.divergences:
             break
     runs = int((divergences > 0).sum())
-    return Restarts(int(divergences.sum()), runs, len(divergences), b, *first.found)
+    return Restarts(int(divergences.sum()), runs, len(divergences), b, *first.event)
 
 
 class FirstRestart:
     """The first restart of a filter that is stepped by hand; `note` records each step.
 
     Attributes:
-        found: the step, symbols of the states that were lost, and the likely cause.
+        event: the step, symbols of the states that were lost, and the likely cause.
     """
 
     def __init__(self, filter_: Filter):
         """Begin before the first measurement."""
         self._filter, self._step = filter_, 0
         self._before: list[Moments] | None = None
-        self.found: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
+        self.event: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
         self._is_open = True
 
     def hold(self, session: Any) -> None:
@@ -139,14 +139,14 @@ class FirstRestart:
         if session.divergences and self._is_open:
             self._is_open = False
             numbers = getattr(session, "numbers", None)
-            self.found = self._step, *_states_and_cause(self._filter, numbers, self._before, u, as_floats(z))
+            self.event = self._step, *_states_and_cause(self._filter, numbers, self._before, u, as_floats(z))
         if self._is_open:
             self.hold(session)
             self._step += 1
 
     def restarts(self, count: int) -> Restarts | None:
         """The restarts of one run, `count` in number; None if there were none."""
-        return Restarts(count, 1, 1, 0, *self.found) if count else None
+        return Restarts(count, 1, 1, 0, *self.event) if count else None
 
 
 class FirstRestarts:
@@ -157,13 +157,13 @@ class FirstRestarts:
         n = filter_.kernel_model.n
         self._filter, self._counts, self._steps = filter_, np.zeros(count), np.zeros(count, dtype=int)
         self._means, self._covs = np.zeros((count, n)), np.zeros((count, n, n))
-        self._found: list[tuple[int, tuple[str, ...], str] | None] = [None] * count
+        self._events: list[tuple[int, tuple[str, ...], str] | None] = [None] * count
 
     def start(self, which: np.ndarray) -> None:
         """Begin anew in some copies, by their indices."""
         self._counts[which], self._steps[which] = 0.0, 0
         for i in which:
-            self._found[i] = None
+            self._events[i] = None
 
     def note(self, which: np.ndarray, counts: np.ndarray, moments: Moments, u, z) -> np.ndarray | None:
         """Sentences on copies that restarted in this step, (N,) with None for the others; None if none restarted.
@@ -180,8 +180,8 @@ class FirstRestarts:
         for i in lost:
             step = int(self._steps[i])
             before = [(self._means[i], self._covs[i])] if step else None
-            first = self._found[i] or (step, *_states_and_cause(self._filter, None, before, u[i], z[i]))
-            self._found[i] = first
+            first = self._events[i] or (step, *_states_and_cause(self._filter, None, before, u[i], z[i]))
+            self._events[i] = first
             sentences[i] = Restarts(int(counts[i]), 1, 1, 0, *first).sentence
         self._steps[which] += 1
         self._counts = np.where(which, counts, self._counts)

@@ -119,7 +119,7 @@ def _without_comments(text: str) -> str:
 
 
 NIS = -1  # its place in a row, where machine code has none
-TOLD = frozenset(  # of each filter in C, and by its tests
+RESERVED = frozenset(  # names in the struct of every filter in C, and of its tests
     "x P innovation S nis log_likelihood channels restarts channel healthy tested alarmed".split()
 )
 
@@ -204,7 +204,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     stages = [stage.of_rows for stage in stages_of(page, memory, equations)]
     extras = {name: matrix.shape for name, matrix in memory.kept.items()}
-    if wrong := [name for name in extras if name in TOLD or not is_name(name) or is_macro(name)]:
+    if wrong := [name for name in extras if name in RESERVED or not is_name(name) or is_macro(name)]:
         raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
     point_count = memory.end - layout.extras - sum(prod(size) for size in extras.values())
     points = _points_of(stages[2], equations, memory, point_count)

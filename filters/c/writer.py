@@ -56,7 +56,7 @@ class Writer:
         name, model, real = self.name, self.model, self.real
         page = sys.modules[self.programs.page].__doc__ or ""
         guard, n, m = name.upper(), model.n, model.m
-        u, z = self._given()
+        u, z = self._input_parameters()
         types, members, declared = (
             ("", "", "") if self.tests is None else (self.tests.types, self.tests.members, self.tests.declared)
         )
@@ -107,7 +107,7 @@ void {name}_update({name} *filter{z});
         name, model, real = self.name, self.model, self.real
         n, m, zero = model.n, model.m, literal(0.0, self.single)
         magnitude = "fabsf" if self.single else "fabs"
-        u, z = self._given()
+        u, z = self._input_parameters()
         constants = "\n".join(self._array(key, np.ravel(value)) for key, value in self.constants().items())
         begin, test = ("", "") if self.tests is None else (TEST_ANEW.format(name=name), TEST_UPDATE)
         functions = "\n".join(functions_called_by(self.programs.all, self.single) + self.functions())
@@ -252,7 +252,7 @@ void {name}_update({name} *filter{z})
         body = "\n".join(f"    {line}" for line in [*(f"(void){argument};" for argument in unused), *lines])
         return f"static void {name}({arguments})\n{{\n{body}\n}}\n"
 
-    def _given(self) -> list[str]:
+    def _input_parameters(self) -> list[str]:
         sizes = self.model.inputs, self.model.m
         return [f", const {self.real} {key}[{size}]" * (size > 0) for key, size in zip("uz", sizes, strict=True)]
 

@@ -17,7 +17,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 STEPS = 24  # up to each of the places in a run, at which slopes are taken ...
 SAMPLES = 8  # ... or more steps, so that the channel that is measured most rarely has about so many of them
-PLACES = (0.75, 1.0)  # in a run: filters have settled there
+FRACTIONS = (0.75, 1.0)  # of a run, by which filters have settled
 BLIND = 1e-10  # eigenvalue of the observability Gramian's correlations, below which nothing is observed
 DOUBLINGS = 60  # of a path, at most: then even slow covariances have settled
 SETTLED = 1e-12  # relative change of a covariance that has settled
@@ -147,7 +147,7 @@ def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
     slopes = observation_slopes(functions, model.shape)
     for keys, inputs, measurements in runs:
         estimates: Estimates = run(filter_, keys, inputs, measurements)
-        ends, count = (int(fraction * inputs.shape[1]) for fraction in PLACES), _steps_to_take(measurements[0])
+        ends, count = (int(fraction * inputs.shape[1]) for fraction in FRACTIONS), _steps_to_take(measurements[0])
         for k in sorted({k for end in ends for k in range(max(end - count, 0) + 1, end + 1)}):
             x, p, s = estimates.means[0, k - 1], estimates.covs[0, k - 1], estimates.innovation_covs[0, k]
             if constant is None or not isinstance(model, AffineModel):

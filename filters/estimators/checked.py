@@ -10,7 +10,7 @@ from filters.estimators.estimator import Output
 from thruster_env.core.checks import as_floats, correlation_flaws, short_repr
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
-CALLED = {
+NAMES = {
     "mean": "mean",
     "cov": "covariance",
     "innovation": "innovation",
@@ -74,11 +74,11 @@ class Checks:
         if array.shape != shape:
             got = f"shape {array.shape}" if array.size else short_repr(value)
             raise ValueError(
-                f"{CALLED[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
+                f"{NAMES[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
             )
         if not np.isfinite(array).all():
             location = _first(~np.isfinite(array), leading)
-            raise ValueError(f"{CALLED[name]} of {self._of} must be finite, but it is not at {location or where}")
+            raise ValueError(f"{NAMES[name]} of {self._of} must be finite, but it is not at {location or where}")
         return self._covariance(name, array, where, leading) if is_cov else array
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
@@ -89,7 +89,7 @@ class Checks:
         if wrong.any():
             location = _first(wrong, leading)
             raise ValueError(
-                f"{CALLED[name]} of {self._of} must be symmetric and positive semidefinite, "
+                f"{NAMES[name]} of {self._of} must be symmetric and positive semidefinite, "
                 f"but it is not at {location or where}"
             )
         return covs

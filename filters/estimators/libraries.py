@@ -45,13 +45,13 @@ class FilterPyEstimator(Estimator):
     ):
         """Keep the filter as it is given; see the class."""
         self.name = name or f"filterpy {type(filter).__name__}"
-        self._given, self._predict = filter, predict or _predict
+        self._original, self._predict = filter, predict or _predict
         self._arguments = dict(update_arguments or {})
         self.filter = copy.deepcopy(filter)
 
     def check_model(self, model: StateSpaceModel) -> None:
         """Raise ValueError unless the filter subtracts and averages the angles of a model as angles."""
-        filter_, lacks = self._given, []
+        filter_, lacks = self._original, []
         for kind, angles in (("x", model.shape.state_angles), ("z", model.shape.measurement_angles)):
             if not any(angles):
                 continue
@@ -69,7 +69,7 @@ class FilterPyEstimator(Estimator):
 
     def reset(self, key, z) -> Output:
         """The prior, updated with the first measurement; FilterPy's filters take no key."""
-        self.filter = copy.deepcopy(self._given)
+        self.filter = copy.deepcopy(self._original)
         points = getattr(self.filter, "points_fn", None)
         if points is not None:  # a first update without a prediction needs sigma points
             self.filter.sigmas_f = points.sigma_points(self.filter.x, self.filter.P)

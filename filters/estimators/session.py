@@ -37,8 +37,8 @@ class EstimatorSession:
             )
         model, self._filter = filter_.model, filter_
         n, m = model.n, model.m
-        self._given = copy.deepcopy(filter_.estimator)
-        self._estimator, self.generators = self._given, GlobalGenerators()
+        self._original = copy.deepcopy(filter_.estimator)
+        self._estimator, self.generators = self._original, GlobalGenerators()
         self._checks = Checks(filter_.name, n, m, filter_.has_covariance)
         self._like = np.zeros(model.inputs), np.zeros(m)
         self._steps = 0
@@ -51,7 +51,7 @@ class EstimatorSession:
         z = vector_like("z", z, self._like[1], missing_allowed=True)
         self._steps = 0
         key = checked_key(key)
-        self._estimator = seeded_copy(self._given, seed_of(key))
+        self._estimator = seeded_copy(self._original, seed_of(key))
         self.generators.seed(derived_seed(seed_of(key), GLOBAL_GENERATORS))
         self._take("reset", key, z)
 

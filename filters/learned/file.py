@@ -23,7 +23,7 @@ LEARNED = {
     kind.kind: kind for kind in (KalmanNet, RecursiveKalmanNet, GatedRecurrentUnit, DifferentiableEnsembleFilter)
 }
 FORMAT = 1
-SHOWN = 5  # constants that differ, of those that an error names
+MOST_NAMED = 5  # differing constants in an error
 DESCRIPTION = "estimator"  # the entry of a file's metadata that describes it
 
 
@@ -100,8 +100,8 @@ class TrainedEstimator:
             for name, value in now.items()
             if name in then and then[name] != value
         ]
-        more = len(differing) - SHOWN
-        differing = differing[:SHOWN] + ([f"{more} more"] if more > 0 else [])
+        more = len(differing) - MOST_NAMED
+        differing = differing[:MOST_NAMED] + ([f"{more} more"] if more > 0 else [])
         problem = self.training.get("problem")
         of_problem = "" if problem is None else f", that of {problem}"
         raise ValueError(f"{rule}{of_problem}, but that had {', '.join(differing) or 'other equations'}")

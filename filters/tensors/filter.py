@@ -214,10 +214,10 @@ class TensorFilter:
         """
         if dtype not in (torch.float64, torch.float32):
             raise ValueError(f"dtype must be torch.float64 or torch.float32, but got {dtype}")
-        self.filter, self._given = filter_, (transition, transition_jacobian, observe, observe_jacobian)
+        self.filter, self._user_functions = filter_, (transition, transition_jacobian, observe, observe_jacobian)
         self._changed: dict[str, Tensor] = {}
         self._make()
-        if self._model is not filter_.model and any(self._given):
+        if self._model is not filter_.model and any(self._user_functions):
             raise ValueError(
                 f"functions of tensors need a filter on the model itself, but got {filter_.name!r}, "
                 "which uses an affine approximation"
@@ -230,7 +230,7 @@ class TensorFilter:
         paged = with_page(self.filter, "a filter on tensors")
         self._model, self._own = paged.kernel_model, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
-        transition, by_transition, observe, by_observe = self._given
+        transition, by_transition, observe, by_observe = self._user_functions
         f_equation = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
         h_equation = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
         if isinstance(paged, EnsembleFilter):
@@ -378,7 +378,7 @@ class TensorFilter:
         """
         changeable = {name: getattr(self, name) for name in ("prior_mean", "prior_cov", "constants")}
         if (
-            any(self._given)
+            any(self._user_functions)
             or self._changed
             or not all(_is(tensor, getattr(self._model, name)) for name, tensor in changeable.items())
         ):

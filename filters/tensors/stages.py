@@ -332,10 +332,10 @@ class _Part:
     def __init__(self, stage: Stage):
         self._wanted = dict(stage.stores[0])
         self._order = in_order(list(self._wanted.values()))
-        self.given = [matrix for matrix in self._order if isinstance(matrix.operation, Place)]
+        self.inputs = [matrix for matrix in self._order if isinstance(matrix.operation, Place)]
 
     def __call__(self, tensors: Mapping[Place, Tensor], like: Tensor) -> dict[Place, Tensor]:
-        values = work_out(self._order, {matrix: tensors[matrix.operation] for matrix in self.given}, like)
+        values = work_out(self._order, {matrix: tensors[matrix.operation] for matrix in self.inputs}, like)
         return {target: values[matrix] for target, matrix in self._wanted.items()}
 
 
@@ -370,8 +370,8 @@ class Stages:
         self.memory = memory = RowMemory(shape, page)
         stages = stages_of(page, memory, TensorModel(f, h, memory))
         parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
-        self.reads = {matrix for part in parts for matrix in part.given}
-        self._belief, self._told = memory.belief, memory.told
+        self.reads = {matrix for part in parts for matrix in part.inputs}
+        self._belief, self._outputs = memory.belief, memory.told
         self._kept = {name: matrix.operation for name, matrix in memory.kept.items()}
         self.kept = {name: len(matrix.shape) for name, matrix in memory.kept.items()}
 
@@ -393,7 +393,7 @@ class Stages:
         """The belief after the measurement z; then the innovation, its covariance and its log density."""
         tensors = self._tensors(numbers, belief, z)
         tensors |= self._update(tensors, belief[0])
-        return self._belief_of(tensors), [tensors[source] for source in self._told]
+        return self._belief_of(tensors), [tensors[source] for source in self._outputs]
 
     def _tensors(self, numbers: Mapping[Place, Tensor], belief: tuple, argument: Tensor) -> dict[Place, Tensor]:
         *known, extras = belief
@@ -416,8 +416,8 @@ class EnsembleStages(Stages):
             name: _Part(stage) for name, stage in members_stages(page, memory, TensorModel(f, h, memory)).items()
         }
         self._parts = parts
-        self.reads = {matrix for part in parts.values() for matrix in part.given}
-        self._belief, self._told = memory.belief, memory.told
+        self.reads = {matrix for part in parts.values() for matrix in part.inputs}
+        self._belief, self._outputs = memory.belief, memory.told
         matrices = {"members": memory.x, **memory.kept}
         self._kept = {name: matrix.operation for name, matrix in matrices.items()}
         self.kept = {name: len(matrix.shape) + matrix.member for name, matrix in matrices.items()}
@@ -444,10 +444,10 @@ class EnsembleStages(Stages):
     def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:
         """The belief after the measurement z; then the innovation, its covariance and its log density."""
         tensors = self._tensors(numbers, belief, z)
-        if any(matrix.operation == NORMALS for matrix in self._parts["update"].given):
+        if any(matrix.operation == NORMALS for matrix in self._parts["update"].inputs):
             tensors[NORMALS] = draw(FILTER_MEASUREMENT, self.memory.shape.m)
         updated = self._after(tensors, ("update",), belief[0])
-        return updated, [tensors[source] for source in self._told]
+        return updated, [tensors[source] for source in self._outputs]
 
     def _after(self, tensors: dict[Place, Tensor], names: Sequence[str], like: Tensor) -> tuple:
         for name in names:

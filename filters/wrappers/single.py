@@ -149,7 +149,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         m = self._channels
         if np.shape(z) != (m,):
             raise ValueError(f"a measurement must have the model's {m} entries, but got {short_repr(z)}")
-        self._held = np.zeros(m)
+        self._last_measured = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
         self._first = FirstRestart(self.filter)
         self._first.note(self._session, None, as_floats(z)[self._measurements])
@@ -210,8 +210,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if self._form == "belief":
             parts.append(np.sqrt(np.diag(cov)))
         elif self._form == "measurement+estimate":
-            self._held = np.where(np.isnan(z), self._held, z)
-            parts.insert(0, self._held)
+            self._last_measured = np.where(np.isnan(z), self._last_measured, z)
+            parts.insert(0, self._last_measured)
         if self._appended:
             parts.append(observation[-self._appended :])
         return np.concatenate(parts).astype(np.float32)

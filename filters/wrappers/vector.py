@@ -93,7 +93,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._beliefs = WithMeasuredInputs(beliefs, split) if inputs else beliefs
         self._restarts, self._used = FirstRestarts(self.filter, self.num_envs), np.zeros((self.num_envs, 0))
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
-        self._held = np.zeros((self.num_envs, self._m))
+        self._last_measured = np.zeros((self.num_envs, self._m))
         watches = monitor_of(monitor)
         watches_of_copies = [watch_of(watches, self.filter) for _ in range(self.num_envs)]
         self._watches = [watch for watch in watches_of_copies if watch is not None]  # of all copies, or of none
@@ -147,7 +147,7 @@ class EstimateStates(gym.vector.VectorWrapper):
     def _start(self, mask: np.ndarray, z: np.ndarray) -> None:
         which = np.flatnonzero(mask)
         self._restarts.start(which)
-        self._held[which] = 0.0
+        self._last_measured[which] = 0.0
         for i in which if self._watches else ():
             self._watches[i].restart()
         self._beliefs.start(which, self._keys.draw(which), z)
@@ -216,8 +216,8 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self._form == "belief":
             parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
         elif self._form == "measurement+estimate":
-            self._held = np.where(np.isnan(z) | ~stepped[:, None], self._held, z)
-            parts.insert(0, self._held)
+            self._last_measured = np.where(np.isnan(z) | ~stepped[:, None], self._last_measured, z)
+            parts.insert(0, self._last_measured)
         if self._appended:
             parts.append(observations[:, -self._appended :])
         return np.concatenate(parts, axis=1).astype(np.float32)
