@@ -124,12 +124,12 @@ def log_program(
 ) -> str:
     """The source of the program for a filter in C of this name.
 
-    It reads numbers, missing ones, units and times as `thruster_env.logs.read.read_log` does, or ends with
-    exit code 2 and the number of the line. Logs must be of the sample time dt [s], and rows that they lack are
-    predicted; without a dt they may be of any, and may lack none. An ensemble's random numbers are those of seed 0
-    in `thruster estimate`, whose columns are those of its output: the estimate and its standard deviation, then
-    each innovation with its own. Where the filter tests its innovations, the number of alarms of each channel
-    follows, from row 50 on, as with `--skip 50`.
+    It reads numbers, missing values, units and times as `thruster_env.logs.read.read_log` does, or ends with
+    exit code 2 and the number of the line. With dt [s], logs must have this sample time, and the program predicts
+    over missing rows; without it, logs may have any sample time, but no missing rows. Output columns are those of
+    `thruster estimate`: each estimate and innovation with its standard deviation, then, if the filter tests its
+    innovations, each channel's number of alarms from row 50 on, as with `--skip 50`. An ensemble draws the random
+    numbers of seed 0 there.
     """
     model, key = programs.model, "".join(f", {int(word)}" for word in filter_keys([0])[0])
     pairs = [(model.states, ("", "std")), (model.measurements, ("innovation", "innovation_std"))]

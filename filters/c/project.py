@@ -128,12 +128,12 @@ def c_filter(
 
     Args:
         filter_: a filter with a page, so no "gsf", "imm", "mmae", "mhe" or "fuzzy".
-        name: of the type, and before all names; the filter's by default.
+        name: of the type, and prefix of all names; the filter's by default.
         single: floats in place of doubles.
         monitor: tests of the innovations, which run after each update.
 
     Raises:
-        ValueError: for another filter, a name that C does not take, or a model whose functions decide, look
+        ValueError: for another filter, a name that C does not allow, or a model whose functions branch, look
             numbers up, or have too many operations.
     """
     name = filter_.name.replace("-", "_") if name is None else name
@@ -325,7 +325,7 @@ def write_project(
     board: bool = False,
     dt: float | None = None,
 ) -> list[Path]:
-    """Write a filter in C, a program that filters a log with it, and how to build them; return the files.
+    """Write a filter in C, a program that filters a log with it, and build instructions; return the files.
 
     README.md has the bytes of the struct, of the stack and of the code for the compilers that are installed: gcc,
     and arm-none-eabi-gcc for a Cortex-M4.

@@ -38,7 +38,7 @@ class Writer:
         model: that it assumes.
         real: "double" or "float".
         tests: of innovations, or None.
-        of_key, by_key: parameters and arguments of what begins with random numbers.
+        of_key, by_key: parameters and arguments of functions that take a random key.
     """
 
     includes = ""  # of NAME.h
@@ -184,7 +184,7 @@ void {name}_update({name} *filter{z})
 """
 
     def kept(self) -> str:
-        """The members of the struct for what the filter keeps besides."""
+        """The members of the struct for the filter's extras."""
         members = ""
         for name, shape in self.programs.kept.items():
             size = f"[{prod(shape)}]" * bool(shape)

@@ -31,7 +31,7 @@ class Interval(NamedTuple):
 def slightly(ratio: Interval) -> str:
     """By how much a ratio differs from 1, "0.02 %", where that is significant but small; empty otherwise.
 
-    A difference below 0.5 % is no reason to prefer a filter, however sure it is.
+    A difference below 0.5 % is no reason to prefer a filter, however significant it is.
     """
     percent = 100.0 * abs(ratio.value - 1.0)
     if ratio.covers(1.0) or not percent < 100.0 * SLIGHT:
@@ -69,7 +69,7 @@ def without_interval(value: float) -> Interval:
 
 
 def mean_interval(values: np.ndarray, resample: bool = True) -> Interval:
-    """Mean of some numbers a run, (B,) or (B, T), with its interval if asked for; NaN entries are not there."""
+    """Mean of values by run, (B,) or (B, T), with its interval if asked for; NaN entries do not count."""
     values = np.reshape(values, (len(values), -1))
     present = ~np.isnan(values)
     if not present.any():
@@ -106,11 +106,11 @@ def rmse_intervals(
 def rmse_ratios(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None = None) -> tuple[Interval, ...]:
     """RMSE of filter a over that of filter b by state, paired by run, from mean square errors (B, n).
 
-    Both are resampled by the same runs, so what makes a run hard for both cancels. Weights (B,) are those of the
-    runs, as `rmse_intervals` takes them.
+    Both are resampled by the same runs, so difficulties that a run has for both cancel. Weights (B,) are those of
+    the runs, as `rmse_intervals` takes them.
 
     Raises:
-        ValueError: if the two have not the same number of runs and states.
+        ValueError: if their numbers of runs or states differ.
     """
     if np.shape(a) != np.shape(b):
         raise ValueError(

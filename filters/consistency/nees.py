@@ -34,7 +34,7 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
 
 
 def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
-    """`whitened` of one run after the other, shared out to the cores: NumPy lets other threads run meanwhile."""
+    """`whitened` run by run, on all cores: NumPy lets other threads run meanwhile."""
     out = np.empty(errors.shape)
 
     def part(first: int, last: int) -> None:

@@ -65,7 +65,7 @@ class ConsistencyReport(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Errors or innovations of B runs over T steps that count, beside what the filter expected of them."""
+    """Errors or innovations of B runs over T steps that count, with the filter's expectation."""
 
     values: np.ndarray  # (B, T, d)
     whitened: np.ndarray  # (B, T, d), as `filters.consistency.nees.whitened`

@@ -53,13 +53,13 @@ class TimeConstants(NamedTuple):
     Attributes:
         steps: the longest first; infinite where an error never fades.
         slowest: index of the state with the largest part in the longest one, in units of its deviation.
-        uptake: steps within which updates take up 63 % of what the channel that counts most says; infinite for a
-            gain of zero.
-        unobservable: indices of states of which measurements tell nothing, whatever the gain.
-        length: steps of a run, of the shortest one.
-        oracle: the longest one and the uptake of the same filter with the plant's own Q and R; None where nobody
-            computed them.
-        advised: a longest time constant [s] that a larger Q reaches; None where none does, or nobody asked.
+        uptake: steps within which updates follow 63 % of a step in the channel with the largest gain; infinite
+            for a gain of zero.
+        unobservable: indices of states that measurements do not determine, whatever the gain.
+        length: steps of the shortest run.
+        oracle: the longest one and the uptake of the same filter with the plant's own Q and R; None if not
+            computed.
+        advised: a longest time constant [s] that a larger Q reaches; None if none does, or if not computed.
     """
 
     steps: tuple[float, ...]
@@ -77,7 +77,7 @@ class TimeConstants(NamedTuple):
 
     @property
     def has_no_gain(self) -> bool:
-        """Whether updates need more than a run to take up what is measured: the gain is practically zero."""
+        """Whether updates need more than a run to follow the measurements: the gain is practically zero."""
         return bool(self.steps) and self.uptake > self.length
 
 
@@ -99,13 +99,13 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
         A = (I - K H) F,   K = (F P F' + Q) H' S^-1,   tau = -1 / log|lambda(A)| steps
         uptake = -1 / log(1 - kappa),   kappa the largest eigenvalue of the mean of H K
 
-    P and S are the filter's own covariances of state and innovation, of an ensemble those of its members, at some
-    steps up to three quarters and up to the end of each run. |lambda| is the mean growth of errors in a step along
-    the runs; with the steady gain of a linear model these are the moduli of A's eigenvalues.
+    P and S are the filter's covariances of state and innovation (of its members, for an ensemble), at steps just
+    before three quarters and before the end of each run. |lambda| is the mean growth of errors in a step along the
+    runs; with the steady gain of a linear model these are the moduli of A's eigenvalues.
 
     Args:
         filter_: the filter.
-        runs: as `filters.run` takes one each.
+        runs: arguments of `filters.run`, with one run each.
 
     Returns:
         None for a filter without a covariance, and where no estimate is finite.
@@ -163,7 +163,7 @@ def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
 
 
 def _steps_to_take(measurements: np.ndarray) -> int:
-    """The number of consecutive steps of measurements (K + 1, m) in which all channels have their usual share."""
+    """The number of consecutive steps of measurements (K + 1, m) in which each channel has its usual share."""
     measured = (~np.isnan(measurements[1:])).mean(axis=0)
     rarest = measured[measured > 0.0].min(initial=1.0)
     return max(STEPS, round(SAMPLES / rarest))
@@ -198,21 +198,21 @@ def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.n
 def forgetting_noise(
     path: Path, model: StateSpaceModel, steps: float, slowest: Callable[[np.ndarray], float] | None = None
 ) -> RaisedNoise:
-    """Q of a model, with the least multiple of a floor for which no time constant exceeds some steps.
+    """Q of a model plus the least multiple of a floor for which no time constant exceeds `steps`.
 
         Q + c (1 - alpha^-2) mean of F P F',   alpha = exp(1 / steps)
 
     P is the steady covariance of the filter with fading memory, in whose prediction F is alpha F: as its gain
-    makes alpha (I - K H) F stable, errors fade faster than exp(-k / steps). Where F and H are constant the
-    floor is the noise by which a Kalman filter has this gain, and c at most 1: it is the least factor that is
-    enough. Where no multiple is enough, it is the one with the shortest time constant of those that were tried.
+    makes alpha (I - K H) F stable, errors fade faster than exp(-k / steps). Where F and H are constant the floor
+    is the noise with which a Kalman filter has this gain, and c at most 1: it is the least sufficient factor. If
+    no multiple is sufficient, it is the one with the shortest time constant of those tried.
 
     Args:
         path: slopes of the model, from `slopes_along`.
         model: its Q and R.
         steps: the longest time constant that is allowed.
         slowest: the longest time constant with a Q (n, n); by default that of the steady gain along the path,
-            repeated for ever, of the observable part of the state.
+            repeated endlessly, of the observable part of the state.
 
     Raises:
         ValueError: if nothing is observable.

@@ -21,7 +21,7 @@ STUCK = 40  # equal readings in a row, beyond what a quantised sensor at rest gi
 
 
 def symptoms(report: ConsistencyReport) -> list[str]:
-    """A remedy for each symptom that a report shows, without a full stop; none where it shows none."""
+    """A remedy for each symptom of a report, without a full stop."""
     remedies = []
     stuck = [name for name, longest in zip(report.channels, report.repeats, strict=False) if longest >= STUCK]
     if stuck:
@@ -99,7 +99,7 @@ def confidence(mean: Interval, dimension: float) -> str:
 
 
 def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
-    """What a mean NEES or NIS says about the covariance."""
+    """The verdict of a mean NEES or NIS on the covariance."""
     if np.isnan(mean.value):
         return f"No {name}: the filter gives no covariance, or a singular one."
     return f"{_capital(confidence(mean, dimension))}: mean {name} {_span(mean)} where {dimension:.3g} is right."
@@ -132,7 +132,7 @@ def distribution_sentence(check: SquaresCheck) -> str:
 
 
 def whiteness_sentence(whiteness: Whiteness, channels: Sequence[str] = ()) -> str:
-    """Whether innovations are white, and which way they are not; `channels` names the measurements."""
+    """Whether innovations are white, else the likely cause; `channels` names the measurements."""
     if whiteness.statistic == 0:
         return "No test of whiteness: the filter gives no innovation covariance, or nothing was measured."
     largest_at = np.unravel_index(np.argmax(np.abs(whiteness.correlations)), whiteness.correlations.shape)
@@ -190,7 +190,7 @@ def ranks_sentence(name: str, ranks: Uniformity, size: int) -> str:
 def ranks_verdict(ranks: Uniformity) -> str:
     """In a few words: do the members lie where the truth may be?
 
-    The outermost bars are looked at by themselves, for the test of the whole distribution hardly sees them.
+    The outermost bars have a check of their own, because the test of the distribution is hardly sensitive to them.
     """
     (first_low, first_high), (last_low, last_high) = ranks.frequency_band[[0, -1]]
     if min(first_low, last_low) > 1:
@@ -220,7 +220,7 @@ def comparison_sentence(name: str, first: str, second: str, ratio: Interval) -> 
 def remedy_sentence(report: ConsistencyReport) -> str:
     """What to try: from NIS and the innovations' correlation, else from NEES; empty if nothing needs to be done.
 
-    Where the model blows up between samples, that alone: no Q and R mend it.
+    If the model blows up between samples, that is the only remedy: no Q and R mend it.
 
     Source: Mehra (1970), "On the identification of variances and adaptive Kalman filtering": with too small a gain
     innovations are correlated positively, with too large a gain negatively.

@@ -20,11 +20,11 @@ from thruster_env.model.state_space import StateSpaceModel
 class FilterPyEstimator(Estimator):
     """A filter of FilterPy, or any object with `predict`, `update`, `x`, `P`, `y`, `S` and `R` like its.
 
-    Each trajectory begins with a copy of the filter as it is given, whose x and P are the prior. It predicts with
-    the input, then updates with the measurement. Where some channels are missing it updates with the others, by
-    the `R`, and the `H` or `hx`, that FilterPy's `update` takes; where all are, it predicts only.
+    Each trajectory begins with a copy of the user's filter, whose x and P are the prior. It predicts with the
+    input, then updates with the measurement. If some channels are missing it updates with the others, with
+    reduced `R` and `H` or `hx` as arguments of FilterPy's `update`; if all are missing, it predicts only.
 
-    Of a model with angles it must know how to subtract and average them: an unscented filter by `residual_x` and
+    For a model with angles it must subtract and average them as angles: an unscented filter by `residual_x` and
     `x_mean_fn`, `residual_z` and `z_mean_fn`, an extended one by `residual` among the arguments of its update.
 
     Args:
@@ -194,8 +194,8 @@ START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and on
 class StoneSoupEstimator(Estimator):
     """A predictor and an updater of Stone Soup, such as those of its extended and unscented Kalman filters.
 
-    A step predicts from the last state over dt, then updates with a detection. Where a channel of a measurement is
-    missing it predicts only, for Stone Soup's measurement models have none that may be left out.
+    A step predicts from the last state over dt, then updates with a detection. If a channel is missing it predicts
+    only, because Stone Soup's measurement models have no optional channels.
 
     Args:
         predictor: with a transition model.
@@ -225,7 +225,7 @@ class StoneSoupEstimator(Estimator):
         self._state, self._now = prior, START
 
     def check_model(self, model: StateSpaceModel) -> None:
-        """Raise ValueError unless measurements that are angles are Stone Soup's, which go the short way round."""
+        """Raise ValueError unless measured angles are Stone Soup's `Angle`, whose differences are wrapped."""
         if not any(model.shape.measurement_angles):
             return
         from stonesoup.types.angle import Angle

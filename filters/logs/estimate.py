@@ -33,7 +33,7 @@ def by_the_clock(
     log: Log,
     noise: Callable[[float], np.ndarray] | None,
 ) -> tuple[Estimates, Restarts | None]:
-    """What `filters.run` gives of one trajectory, of a log on its own stamps, and its restarts.
+    """The estimates of a log on its own stamps, in the form of `filters.run`, and the restarts.
 
     Args:
         filter_: of a model whose sample time is one of its constants.
@@ -60,9 +60,9 @@ def by_the_clock(
 def noise_by_rates(
     plant: ContinuousModel | None, model: StateSpaceModel, dt: float
 ) -> Callable[[float], np.ndarray] | None:
-    """Q by the length of a step [s], of a plant in continuous time whose noise at dt is still the model's.
+    """Q by the length of a step [s], of a plant in continuous time whose noise at dt is the model's.
 
-    Of a model with another Q, as tuning gives, it is None: in proportion to the length.
+    For a model with another Q, as after tuning, it is None: in proportion to the length.
     """
     if plant is None or not np.array_equal(plant.noise(dt), model.process_noise_cov):
         return None
@@ -90,7 +90,7 @@ class LogEstimate(NamedTuple):
 
     @property
     def model(self) -> StateSpaceModel:
-        """What the filter assumes."""
+        """The filter's model."""
         return self.filter.model
 
     @property
@@ -130,14 +130,14 @@ def estimate(
     """Run a filter over a log, and a smoother after it if that is asked for.
 
     The numbers are those of `EstimateState(gym.make("Replay-v0", log=log, model=model), ...)` after
-    `reset(seed=seed)`. On its own stamps a log is filtered by the clock, as `filter.live()` does it: Q of a step
-    is that of its length, of a `ContinuousModel` by its rates, else in proportion.
+    `reset(seed=seed)`. A log on its own stamps is filtered by the clock, as by `filter.live()`: the Q of a step
+    follows from its length, by the rates of a `ContinuousModel`, else in proportion.
 
     Args:
         log: recorded run, or the path of a file.
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
-        model: of the log, as `thruster_env.env.record.ReplayEnv` takes it: a model, what makes or offers one,
-            or "module:object".
+        model: of the log, as `thruster_env.env.record.ReplayEnv` takes it: a model, a function that makes one, an
+            object that offers one, or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.
         lag: how many later measurements, also without `smoother`; all if None.
@@ -209,7 +209,7 @@ def estimate_with(
 def _stepped(
     filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray
 ) -> tuple[Estimates, Restarts | None]:
-    """What `run` gives of one trajectory, by the steps of a wrapper, to the last bit, and its restarts."""
+    """Estimates of one trajectory by a wrapper's steps, equal to `run` to the last bit, and the restarts."""
     session, z, first = Session(filter_), measurements[0], FirstRestart(filter_)
     session.start(keys[0], z[0])
     rows = []

@@ -108,9 +108,9 @@ def log_figure(path: str | Path, estimate: LogEstimate, title: str, alarms: LogA
 def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: LogAlarms | None = None) -> Figure:
     """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
-    A measurement of a state or an output stands there as dots. References come first; of many states and outputs
-    the first six are drawn. Bands of the first rows, in which a filter settles from its prior, do not widen the
-    axes. The first alarm of a stretch is a line in the innovations, the stretch shaded.
+    Measurements of a state or an output are dots. References come first; of many states and outputs the first six
+    are drawn. Bands of the first rows, in which a filter settles from its prior, do not widen the axes. A line in
+    the innovations marks the first alarm of an episode, which is shaded.
     """
     model, references, colour = estimate.model, compared(estimate), colour_of(estimate.filter.name)
     values = [f"{STATE}:{quantity.symbol}" for quantity in model.states] + [
@@ -166,7 +166,7 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
 
 
 def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarray]:
-    """The measured channels whose part of h(x) is a state or an output with these values, by some estimates."""
+    """The measured channels whose component of h(x) equals a state or output, judged by some estimates."""
     model, rows = estimate.model, np.linspace(0, len(values) - 1, 40).astype(int)
     states = estimate.means[rows] if is_array(model.n) else [tuple(row) for row in estimate.means[rows].tolist()]
     try:
@@ -183,7 +183,7 @@ def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray, colour: 
 
 
 def _limit(axis, middle: np.ndarray, std: np.ndarray, line: np.ndarray) -> None:
-    """Let an axis show both lines and, of the band, what is behind the first rows."""
+    """Limit an axis to both lines and to the band after its first rows."""
     reach = TWO_SIDED * std[min(SKIPPED, len(std) // 4) :]
     ends = middle[len(std) - len(reach) :]
     limits = np.concatenate((middle, line, ends - reach, ends + reach))

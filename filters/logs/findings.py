@@ -174,7 +174,7 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
 
 
 class LogAlarms(NamedTuple):
-    """What a monitor says of a log; steps of alarms are rows of it."""
+    """The alarms of a monitor on a log; steps of alarms are rows of the log."""
 
     monitor: Monitor
     first: int  # the row at which the tests begin
@@ -238,7 +238,7 @@ def _statistical(alarms: Sequence[Alarm]) -> list[Alarm]:
 
 
 def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
-    """Alarms of a channel that follow each other within some steps, by their first."""
+    """Alarms of a channel that follow each other within `memory` steps, in the order of their first."""
     result: list[list[Alarm]] = []
     for alarm in alarms:
         last = next((episode for episode in reversed(result) if episode[-1].channel == alarm.channel), None)
@@ -252,7 +252,7 @@ def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
 def episode_sentence(episode: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
     """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
 
-    It begins with its first alarm; where the sensor is stuck or missing, with that, which explains the others.
+    It describes the first alarm, or a stuck or missing sensor, which explains the others.
     """
     cause = next((alarm for alarm in episode if alarm.test in ("stuck", "missing")), episode[0])
     unit = f" {channel.unit}" if channel.unit else ""

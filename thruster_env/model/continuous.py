@@ -43,10 +43,10 @@ def same_dt(first: float, second: float) -> bool:
 def noise_for_dt(
     process_noise_cov: ArrayLike, dt_from: float, dt_to: float, slope: ArrayLike | None = None
 ) -> np.ndarray:
-    """Q of a step of another sample time: Q dt_to/dt_from, that of Gaussian diffusion.
+    """Q of a step of another sample time: Q dt_to/dt_from, as for Gaussian diffusion.
 
     It is exact if the states change little within a step; otherwise a first guess. With the slope A it is exact
-    for linear rates: white noise of the densities that give this Q at `dt_from`.
+    for linear rates: it is the Q of white noise whose densities give the old Q at `dt_from`.
 
     Args:
         process_noise_cov: Q per step of `dt_from`, a matrix, variances or one.
@@ -99,7 +99,7 @@ def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> n
     q_text = short_repr(as_floats(process_noise_cov).tolist())
     try:
         s = covariance("densities", s, n, variances=np.diag(q) / dt)
-        without = np.diag(s) <= ROUNDING * np.diag(q) / dt  # all their noise is that of others, but for rounding
+        without = np.diag(s) <= ROUNDING * np.diag(q) / dt  # these states have no noise of their own, to rounding
         s[without], s[:, without] = 0.0, 0.0
         return s * units[:, None] * units
     except ValueError:

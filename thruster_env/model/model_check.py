@@ -170,7 +170,7 @@ if TYPE_CHECKING:
 LENGTH = 12  # hexadecimal digits
 MAGNITUDES = (0.0, 0.1, 1.0, 1.0, 10.0, 100.0)  # of states and inputs at the points
 DIGITS = 10  # of a value: further ones differ from one machine to another
-SMALL = 1e-2  # of the largest number at a point: of less, less digits are sure, as it may be a difference
+SMALL = 1e-2  # relative to the largest number at a point: smaller values may be differences, with fewer digits
 
 
 def digest_of(model: StateSpaceModel) -> str:
@@ -208,7 +208,7 @@ def _points(sizes: tuple[int, ...]) -> list[list[tuple[float, ...]]]:
 
 
 def _values(function: Callable, model: StateSpaceModel, sizes: tuple[int, ...]) -> list:
-    """What a function returns at the points, in digits, or what it raises."""
+    """The values of a function at the points, rounded, or the type of its exception."""
     results: list = []
     for point in _points(sizes):
         try:
