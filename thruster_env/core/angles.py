@@ -46,7 +46,7 @@ NAMES: dict[str, Any] = {  # of sources about angles
 
 
 def is_angle(index: int, angles: Sequence[bool]) -> bool:
-    """Whether component `index` is an angle; no component is where there are no flags."""
+    """Whether component `index` is an angle; without flags no component is."""
     return index < len(angles) and angles[index]
 
 
@@ -56,7 +56,7 @@ def places_of(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
 
 
 def at_angle(index: int | Index, angles: Sequence[bool], if_angle: str, elsewhere: str) -> str:
-    """Source of `there` for components that are angles, else of `elsewhere`; in loops decided at run time."""
+    """Source `if_angle` for components that are angles, else `elsewhere`; loops decide at run time."""
     if not isinstance(index, Index):
         return if_angle if is_angle(index, angles) else elsewhere
     if all(angles):
@@ -70,7 +70,7 @@ def short_way(expression: str, index: int | Index, angles: Sequence[bool]) -> st
 
 
 def wrapped_where(x: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
-    """Vectors x (..., d), their angles in (-pi, pi]; x itself where there are none."""
+    """Vectors x (..., d) with their angles in (-pi, pi]; x itself if none is an angle."""
     return np.where(angles, wrapped(x), x) if any(angles) else x
 
 
@@ -82,7 +82,7 @@ def difference(a: np.ndarray, b: np.ndarray, angles: Sequence[bool]) -> np.ndarr
 def on_one_branch(rows: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
     """Samples (N, d), each angle within half a turn of the circular mean of its column; NaN counts for nothing.
 
-    What spread they have, as a standard deviation or a range, is then that of ordinary numbers.
+    Their standard deviation or range can then be computed as that of ordinary numbers.
     """
     if not any(angles):
         return rows
@@ -101,7 +101,7 @@ def with_breaks(x: np.ndarray, *lines: np.ndarray) -> tuple[np.ndarray, ...]:
 
 @lru_cache(maxsize=64)
 def with_wrapped_angles(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callable:
-    """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""
+    """Wrap the angles in the vector that a function of the arguments returns to (-pi, pi]."""
     if not any(angles):
         return function
     source = Source("kept", arguments, result=(len(angles),))

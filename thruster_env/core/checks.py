@@ -32,8 +32,8 @@ def short_repr(value) -> str:
 def as_floats(value) -> np.ndarray:
     """Return value as a float64 array, NaN and infinity included; raise ValueError unless it is real numbers.
 
-    Text that looks like a number is none, and neither are complex numbers. What is missing in an array is NaN:
-    what a masked array masks, alone or in a list, None and pandas.NA.
+    Text is no number, even "1.0", and neither are complex numbers. Missing entries become NaN: masked entries of
+    masked arrays, alone or in a list, None and pandas.NA.
     """
     try:
         array = np.asarray(_unmasked(value))
@@ -47,7 +47,7 @@ def as_floats(value) -> np.ndarray:
 
 
 def _unmasked(value):
-    """A value without its masks: what they hide is NaN."""
+    """A value without masks: masked entries become NaN."""
     if isinstance(value, np.ma.MaskedArray):
         if value.dtype.kind == "O":
             return value.filled(math.nan)
@@ -60,7 +60,7 @@ def _unmasked(value):
 
 
 def _with_missing_as_nan(array: np.ndarray) -> np.ndarray:
-    """An array of objects whose entries None and pandas.NA are NaN; TypeError if some are text, or it is None."""
+    """Replace None and pandas.NA in an array of objects by NaN; TypeError for None itself and for text."""
     entries = [
         math.nan if entry is None or type(entry).__name__ == "NAType" else entry
         for entry in array.ravel().tolist()
@@ -143,7 +143,8 @@ def options(value) -> Mapping:
 def one_of(name: str, value, choices: Iterable[str], listed: str | None = None) -> str:
     """Return value; raise ValueError, with the name that comes nearest, unless it is one of the choices.
 
-    Of many choices, where one comes near, the message has the first only, and `listed`, the command that has all.
+    If there are many choices and one is near, the message lists the first few and names `listed`, the command that
+    lists all.
     """
     known = tuple(choices)
     if not isinstance(value, str) or value not in known:
@@ -163,7 +164,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def any_case(value, choices: Iterable[str]):
-    """The choice that differs from a value in its case at most; the value itself where there is none."""
+    """The choice that equals a value up to case; the value itself if there is none."""
     if isinstance(value, str):
         return next((choice for choice in choices if choice.casefold() == value.casefold()), value)
     return value
@@ -256,7 +257,7 @@ def correlation_flaws(covs: np.ndarray, variances: np.ndarray | None = None) -> 
 def correlations(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A covariance in units of about its deviations, and these units (d,), powers of two: nothing is rounded.
 
-    What is computed of it does not depend on the units of what varies; of a variance of 0 the unit is 1.
+    Results computed from it do not depend on the units of the components; the unit of a variance of 0 is 1.
     """
     variances = np.diag(cov)
     units = np.ldexp(1.0, np.where(variances > 0, np.frexp(np.sqrt(variances))[1], 0))
@@ -289,7 +290,7 @@ def takes_arguments_of(
 ) -> Callable[[Function], Function]:
     """Return a decorator: a function of (self, **arguments) takes those of other functions, names and defaults.
 
-    It is called with all of them, and `inspect.signature` and `help` show them. A method's
+    The function is called with all of them, and `inspect.signature` and `help` show them. A method's
     first argument may be given by position, the others by name; its own named arguments come last.
 
     Args:

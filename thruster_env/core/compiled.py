@@ -62,7 +62,7 @@ def keep_code(dispatcher):
 
 
 class Stores:
-    """Caches of numba to read from, of which at most the last is written."""
+    """Several of numba's caches: all are read, at most the last is written."""
 
     def __init__(self, readable: list, writable):
         """Take caches that are only read, and one that is written, or None."""
@@ -107,7 +107,7 @@ class Stores:
 
 @cache
 def made_by() -> str:
-    """The versions and the processor for which machine code is made: others may compute other last digits."""
+    """The versions and the processor that machine code is made for: others may compute different last digits."""
     import numba
     from numba.core.registry import cpu_target
 
@@ -129,7 +129,7 @@ def _told_folder() -> str | None:
 
 
 def private_folder() -> str | None:
-    """A folder among the temporary ones that nobody else can write, for what is loaded from it is run."""
+    """A temporary folder that no other user can write, because the code loaded from it is run."""
     try:
         folder = Path(tempfile.gettempdir()) / f"thruster-env-{os.getuid() if hasattr(os, 'getuid') else 'code'}"
         try:
@@ -146,24 +146,24 @@ def private_folder() -> str | None:
 
 
 def _is_installed(function) -> bool:
-    """Whether a function's file is among those that pip has installed, and will one day remove."""
+    """Whether pip has installed the function's file, and may remove it."""
     return not INSTALLED.isdisjoint(Path(function.__code__.co_filename).parts)
 
 
 def _elsewhere(function):
-    """The cache of a function where the user says, or in the user's folder; RuntimeError if neither takes it."""
+    """The cache of a function in a folder that is set, or in the user's own; RuntimeError if neither works."""
     return _cache_by(function, [locator for locator in _locators() if not locator.__name__.startswith("InTree")])
 
 
 def _locators() -> list:
-    """Where numba looks for a place, in its order."""
+    """Numba's locators of cache folders, in its order."""
     from numba.core.caching import FunctionCache
 
     return list(FunctionCache._impl_class._locator_classes)
 
 
 def _cache_by(function, locators: list):
-    """The cache of a function in the first place of some that will have it."""
+    """The cache of a function in the first folder that accepts it."""
     from numba.core.caching import FunctionCache
 
     implementation = type("Placed", (FunctionCache._impl_class,), {"_locator_classes": locators})
@@ -187,7 +187,7 @@ def _in_folder(function, folder: str):
 
 
 def _readable(function) -> list:
-    """All caches of a function that are there, whether or not they can be written."""
+    """All existing caches of a function, writable or not."""
     caches = []
     for locator in _locators():
         reading = type(locator.__name__, (locator,), {"ensure_cache_path": _must_be_there})
@@ -333,7 +333,7 @@ def _values_in(function: Callable) -> list:
 
 
 def _with_callees(functions: Iterable[Callable]) -> Iterator[Callable]:
-    """Functions and all plain functions that they call, each once."""
+    """Functions and all plain functions that they call, without repetition."""
     visited: set[Callable] = set()
     waiting = list(functions)
     while waiting:
@@ -388,8 +388,8 @@ def compiled(function: Callable) -> Callable:
 def fastmath_of(function: Callable) -> set[str]:
     """What LLVM may do with the arithmetic of a function.
 
-    A user's division is one: 49/49 is 1, and 49 * (1/49) is less. Where a function rounds, an ulp may decide, so
-    that it computes as it is written.
+    Division in a user's function stays a division: 49/49 is 1, but 49 * (1/49) is less. A function that rounds is
+    compiled exactly as written, because one ulp may change its result.
     """
     if (function.__module__ or "").partition(".")[0] in OURS:
         return set(FASTMATH)
@@ -398,7 +398,7 @@ def fastmath_of(function: Callable) -> set[str]:
 
 
 def rounds(code: types.CodeType) -> bool:
-    """Whether a function rounds numbers, or takes rests."""
+    """Whether a function rounds numbers or computes remainders."""
     signs = {"%", "//", "%=", "//="}
     return (
         not JUMPS.isdisjoint(code.co_names)
@@ -530,7 +530,7 @@ class CompiledOrPython:
 
 
 def _refusal(function: Callable, error: Exception) -> str:
-    """That a function runs as Python, and why: the user's model, this package, or the machine."""
+    """The warning that a function runs as Python, and why: the user's model, this package or the machine."""
     text, ours = str(error), []
     if isinstance(error, (OSError, MemoryError)):
         return f"the model runs as Python, slowly, because machine code of it could not be made: {text}"
@@ -552,13 +552,13 @@ def _refusal(function: Callable, error: Exception) -> str:
 
 
 def _objects_called(function: Callable) -> list[str]:
-    """How numba calls the types of a function's callables that are no functions: a user's objects."""
+    """Numba's names of the types of callable objects in a function that are no plain functions."""
     kinds = {type(callee) for callee in _values_in(function) if callable(callee)} - {types.FunctionType}
     return [f"{kind.__module__}.{kind.__qualname__}" for kind in kinds]
 
 
 def _described(function: Callable) -> str:
-    """A function's name and module, or by whom it was written out."""
+    """A function's name and module; of generated code its generator."""
     file = function.__code__.co_filename
     return file.strip("<>") if file.startswith("<") else f"{function.__name__} of {function.__module__}"
 

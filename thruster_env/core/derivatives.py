@@ -48,7 +48,7 @@ def step_of(x, scale, far):
 def step_growth(count: int) -> Callable:
     """Return `step_growth(x, scales)`: the cube root of the largest 1 + |x_i|/s_i of `count` components.
 
-    What is computed of a component far from zero is rounded as it is, whichever component moves.
+    The rounding error of a result grows with its largest component, whichever component is varied.
     """
     source = Source("step_growth", "x, scales", x=(count,), scales=(count,))
     source.line("most = 1.0")
@@ -141,7 +141,7 @@ def _complex_step_in_loops(function: Callable, rows: int, columns: int, argument
 
 
 def by_complex_step(function: Callable) -> bool:
-    """Whether a Jacobian is one that `complex_step` has returned."""
+    """Whether `complex_step` has returned this Jacobian."""
     return isinstance(function, FunctionType) and function in _EXACT  # others need not have a hash
 
 

@@ -1,4 +1,4 @@
-"""Compiled functions called without a look at the types of their arguments, where that would take longest."""
+"""Calls of compiled functions that skip numba's dispatch on the types of arguments."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from thruster_env.core.compiled import CompiledOrPython
 
 
 def direct(function: Callable, *arguments) -> Callable:
-    """The machine code that a compiled function has for arguments like these, to be called with such ones only.
+    """The machine code of a compiled function for the types of these arguments; call it with such arguments only.
 
-    At every call numba finds out the type of each argument, which takes 0.2 us where three are arrays, and then
-    calls what this returns. Arrays must stay of the same number of dimensions, dtype, layout and writability, so
+    At every call numba determines the type of each argument, which takes 0.2 us for three arrays, and then calls
+    this machine code. Arrays must stay of the same number of dimensions, dtype, layout and writability, so
     it is meant for a memory of one's own.
 
     Args:

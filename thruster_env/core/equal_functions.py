@@ -1,7 +1,7 @@
-"""Functions with equal code and equal values stand for one another, as those that a factory writes at each call.
+"""Functions with equal code and equal values are replaced by the first of them, as those that a factory returns.
 
-A function within a function is a new object whenever the outer one runs, and what is traced, compiled or compared
-is found by the function. So in all these places the first of all equal functions stands for the others.
+A nested function is a new object whenever the outer function runs, and results of tracing, compilation and
+comparison are stored by function object. So all of these use the first of several equal functions.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def bound_call(value: Any) -> Any:
 
 
 def original_of(value: Any) -> Any:
-    """The function of which a copy reads other values; others as they are."""
+    """The function from which a copy with other values was made; other values as they are."""
     try:
         return _copied.get(value, value)
     except TypeError:
@@ -121,7 +121,7 @@ def _found(value: Any) -> Any:
 
 
 def _copy_of(value: Any) -> Any:
-    """The same function as an object of its own, which calls what stands for its helpers."""
+    """A copy of a function that calls the first equal function in place of each helper."""
     if isinstance(value, types.MethodType):
         result: Any = types.MethodType(_copy_of(value.__func__), value.__self__)
     elif isinstance(value, types.FunctionType):
@@ -142,7 +142,7 @@ def _copy_of(value: Any) -> Any:
 
 
 def _key_of(value: Any) -> Hashable | None:
-    """What functions that are equal share; None for a function that changes what it holds."""
+    """A key that equal functions share; None for a function that changes the values it holds."""
     keys = _Keys()
     try:
         key = keys.of(original_of(value)), keys.of_members()
@@ -181,7 +181,7 @@ def has_by_name(value: Any) -> bool:
 
 
 class TooMany(Exception):
-    """A function holds more than is compared."""
+    """A function holds more values than are compared."""
 
 
 class _Same:
@@ -205,7 +205,7 @@ class _Same:
 
 
 class _Keys:
-    """Keys of values, and what the code among them does with values that can be changed."""
+    """Keys of values, and whether the code among them changes mutable values."""
 
     def __init__(self):
         self.has_parts = self.changes_parts = self.changes_others = False
@@ -285,7 +285,7 @@ class _Keys:
         )
 
     def _of_attributes(self, module: types.ModuleType, code: types.CodeType) -> Hashable:
-        """What the code may read of a module: of one that is installed numbers, texts, tuples and arrays alone."""
+        """The attributes of a module that the code may read; of an installed module only plain values."""
         attributes = vars(module)
         by_user = not (getattr(module, "__file__", None) or "").startswith(INSTALLED) and (
             module.__name__.partition(".")[0] not in {*OURS, *sys.builtin_module_names}
@@ -296,7 +296,7 @@ class _Keys:
         return tuple((name, self.of(attributes[name])) for name in names)
 
     def of_members(self) -> Hashable:
-        """Members of the users' classes among the values: those that the code reads, and operators."""
+        """Members of users' classes among the values that the code reads, and operators."""
         members: dict[tuple[type, str], Hashable] = {}
         count = -1
         while count < len(members):  # a member may read others
@@ -357,7 +357,7 @@ def is_of_a_user(kind: type) -> bool:
 
 
 def attributes_of(value: Any) -> dict[str, Any]:
-    """What an object holds, in its dictionary and its slots."""
+    """An object's attributes, from its dictionary and its slots."""
     kinds = [vars(base) for base in type(value).__mro__ if "__slots__" in vars(base)]
     slots = [name for kind in kinds for name in kind if isinstance(kind[name], types.MemberDescriptorType)]
     slot_values = {name: getattr(value, name) for name in slots if hasattr(value, name)}
@@ -366,7 +366,7 @@ def attributes_of(value: Any) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=4096)
 def _changes_of(code: types.CodeType) -> tuple[bool, bool]:
-    """Whether code sets variables of others, and whether it may change parts of what it holds."""
+    """Whether code sets outside variables, and whether it may change parts of the values it holds."""
     steps = list(dis.get_instructions(code))
     free = {"STORE_DEREF", "DELETE_DEREF"}
     changes_others = any(
@@ -409,7 +409,7 @@ LARGEST_CAPTURED = 64  # entries of an array that are numbers of their own
 
 
 def captured_numbers(function: Any) -> list[float]:
-    """The floats that a function holds, always in the same order; those of its module and its code are not."""
+    """The floats that a function holds, in a fixed order, without those of its module and its code."""
     numbers: list[float] = []
 
     def note(value: float) -> float:
@@ -443,7 +443,7 @@ class _Copy:
         self._copies: dict[int, tuple[Any, Any]] = {}  # with the object, so that no new one gets its id
 
     def of(self, value: Any) -> Any:
-        """The copy of a value; what holds no floats, or nothing known, is returned as it is."""
+        """The copy of a value; a value without floats, or of an unknown type, is returned as it is."""
         if isinstance(value, float):
             other = self._other(value)
             return type(value)(other) if isinstance(other, float) else other  # of NumPy a number of NumPy
@@ -515,8 +515,8 @@ MOST_RESULTS = 128  # results that are kept for a maker, beyond those that somet
 def makes_functions(maker: Callable) -> Callable:
     """Decorate what returns a function, or a tuple or dictionary of functions.
 
-    Of equal arguments there is one result, as with `functools.cache`; of functions among them that are equal
-    (`first_equal`), too. What was returned long ago and nobody holds is forgotten.
+    Equal arguments give the same result object, as with `functools.cache`; arguments that are functions count as
+    equal by `first_equal`. Old results without other references are dropped.
     """
 
     @lru_cache(maxsize=MOST_RESULTS)

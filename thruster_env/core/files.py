@@ -45,9 +45,8 @@ def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file aside, then rename it into place: a reader sees the old file or the new one.
 
-    A file that is there keeps its mode; a new one has what the umask leaves. A link stays, and what it leads to is
-    written. What is no regular file (a device, a pipe), or is this process's own standard output, is written to as
-    it is.
+    An existing file keeps its mode; a new one gets its mode from the umask. A link stays, and its target is
+    written. A device, a pipe or this process's own standard output is appended to in place.
 
     Args:
         path: where; missing folders are made.
@@ -74,7 +73,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 
 
 def _found(path: Path) -> os.stat_result | None:
-    """What is at a path, links followed, if anything; OSError if it is nothing that can be written."""
+    """The status of an existing file, links followed; OSError if it cannot be written."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -87,7 +86,7 @@ def _found(path: Path) -> os.stat_result | None:
 
 
 def _is_replaced(status: os.stat_result) -> bool:
-    """Whether what is there is a regular file, and not where this process's own output goes."""
+    """Whether a file is regular and not this process's own output, so that it may be replaced."""
     return stat.S_ISREG(status.st_mode) and not any(_is_open_as(stream, status) for stream in STREAMS)
 
 
@@ -158,7 +157,7 @@ def _key(name: str) -> str:
 
 
 def _text(value) -> str:
-    """A value as TOML has it."""
+    """A value in TOML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(name)} = {_text(part)}" for name, part in value.items()) + "}"
     if isinstance(value, (list, tuple)):

@@ -17,7 +17,7 @@ HELD = (np.random.Generator, np.random.RandomState, random.Random)
 
 
 class GlobalGenerators:
-    """The global generators as one owner meets them: what others draw in between changes nothing for it.
+    """The global generators' states for one owner, unaffected by draws of others in between.
 
     Before `seed`, `used` leaves them alone. torch is seeded where it has been imported by then, on the CPU.
     """
@@ -28,7 +28,7 @@ class GlobalGenerators:
         self._within = False
 
     def seed(self, seed: int) -> None:
-        """Begin at a seed below 2^32, and let the others' generators be as they are."""
+        """Start from a seed below 2^32; the global generators stay as they are."""
         before = _states()
         random.seed(seed)
         np.random.seed(seed)
@@ -54,7 +54,7 @@ class GlobalGenerators:
             _set(before)
 
     def __deepcopy__(self, memo) -> GlobalGenerators:
-        """A copy that goes on by itself; states are never written into."""
+        """An independent copy; states may be shared because they are never written into."""
         other = GlobalGenerators()
         other._states = self._states
         return other
@@ -80,7 +80,7 @@ def _set(states: tuple) -> None:
 
 
 def seeded_copy(original: Any, seed: int) -> Any:
-    """A deep copy of an object; generators of Python and NumPy that it holds get seeds of their own."""
+    """A deep copy of an object, in which each generator of Python and NumPy gets a new seed."""
     memo: dict = {}
     duplicate = copy.deepcopy(original, memo)
     generators = (part for part in memo.values() if isinstance(part, HELD))

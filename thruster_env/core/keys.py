@@ -66,7 +66,7 @@ class EpisodeKeys:
 
 
 def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
-    """The copies that a reset's options begin anew, (count,) of booleans; None for all.
+    """The copies that a reset's options restart, (count,) booleans; None for all.
 
     Raises ValueError for other options, and for a mask that leaves out copies that have never been reset.
     """

@@ -64,7 +64,7 @@ def called(function):
 
 @not_inlined
 def _products_of_rows(a, b, lower):
-    """A b', or its part on and below the diagonal, in blocks of two rows of a and four of b that share reads.
+    """A b', or its lower triangle, in blocks of two rows of a and four of b that share reads.
 
     Blocks at the ends repeat the last row, so that no further loops are needed for the remainder.
     """
@@ -127,7 +127,7 @@ def product(a, b):
 
 @not_inlined
 def sparse_product(a, b):
-    """A b; where four entries of a that lie side by side are zero, nothing is added."""
+    """A b, skipping each four adjacent entries of a that are zero."""
     out = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):
         for first in range(0, a.shape[1], 4):
@@ -314,7 +314,7 @@ def triangle_divider(rows: int, size: int) -> Callable:
 
 
 def _forward(source: Source, size: int, each: Callable = lambda i, y: None, missing: str = "") -> Local:
-    """The numbers y = l^-1 v; `each(i, y)` is called behind every one, and `missing` follows its source."""
+    """The numbers y = l^-1 v; `each(i, y)` is called after each, and `missing` is appended to its source."""
     y = source.local("y", size)
     for i in source.range(size):
         rest = source.less(f"v[{i}]", (f"l[{i}][{k}] * {y[k]}" for k in source.range(i)))

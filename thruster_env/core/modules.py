@@ -24,7 +24,7 @@ SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
 
 
 def is_code(name) -> bool:
-    """Whether a name is that of an object in a module, "module:object", which only a user may have imported."""
+    """Whether a name is "module:object", code that only the user may run."""
     return isinstance(name, str) and ":" in name and not name.endswith(".toml")
 
 
@@ -84,10 +84,10 @@ def _module(name: str) -> ModuleType:
 
 @contextmanager
 def working_folder_last() -> Iterator[None]:
-    """Within this context modules are looked for in the working folder, too, where nobody else has them.
+    """Within this context modules are also imported from the working folder, after all other folders.
 
-    So what a user names is found, and what that imports beside it, now and when it is called; but a `struct.py`
-    beside the data takes the place of no module of Python's, of ours or of another package.
+    So the user's module is found, and the modules beside it that it imports, now or when it is called; but a
+    `struct.py` beside the data replaces no module of Python, of this package or of another one.
     """
     folder = os.getcwd()
     if folder in sys.path or "" in sys.path:
@@ -111,7 +111,7 @@ class _UserFolders:
         self.open: list[str] = []
 
     def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
-        """The module, if it may be asked for, and lies there."""
+        """The spec of a module in the working folder, if it may be imported from there."""
         if path is not None:
             return None
         if self.open:
@@ -127,7 +127,7 @@ _USER_FOLDERS = _UserFolders()
 
 
 def _folder_of(name: str) -> str | None:
-    """The folder in which a module lies, or the package of which it is a part."""
+    """The folder of a module, or of its package."""
     file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
     if not file:
         return None
@@ -137,7 +137,7 @@ def _folder_of(name: str) -> str | None:
 
 @contextmanager
 def safe_paths() -> Iterator[None]:
-    """Within this context processes that are started do not look for modules in the working folder first."""
+    """Within this context new processes do not search the working folder for modules first."""
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -150,7 +150,7 @@ def safe_paths() -> Iterator[None]:
 
 
 def as_module(name: str) -> list[str]:
-    """The command that runs the main program of a module of ours, which no file in the working folder can replace.
+    """The command that runs one of our modules as a program; no file in the working folder can replace it.
 
     Where our packages are not installed, the folder that holds them comes last on the path.
     """

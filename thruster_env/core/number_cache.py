@@ -19,7 +19,7 @@ _known: dict[str, tuple[float, ...]] = {}  # of this process
 def cached_numbers(
     name: str, count: int, follows_from: bytes, code: CompiledOrPython, compute: Callable
 ) -> np.ndarray:
-    """Return the vector compute(), or what it was the last time that it followed from the same.
+    """Return the vector compute(), from the cache if it was computed from the same inputs before.
 
     Numbers lie as JSON where the code is compiled to (`thruster_env.core.compiled`), for one kind of
     processor, and go with it. A file that is damaged is as if it were not there, a folder that takes none is as it

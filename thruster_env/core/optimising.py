@@ -20,7 +20,7 @@ RARELY = 1_000_000  # new objects after which garbage is collected meanwhile
 
 
 class Which(NamedTuple):
-    """Of which functions machine code is made differently; each says so of a plain function."""
+    """Which functions are compiled differently; each is a predicate of a plain function."""
 
     asked: Callable[[Callable], bool]  # whether it is ours to compile; of others' functions nothing is changed
     marked: Callable[[Callable], bool]  # whether it is one that becomes part of these
@@ -30,7 +30,7 @@ class Which(NamedTuple):
 
 
 def optimise_once(which: Which) -> None:
-    """Leave called functions as they are when they are compiled for a caller; what is asked for is optimised.
+    """Optimise only the outermost function of a compilation, not the functions compiled for its calls.
 
     Of those that only compiled code can call no machine code is made by itself. Without the places in numba that
     this needs, everything still works, and takes longer to compile. What others compile is untouched, and so is
@@ -83,7 +83,7 @@ def _listener(base: type, asked: Callable[[Callable], bool]):
             return self.dispatchers[0].py_func if self.dispatchers else None
 
         def function_of(self, library) -> Callable | None:
-            """The function, innermost of all, that a library is made of; None if it is made of something else."""
+            """The innermost function that a library is compiled from; None if there is none."""
             function = self.dispatchers[-1].py_func if self.dispatchers else None
             return function if function is not None and library.name == function.__qualname__ else None
 

@@ -1,4 +1,4 @@
-"""Progress of long computations: they report it, and whoever shows it listens."""
+"""Progress of long computations, reported to a listener."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _around: ContextVar[str] = ContextVar("progress of the work that this is a part 
 
 @contextmanager
 def listening(listener: Callable[[str], None]) -> Iterator[None]:
-    """Within this context call listener("posterior bound: 40 of 200") as work goes on in this thread."""
+    """Within this context call listener("posterior bound: 40 of 200") as this thread's work proceeds."""
     before = _listener.set(listener)
     try:
         yield
@@ -24,14 +24,14 @@ def listening(listener: Callable[[str], None]) -> Iterator[None]:
 
 
 def tell(text: str) -> None:
-    """Tell what goes on, if anybody listens."""
+    """Report progress to the listener, if there is one."""
     listener = _listener.get()
     if listener is not None:
         listener(text)
 
 
 def with_progress(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
-    """Go through the parts of a computation, and report before each how much is done.
+    """Iterate over the parts of a computation and report progress before each.
 
     Progress inside a part is appended to that of the part: "N = 40: 3 of 12, runs: 20 of 100".
 

@@ -1,4 +1,4 @@
-"""Results of users' functions as arrays: tuples of any kind, or arrays as they are, for models that are large."""
+"""Results of users' functions, tuples or arrays, as arrays for large models."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
 
 
 def as_array(function: Callable, arguments: str, *shape: int) -> Callable:
-    """Return the same of a function that returns a tuple of this shape, however it was made."""
+    """Return a function with the same result as an array, for a function that returns a tuple of this shape."""
     if not is_array(*shape):
         return function
     lines = f"out = np.empty({shape})", f"fill(out, function({arguments}))"
@@ -37,7 +37,7 @@ def as_array(function: Callable, arguments: str, *shape: int) -> Callable:
 
 @when_compiling
 def teach_numba() -> None:
-    """Have numba compile `fill`; what a result is decides how."""
+    """Register numba's compilation of `fill`, which depends on the type of the result."""
     from numba import types
     from numba.extending import overload
 
@@ -62,13 +62,13 @@ def _copy_matrix(out, value):
 
 
 def _by_entries(count: int) -> Callable:
-    """Entries of a tuple one by one, for they may differ in type."""
+    """Fill from a tuple entry by entry, because entries may differ in type."""
     return written_out(
         "fill_entries", "out, value", *(f"out[{i}] = value[{i}]" for i in range(count)), "None", _loops=True
     )
 
 
 def _by_rows(count: int) -> Callable:
-    """Rows of a tuple, each of which may be a tuple or an array."""
+    """Fill row by row; each row may be a tuple or an array."""
     lines = (f"fill(out[{i}], value[{i}])" for i in range(count))
     return written_out("fill_rows", "out, value", *lines, "None", _loops=True, fill=fill)

@@ -60,7 +60,7 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
 
 
 def _forget(file: str) -> None:
-    """Drop a text of which there is no function any more."""
+    """Drop a source text when its last function is gone."""
     _shown[file] -= 1
     if not _shown[file]:
         del _shown[file]
@@ -70,8 +70,8 @@ def _forget(file: str) -> None:
 def _name_in_tracebacks(name: str, text: str) -> str:
     """A file name for a text, under which `linecache` finds it.
 
-    Numba finds machine code again by the function's code, of which the name is a part: so it holds a digest of the
-    text, and no number, which would depend on what the process has made before.
+    Numba's cache looks up machine code by the function's code, which includes this name. So the name has a digest
+    of the text, and no counter, which would depend on what the process has generated before.
     """
     frame = sys._getframe(2)
     while frame.f_globals.get("__name__") in _MAKERS and frame.f_back is not None:
@@ -86,7 +86,7 @@ def _name_in_tracebacks(name: str, text: str) -> str:
 
 
 def made_here(function: Callable) -> bool:
-    """Whether a function was written out, and so returns what is large as an array."""
+    """Whether a function was generated, so that it returns large results as arrays."""
     return getattr(function, "__module__", None) == __name__
 
 
@@ -96,17 +96,17 @@ LONGEST_TEXT = 128  # products that are written out: those of two matrices of fi
 
 
 def is_array(*shape: int) -> bool:
-    """Whether a vector (count,) or matrix (rows, columns) is a float64 array and no tuple."""
+    """Whether a vector (count,) or matrix (rows, columns) of this size is a float64 array, not a tuple."""
     return int(np.prod(shape)) > LARGEST_TUPLE or (len(shape) == 2 and min(shape) > LARGEST_SIDE)
 
 
 def as_value(values) -> tuple | np.ndarray:
-    """A vector of numbers in the form that functions take: a tuple of them, or an array if it is large."""
+    """A vector in the form that functions take: a tuple, or an array if it is large."""
     return np.asarray(values) if is_array(len(values)) else tuple(values)
 
 
 def lower_pairs(size: int) -> list[tuple[int, int]]:
-    """Places (i, j) on and below the diagonal."""
+    """Indices (i, j) on and below the diagonal."""
     return [(i, j) for i in range(size) for j in range(i + 1)]
 
 
@@ -126,13 +126,13 @@ class Index(str):
 
 
 class Local:
-    """Numbers that a function works out, one for each place: names of their own, or an array."""
+    """A function's local vector or matrix: a variable for each entry, or an array."""
 
     def __init__(self, name: str, shape: tuple[int, ...], loops: bool):
         self.name, self.shape, self._loops = name, shape, loops
 
     def __getitem__(self, index) -> str:
-        """Source of the number at a place i or (i, j)."""
+        """Source of the entry i or (i, j)."""
         indices = index if isinstance(index, tuple) else (index,)
         if self._loops:
             return f"{self.name}[{', '.join(map(str, indices))}]"
@@ -173,7 +173,7 @@ class Source:
                 self._as_array(argument, shape)
 
     def _as_array(self, argument: str, shape: tuple[int, ...]) -> None:
-        """Loops read arrays: one is made of an argument that is a tuple."""
+        """Copy an argument that is a tuple into an array, because loops read arrays."""
         name = argument
         if not is_array(*shape):
             name = f"{argument}_"
@@ -267,7 +267,7 @@ class Source:
         return self._renamed.get(argument, argument)
 
     def local(self, name: str, *shape: int) -> Local:
-        """Numbers to be worked out, one a place; zero at first in an array."""
+        """A local vector or matrix; if it is an array, it starts at zero."""
         if self.loops:
             self.line(f"{name} = np.zeros({shape})")
         return Local(name, shape, self.loops)
@@ -277,7 +277,7 @@ class Source:
         return self._total("0.0", "+", terms) if self.loops else " + ".join(terms) or "0.0"
 
     def less(self, first: str, terms: Iterable[str], sign: str = "-") -> str:
-        """Source of what is left of the first after all terms, or of the first and all terms with sign="+"."""
+        """Source of the first minus all terms, or plus all terms with sign="+"."""
         return self._total(first, sign, terms) if self.loops else first + "".join(f" {sign} {t}" for t in terms)
 
     def product(self, factors: Iterable[str]) -> str:
@@ -329,7 +329,7 @@ class Source:
         return self.mirrored(out)
 
     def whole(self, local: Local) -> str:
-        """Source of a vector or matrix of numbers worked out, of those on and below the diagonal if ..."""
+        """Source of a local vector or matrix, of its lower triangle if ..."""
         return self._value(local, lambda i, j: local[i, j])
 
     def lower(self, local: Local) -> str:
@@ -337,7 +337,7 @@ class Source:
         return self._value(local, lambda i, j: local[i, j] if j <= i else "0.0")
 
     def mirrored(self, local: Local) -> str:
-        """Source of a symmetric matrix of which entries on and below the diagonal have been set."""
+        """Source of a symmetric matrix whose entries on and below the diagonal have been set."""
         if self.loops:
             for i in self.range(local.shape[0]):
                 for j in self.range(i):
@@ -447,7 +447,7 @@ def scaled_sum(count: int) -> Callable:
 
 @cache
 def vector_part(count: int, size: int, first: int = 0) -> Callable:
-    """Return `part(x)`: the `count` components from the first on, of a vector of `whole`."""
+    """Return `part(x)`: `count` components, from index `first` on, of a vector of `size` components."""
     source = Source("part", "x", result=(count,), x=(size,))
     return source.function(source.vector(count, lambda i: f"x[{i + first}]"))
 
@@ -497,6 +497,6 @@ def zeros_of(*shape: int) -> Callable:
 
 @cache
 def part_of(rows: int, columns: int, shape: tuple[int, int], top: int = 0, left: int = 0) -> Callable:
-    """Return `part(a)`: the `rows` and `columns` of a matrix of the shape `whole` that begin at (top, left)."""
+    """Return `part(a)`: the block (rows, columns) at (top, left) of a matrix of this shape."""
     source = Source("part", "a", result=(rows, columns), a=shape)
     return source.function(source.matrix(rows, columns, lambda i, j: f"a[{i + top}][{j + left}]"))

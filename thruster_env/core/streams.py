@@ -38,7 +38,7 @@ def quantile(share):
     return 0.5 * (low + high)
 
 
-# Moments of a normal distribution of which only a part is possible.
+# Moments of a truncated normal distribution.
 
 
 FAR = 5.0  # standard deviations, from which a continued fraction is used
@@ -62,7 +62,7 @@ def mills_ratio(a):
 
 @inlined
 def truncated_normal(low, high):
-    """Mean and variance of a standard normal number between two bounds, of which one may be infinite.
+    """Mean and variance of a standard normal variable truncated to two bounds, one of which may be infinite.
 
         d = m(a) - e m(b),  e = exp((a^2 - b^2)/2),  mean = (1 - e)/d,  variance = 1 + (a - b e)/d - mean^2
 
@@ -161,7 +161,7 @@ def cosine_and_sine_of_turns(turns):
 def nearest_whole(x):
     """The whole number nearest to x, of a float, an array or a tensor; one instruction in compiled code.
 
-    Of a remainder torch knows the derivative, of a floor it does not.
+    It uses a remainder, because torch knows its derivative, but not that of a floor.
     """
     above = x + 0.5
     return above - above % 1.0
@@ -309,8 +309,8 @@ def normal_block(block, step, stream, key_0, key_1):
 def fill_normals(out, count, step, stream, key_0, key_1):
     """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
 
-    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them. As
-    Python it draws those of several steps at once, which takes about as long as those of one.
+    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them. In
+    Python it draws the normals of several steps at once, which takes about as long as one step's.
     """
     if out.dtype != np.float64:  # numbers that count what is done to them
         return _fill_in_loop(out, count, step, stream, key_0, key_1)
@@ -322,7 +322,7 @@ def fill_normals(out, count, step, stream, key_0, key_1):
 
 @lru_cache(maxsize=32)
 def _normals_of_steps(blocks, begin, count, stream, key_0, key_1):
-    """Rows of normals, (together, 4 blocks), of the steps from begin * together on."""
+    """Normals (count, 4 blocks) of `count` steps from step begin * count on."""
     steps = begin * count + np.arange(count)[:, None]
     return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(count, -1)
 
@@ -381,7 +381,7 @@ def derived_generator(seed: int | None, purpose: int, *numbers: int) -> np.rando
 
 
 def derived_seed(seed: int | None, purpose: int, *numbers: int) -> int:
-    """A whole number below 2^32 for what takes no generator; see `derived_sequence`."""
+    """A whole number below 2^32 for code that takes a seed and no generator; see `derived_sequence`."""
     return int(derived_sequence(seed, purpose, *numbers).generate_state(1)[0])
 
 

@@ -62,7 +62,7 @@ STRAIGHT = {"HORIZONTAL": "-", "LEFT": "-", "RIGHT": "-", "VERTICAL": "|"}  # en
 
 
 def adapt_standard_streams() -> None:
-    """Have standard output and error write what their encoding lacks in other characters."""
+    """Make standard output and error replace the characters that their encoding lacks."""
     codecs.register_error(HANDLER, _replace)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -70,7 +70,7 @@ def adapt_standard_streams() -> None:
 
 
 def showable(text: str, encoding: str) -> str:
-    """Text in characters of an encoding, for what is laid out in columns before it is written."""
+    """Text in the characters of an encoding, so that columns keep their widths when it is written."""
     if encoding.startswith("utf"):
         return text
     codecs.register_error(HANDLER, _replace)
@@ -78,7 +78,7 @@ def showable(text: str, encoding: str) -> str:
 
 
 def verbatim(text: str, most: int | None = None) -> str:
-    """Text of a user's for a figure: dollars begin no formula, and the middle of a long one is left out."""
+    """A user's text for a figure: dollars are escaped, and the middle of a long text is left out."""
     if most is not None and len(text) > most:
         text = f"{text[: most // 2]}...{text[-(most // 2) :]}"
     return "".join(character if character.isprintable() else "?" for character in text).replace("$", r"\$")
@@ -110,7 +110,7 @@ console = Console(markup=False, highlight=False)
 
 
 class WholeTable(Table):
-    """A table whose title and caption are as wide as the terminal, and not broken where the table ends."""
+    """A table whose title and caption use the width of the terminal rather than that of the table."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The title, the table, the caption."""
@@ -190,7 +190,7 @@ def _longest_word(cell: str) -> int:
 
 
 def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str:
-    """What the terminal would show of tables and lines, without colours; also one of another width."""
+    """Tables and lines as the terminal shows them, without colours; another width may be given."""
     stream = StringIO()
     plain = Console(
         file=stream,

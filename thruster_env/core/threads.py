@@ -93,26 +93,26 @@ def waiting(policy: str) -> Iterator[None]:
 
 
 LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
-CALL = 0  # place of the current call's number
+CALL = 0  # index of the current call's number
 OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
 SPINS = 64  # at a number between two moments in which another thread may have the core
 SPIN_ROUNDS = 1000  # such moments in a wait for the next call, of about half a microsecond each
 
 
 def new_flags(count: int) -> np.ndarray:
-    """Zeros, a line for each of some places."""
+    """Zeros: a cache line for each of `count` flags."""
     return np.zeros(LINE * count, np.int64)
 
 
 @overloaded
 def read(flags, index):
-    """Read one flag (acquire): whatever its writer wrote before is then visible."""
+    """Read one flag (acquire): everything its writer wrote before is then visible."""
     return flags[index]
 
 
 @overloaded
 def post(flags, index, value):
-    """Write one flag (release): whoever reads it sees all that was written before."""
+    """Write one flag (release): a thread that reads it sees everything written before."""
     flags[index] = value
 
 
@@ -152,7 +152,7 @@ def spin_for_call(flags, call, rounds):
 
 @cache
 def teach_numba() -> None:
-    """Have numba compile `read`, `post`, `take` and `yield_core` to what the processor has for it."""
+    """Register numba's compilation of `read`, `post`, `take` and `yield_core` to atomic instructions."""
     from numba import extending, types
     from numba.extending import overload
 

@@ -1,4 +1,4 @@
-"""A user's functions: which ones a function calls, what their code says, and copies that find other names.
+"""A user's functions: the functions they call, properties of their code, and copies with other names bound.
 
 Code is read where a call would not tell: whether a function catches exceptions, which machine code does not raise,
 or asks whether a comparison `is True`, which holds for Python's truth values alone.
@@ -156,7 +156,7 @@ def _is_empty(cell: types.CellType) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
-    """Parts (first, end) of some code whose exceptions an `except` catches; what cleans up alone does not."""
+    """Parts (first, end) of code whose exceptions an `except` catches, without mere clean-up."""
     listed = dis.Bytecode(code)
     instructions = list(listed)
     index_at = {instruction.offset: i for i, instruction in enumerate(instructions)}
@@ -195,13 +195,13 @@ def _asks_for_truth(code: types.CodeType) -> bool:
 
 
 def inverts(code: types.CodeType) -> bool:
-    """Whether some code has a `~`, which means "not" to NumPy's truth values and machine code alone."""
+    """Whether code has a `~`, which means "not" only for NumPy's truth values and in machine code."""
     names = (instruction.opname for instruction in dis.get_instructions(code))
     return "UNARY_INVERT" in names or any(map(inverts, _codes_within(code)))
 
 
 def takes_roots(code: types.CodeType) -> bool:
-    """Whether some code has powers other than those of whole numbers, which Python's floats may have complex."""
+    """Whether code has powers other than those of whole numbers: with Python's floats they may be complex."""
     pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
     powers = (type(before.argval) is not int for before, after in pairs if after.argrepr in ("**", "**="))
     return any(powers) or "pow" in code.co_names or any(map(takes_roots, _codes_within(code)))
@@ -212,7 +212,7 @@ def _codes_within(code: types.CodeType) -> list[types.CodeType]:
 
 
 def needs_python(*functions: Any) -> str | None:
-    """Why only Python can say what functions compute, as they catch exceptions; else None."""
+    """Why functions must run as Python: they catch exceptions; else None."""
     for function in functions_in(*functions):
         if catches_exceptions(function.__code__):
             return f"{function.__name__} catches exceptions, and arithmetic raises some in Python alone"
@@ -228,7 +228,7 @@ def needs_floats(*functions: Any) -> str | None:
 
 
 class Module:
-    """A module of which a function's copy finds other functions under some names."""
+    """A module in which a function's copy finds other functions under some names."""
 
     def __init__(self, module: types.ModuleType, in_place_of: Callable[[types.ModuleType, str], Any]):
         """Take the module, and what is found in it under a name."""
@@ -239,7 +239,7 @@ class Module:
 
 
 class _Silent:
-    """In place of a logger or a module: whatever is called of it does nothing."""
+    """A stand-in for a logger or a module whose functions do nothing."""
 
     def __getattr__(self, name: str):
         return self
@@ -265,7 +265,7 @@ class Copies:
         self._copies: dict[int, types.FunctionType] = {}
 
     def of(self, value: Any) -> Any:
-        """The copy of a function; of another value what a copy shall find in its place."""
+        """The copy of a function; for another value its replacement in copies."""
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
         if isinstance(value, types.ModuleType) and value in MODULES:
             return Module(value, self._in_place_of)
@@ -282,7 +282,7 @@ class Copies:
         return self._of_function(value) if isinstance(value, types.FunctionType) else value
 
     def called(self, value: Any) -> Callable:
-        """The copy of a function, or of what an object does when it is called."""
+        """The copy of a function, or of an object's `__call__`."""
         value = stands_for(value)
         by_class = inspect.getattr_static(type(value), "__call__", None)
         is_object = isinstance(by_class, types.FunctionType) and _top(value) not in LIBRARIES.union(OURS)
@@ -308,7 +308,7 @@ _stand_ins: weakref.WeakKeyDictionary[Callable, Callable] = weakref.WeakKeyDicti
 
 
 def stand_in(other: Callable, function: Callable) -> Callable:
-    """Have one function stand for another, in whose place a filter calls it; return it."""
+    """Register a function that filters call in place of another; return it."""
     _stand_ins[other] = function
     return other
 
@@ -341,7 +341,7 @@ def remember(function: Callable, recipe: Made) -> None:
 
 
 def as_made(value: Any) -> Any:
-    """What pickle can hold in place of a function that was written out; other values as they are."""
+    """The picklable recipe of a generated function; other values as they are."""
     try:
         recipe = _MADE.get(value)
     except TypeError:  # nothing that a weak reference or a hash can be had of
