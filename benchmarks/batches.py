@@ -1,4 +1,4 @@
-"""Whole evaluations on all cores, per member and step, beside the arithmetic that nobody can do without."""
+"""Whole evaluations on all cores, per member and step, beside the least arithmetic that they need."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _sum(*measures: Measure) -> Measure:
 
 
 def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
-    """Measures, by name, of what each member and step needs at least: its motion, and its noise.
+    """Measures, by name, of the least work of each member and step: its motion and its noise.
 
     As many members and steps as in the evaluation, spread over the cores in the same way, but with no
     moments, no gain, nothing stored and no member that is only there to fill a register.

@@ -1,4 +1,4 @@
-"""How many operations a computation needs: its very source is run on numbers that remember where they come from.
+"""Counts of operations: a computation's source is run on numbers that record their operands.
 
 Each number knows the operation and the operands that it was made of. Counted are those operations on which a
 result depends, each once, however often the source writes it: what a compiler drops, or finds twice, is no work.
@@ -36,7 +36,7 @@ POWERS = {0.5: ROOT, -0.5: RECIPROCAL_ROOT, 2: MULTIPLY}
 
 
 class Counted(NDArrayOperatorsMixin):
-    """A number, and the operation that it is the result of."""
+    """A number and the operation that computed it."""
 
     __slots__ = ("graph", "kind", "operands", "value")
 
@@ -55,7 +55,7 @@ class Counted(NDArrayOperatorsMixin):
         return self.graph.number(name, inputs, value, _kind(name, inputs, value))
 
     def __float__(self) -> float:
-        """For functions of the mathematical library, whose result is then taken for a constant."""
+        """For functions of the mathematical library; their result counts as a constant."""
         self.graph.results.append(self)
         return float(self.value)
 
@@ -93,7 +93,7 @@ class Graph:
         self.results: list[Counted] = []
 
     def variables(self, array: np.ndarray) -> np.ndarray:
-        """An array of numbers that are given, and not known before."""
+        """An array as variables: numbers that are inputs, not constants."""
         out = array.astype(object)
         for index, value in np.ndenumerate(array):
             out[index] = Counted(self, value, None, ())
@@ -101,7 +101,7 @@ class Graph:
         return out
 
     def number(self, name: str, inputs: tuple, value, kind: str | None) -> Counted:
-        """The number that an operation makes; that of the same operation on the same operands is the same."""
+        """The result of an operation; the same operation on the same operands gives the same object."""
         names = [id(x) if isinstance(x, Counted) else (x,) for x in inputs]
         key = (name, *(sorted(names, key=str) if name in COMMUTATIVE else names))
         if key not in self._known:

@@ -37,7 +37,7 @@ class Row(NamedTuple):
 
     @property
     def limits(self) -> str:
-        """The multiple of the limit as text; a limit that is passed is flagged, for it is none."""
+        """The multiple of the limit as text; a time below the limit is flagged, as the limit is then wrong."""
         if self.of_limit is None:
             return "-"
         return rounded(self.of_limit, 2) + (" passed" if self.of_limit < 1 else "")
@@ -107,7 +107,7 @@ def readable(seconds: float) -> str:
 
 
 def machine() -> dict[str, str | int | bool]:
-    """What the times depend on beside the code."""
+    """Processor, cores and versions, on which the times depend beside the code."""
     from llvmlite import binding  # comes with numba
 
     return {
@@ -132,7 +132,7 @@ def _cpu() -> str:
 
 
 def machine_name(facts: dict) -> str:
-    """Processor and cores: what tells machines apart."""
+    """Processor and cores, which identify a machine."""
     return f"{facts['cpu']}, {facts['cores']} cores"
 
 

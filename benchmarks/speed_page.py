@@ -27,7 +27,7 @@ def check_page(path: Path) -> None:
 
 
 def write_page(path: Path, rows: Sequence[Row], facts: dict, memory: Sequence[str]) -> None:
-    """Write the section of this machine anew, or behind those of the others; theirs stay."""
+    """Replace this machine's section or append it; those of other machines stay."""
     page, name = path.read_text(), f"speed: {machine_name(facts)}"
     mark = f"<!-- table {name} -->"
     if mark not in page:
@@ -37,13 +37,13 @@ def write_page(path: Path, rows: Sequence[Row], facts: dict, memory: Sequence[st
 
 
 def machine_section(rows: Sequence[Row], facts: dict, memory: Sequence[str]) -> str:
-    """The machine's name as a heading, its table, and what else there is to say of it."""
+    """The machine's name as a heading, its table and its other facts."""
     lines = " ".join([*machine_lines(facts), *memory])
     return f"\n## On {machine_name(facts)}\n\n{speed_table(rows)}\n\n{lines}\n"
 
 
 def speed_table(rows: Sequence[Row]) -> str:
-    """All rows as a table in Markdown; what there is none of is left empty."""
+    """All rows as a table in Markdown, with empty cells for missing values."""
     lines = []
     for row in rows:
         _, *cells = row.cells()

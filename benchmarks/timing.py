@@ -1,4 +1,4 @@
-"""Timing two things side by side: in turns, so that both meet the same moods of the machine."""
+"""Timing two programs in turns, so that both meet the same load of the machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Timing(NamedTuple):
 
 @contextmanager
 def _no_collection():
-    """Hold the garbage collector, which would charge one contestant for what the other one left."""
+    """Suspend the garbage collector, which would charge one program for the garbage of the other."""
     was_on = gc.isenabled()
     gc.collect()
     gc.disable()

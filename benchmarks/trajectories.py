@@ -64,7 +64,7 @@ def estimates(filter_: Filter, data: Data) -> np.ndarray:
 
 
 def check_agreement(ours: np.ndarray, theirs: np.ndarray, states: np.ndarray) -> None:
-    """Raise ValueError unless two filters' estimates (B, K + 1, n) are as good: else their times tell nothing."""
+    """Raise ValueError unless two filters' estimates (B, K + 1, n) are equally accurate, so that times compare."""
     ratio = np.sqrt(np.mean((ours - states) ** 2, axis=(0, 1)) / np.mean((theirs - states) ** 2, axis=(0, 1)))
     if np.any(np.abs(ratio - 1.0) > AGREEMENT):
         raise ValueError(f"two ensemble filters must have the same RMSE within {AGREEMENT:.0%}, but got {ratio}")

@@ -1,4 +1,4 @@
-"""What vectors of 512 bits buy in code as it is made for an Intel server, of which LLVM makes 256 bits by itself.
+"""The gain of vectors of 512 bits in code for an Intel server, where LLVM prefers 256 bits.
 
 `python -m benchmarks.vector_width` prints a table in Markdown, that of docs/speed.md, in three minutes. Each width
 is measured in processes of its own, in turns. A processor of another maker runs Intel's code too, if it has

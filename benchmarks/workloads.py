@@ -1,4 +1,4 @@
-"""Operations of one step of an env, of a filter, of noise: what the arithmetic limits of the rows are made of."""
+"""Operations of one step of an env, of a filter and of noise, for the arithmetic limits of the rows."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ def normals(count: int) -> Counter[str]:
 
 
 def times(count: Counter[str], factor: float) -> Counter[str]:
-    """So many times the operations, or part of them."""
+    """The operations multiplied by a factor."""
     return Counter({kind: factor * number for kind, number in count.items()})

@@ -105,7 +105,7 @@ def filters_members() -> str:
 
 
 def filters_cures() -> str:
-    """What makes 50 members enough there."""
+    """Settings with which 50 members suffice there."""
     return of_rows(rows_of("auv:papers_20hz", [EKF, *CURES], RUNS))
 
 
@@ -122,7 +122,7 @@ def filters_drag() -> str:
 
 
 def filters_current() -> str:
-    """RMSE in a current, of a filter that does not know of it and of one with two states for it."""
+    """RMSE in a current, of a filter without the current and of one with two states for it."""
     symbols = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
     lines, units = [], {}
     for name in ("auv:current", "auv:estimated_current"):

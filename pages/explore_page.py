@@ -25,7 +25,7 @@ MOVED = 5.5  # R [N^2], where it stood at the 0.25 of the sensor's data sheet
 
 
 def screenshot(page: Page, url: str) -> bytes:
-    """What one sees after the start was held, R was raised and a study has run."""
+    """A screenshot of the page after the start was held, R was raised and a study has run."""
     page.set_default_timeout(PATIENCE)
     page.goto(url)
     page.wait_for_selector("#figures dd")

@@ -60,7 +60,7 @@ def kalman(path: Path) -> Path:
 
 
 def one_update(path: Path) -> Path:
-    """One update from where the thrust hardly depends on U_a: what each filter makes of it."""
+    """Each filter's update at a point where the thrust hardly depends on U_a."""
     motor, mean, deviation, z = 100.0, 0.3, 0.7, 3.0
     model = thruster_model(measurement_noise_cov=0.5).replace(
         prior_mean=[motor, mean], prior_cov=[1e-6, deviation**2]

@@ -32,7 +32,7 @@ def outliers(share: float) -> dict:
 
 
 def noisy(runs: Runs, stds: np.ndarray) -> Runs:
-    """Runs measured anew, with noise of given standard deviations (K + 1,) [N]."""
+    """Runs with new measurement noise of standard deviations (K + 1,) [N]."""
     thrust = thruster_model().output("T", runs.states)
     draws = np.random.default_rng(SEED).normal(size=thrust.shape)
     return runs._replace(measurements=(thrust + stds * draws)[..., None])

@@ -1,4 +1,4 @@
-"""Runs of the thruster for docs/filters.md, and what a filter makes of them; every seed is fixed."""
+"""Runs of the thruster for docs/filters.md and filters' errors on them, with fixed seeds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STYLES = {name: plot_style(name) for name in FILTERS} | {
 
 
 class Runs(NamedTuple):
-    """What B runs of K steps give a filter, and the truth."""
+    """Keys, inputs and measurements of B runs of K steps, and the true states."""
 
     keys: np.ndarray  # (B, 2), the filters'
     inputs: np.ndarray  # (B, K, 1) [V]
@@ -38,7 +38,7 @@ class Runs(NamedTuple):
 
     @property
     def given(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What `filters.run` takes."""
+        """The arguments of `filters.run`."""
         return self.keys, self.inputs, self.measurements
 
 

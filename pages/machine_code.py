@@ -2,7 +2,7 @@
 
     python -m pages.machine_code [FOLDER]
 
-What the page shows is made of the extended Kalman filter of a body that its drag slows down.
+The example is the extended Kalman filter of a body that its drag slows down.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def body() -> StateSpaceModel:
 
 
 def stages() -> tuple[list[Stage], Memory]:
-    """Of a step of its filter: advance, settle, update; and where numbers lie."""
+    """The stages of a step of its filter (propagate, add process noise, update), and the memory layout."""
     model = body()
     memory = Memory(model.shape, extended.ExtendedKalmanFilter.page)
     equations = Equations(model.functions, memory, constants_move=True, trace=True)
@@ -77,7 +77,7 @@ def page() -> str:
 
 
 def operation_lines(wanted: Sequence[Matrix], names: dict[Matrix, str]) -> list[str]:
-    """What operations some matrices are made of, a line each."""
+    """The operations that compute some matrices, a line each."""
     lines = []
     for matrix in in_order(wanted):
         if matrix in names:
@@ -92,7 +92,7 @@ def operation_lines(wanted: Sequence[Matrix], names: dict[Matrix, str]) -> list[
 
 
 def names_of(memory: Memory) -> dict[Matrix, str]:
-    """The matrices that are given, by the page's names."""
+    """The page's names of its input matrices."""
     names = {memory.x: "x", memory.P: "P", memory.u: "u", memory.z: "z", memory.Q: "Q", memory.R: "R"}
     names |= {memory.scales: "s", memory.constants: "c", memory.constants_slope: "dc", memory.size: "size"}
     return names | {slope: f"d{names[matrix]}" for matrix, slope in memory.moves.items()}
@@ -148,7 +148,7 @@ def particles() -> str:
 
 
 def loops() -> str:
-    """The loops of a deterministic ensemble's update, of what they do for each member."""
+    """The loops over members in a deterministic ensemble's update."""
     model, kind = body(), deterministic.DeterministicEnsembleKalmanFilter
     memory = MembersMemory(model.shape, kind.page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)

@@ -110,7 +110,7 @@ SUITES: dict[str, tuple[str, ...]] = {
 
 
 def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
-    """The channel that measures one state, or another one of it, by name."""
+    """The channel that measures one state, or a second channel of it with another name."""
     i = SYMBOLS.index(symbol)
     _, _, unit, angle = STATES[i]
     name = symbol if name is None else name
@@ -125,7 +125,7 @@ def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
 
 
 def unit_row(index: int, count: int) -> str:
-    """Source of a tuple of `count` zeros, with a one at a place."""
+    """Source of row `index` of the identity matrix of size `count`."""
     return tuple_of("1.0" if i == index else "0.0" for i in range(count))
 
 
@@ -144,7 +144,7 @@ MEASURED = {name: name.removesuffix("_gps") for name in CHANNELS}
 
 @cache
 def channels_of(names: tuple[str, ...], states: int) -> tuple[Channel, ...]:
-    """Channels by name, for a model of the first `states` states; ValueError if it lacks what one measures."""
+    """Channels by name for a model of the first `states` states; ValueError if it lacks a measured state."""
     known = SYMBOLS[:states]
     unknown = [name for name in names if MEASURED[name] not in known]
     if unknown:
@@ -164,5 +164,5 @@ def suite(name: str) -> dict[str, Instrument]:
 
 
 def default_instrument(channel: str) -> Instrument:
-    """The instrument that measures a channel unless a suite says another."""
+    """The instrument that measures a channel unless a suite has another."""
     return next(instrument for instrument in INSTRUMENTS.values() if channel in instrument.channels)

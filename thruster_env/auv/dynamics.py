@@ -235,7 +235,7 @@ def current_rates(x, u, c):
 def drifting_rates(x, u, c):
     """`current_rates` with the current as states: x = (nu, phi, theta, psi, x, y, z, north, east).
 
-    What changes the current [m/s] is process noise alone, and it has no component down.
+    Only process noise changes the current [m/s], which has no component down.
     """
     inputs = (u[0], u[1], u[2], u[3], x[12], x[13], 0.0)
     return (*current_rates(x, inputs, c), 0.0, 0.0)

@@ -112,5 +112,5 @@ class NearSurface(Effect):
         return [self.depth, context.valid_offset, context.depth_row]
 
     def rows(self, context: VehicleContext) -> int:
-        """The last measurement that was there."""
+        """The last measurement that was not missing."""
         return 1

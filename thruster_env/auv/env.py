@@ -51,7 +51,7 @@ class ModelledVehicle(ModelledEnv):
         return super().state_space_model(**{"attitude": attitude} | changes)
 
     def measured_inputs(self, model: StateSpaceModel) -> Split | None:
-        """Which channels are a model's inputs beside the action, by symbol; None where there are none."""
+        """The channels that are inputs of a model beside the action, by symbol; None if there are none."""
         return split(model, len(self.plant.inputs), self.plant.channels)
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
@@ -61,7 +61,7 @@ class ModelledVehicle(ModelledEnv):
         return check_same_plant(tuned_for, self.plant, file)
 
     def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
-        """The belief that a rendered vehicle shows beside the truth: the states it has, by their symbols."""
+        """The states of a belief that a rendered vehicle shows beside the truth, by their symbols."""
         from thruster_env.auv.rendering import Overlay
 
         names = {state.symbol: i for i, state in enumerate(model.states)}
@@ -83,7 +83,7 @@ class RenderedVehicle(RenderedEnv):
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
 
     def make_renderer(self) -> Renderer:
-        """What draws the vehicle on its way."""
+        """The renderer of the vehicle and its path."""
         assert self.render_mode is not None  # a renderer is made for a mode only
         return Renderer(
             self.render_mode,
@@ -96,7 +96,7 @@ class RenderedVehicle(RenderedEnv):
         )
 
     def moment_of(self, report: list[float]) -> Moment:
-        """What the renderer adds of a report: truth, measurements, the path abreast, and what acts."""
+        """The renderer's input from a report: truth, measurements, the path abreast and the actuators."""
         channels, state = self.plant.channels, report[at.STATE : at.STATE + at.N]
 
         def measured(symbol: str) -> float | None:

@@ -48,7 +48,7 @@ TILT = 1e-4  # rad
 
 
 def split_channels(channels: tuple[str, ...], states: str, attitude: str) -> tuple[list[int], list[int]]:
-    """Places of the channels that are inputs of a model, phi and theta, and of those that it measures.
+    """Indices of the channels that are inputs of a model, phi and theta, and of those that it measures.
 
     Raises ValueError if an attitude that is to be measured is not.
     """
@@ -77,7 +77,7 @@ def derivative_by_attitude(move: Callable, state: np.ndarray, inputs: list[float
 
 @dataclass(frozen=True)
 class Steps:
-    """How many states move, by which functions of the equations of motion."""
+    """The number of states of a model, and its functions among the equations of motion."""
 
     count: int
     methods: dict[str, tuple[Callable, Callable]]  # the step by each method of integration, and its Jacobian

@@ -110,7 +110,7 @@ class Path(NamedTuple):
         return np.vstack([self.starts, self.starts[-1] + self.lengths[-1] * self.directions[-1]])
 
     def piece(self, position: np.ndarray, piece: np.ndarray) -> np.ndarray:
-        """The piece (...) that positions (..., 3) have got to, from the one (...) that they were at.
+        """The piece (...) that positions (..., 3) have reached, from their last piece (...).
 
         It is the first whose end is not behind the position; progress is never lost, and no corner is cut.
         """
@@ -164,7 +164,7 @@ def make_path(path, depth: float = 0.0) -> Path:
 
 
 def by_arc_length(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Points of a polyline (K, 3) at equal distances along it, near to `spacing`, both ends included."""
+    """Points of a polyline (K, 3) at equal distances along it, close to `spacing`, both ends included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     distances = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))
     return np.stack([np.interp(distances, along, column) for column in points.T], axis=-1)

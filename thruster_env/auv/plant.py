@@ -195,7 +195,7 @@ def _sensors(sensors, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[st
 
 
 def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
-    """Effects for the rate of an instrument, as the nearest number of steps, and for where it works."""
+    """Effects for the rate of an instrument, in whole steps, and for the depth at which it works."""
     steps = 1 if instrument.rate is None else max(1, round(1.0 / (instrument.rate * dt)))
     return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
 
@@ -252,9 +252,9 @@ ENTRIES = Entries(
 
 
 def plant_data(plant: Plant) -> dict:
-    """What a filter's numbers depend on: the vehicle, its sample time, sensors, noise, current and lags.
+    """The data on which a filter's parameters depend: vehicle, sample time, sensors, noise, current and lags.
 
-    Initial state, task and seed are not among it.
+    Initial state, task and seed are not part of it.
     """
     named = [name for name, parameters in PRESETS.items() if parameters == plant.parameters]
     data = {

@@ -168,7 +168,7 @@ def encoded(
 
 
 def _representable(effect: Effect, parameters: list[float]) -> list[float]:
-    """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
+    """An effect's parameters as floats; ValueError if an argument or a parameter is too large or too small."""
     smallest, largest = MAGNITUDES
     parts: list[Any] = [*_numbers(dataclasses.astuple(effect)), 0.0]
     magnitudes = [abs(value) for value in np.hstack(parts) if value]
@@ -181,7 +181,7 @@ def _representable(effect: Effect, parameters: list[float]) -> list[float]:
 
 
 def _numbers(values: tuple) -> list:
-    """Those that are numbers, or tuples of numbers."""
+    """The values that are numbers or tuples of numbers."""
     return [value for value in values if isinstance(value, (int, float, tuple)) and value]
 
 
@@ -204,11 +204,11 @@ def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:
 def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
     """Return `run(memory, b, numbers, at, begin)`: run the effects that `effects.encoded` put at numbers[at].
 
-    It returns the place where they end.
+    It returns the offset behind them.
 
     Args:
         effects: the known types of effects, as `encoded` had them.
-        count: the place in numbers where their number stands.
+        count: the offset in numbers of the number of effects.
     """
     dispatch = _dispatch(effects)
 

@@ -1,6 +1,6 @@
 """Measurements that are missing: lost at random, or not taken at every step.
 
-A missing measurement repeats the last one that was there (0 before the first) and is marked as not valid.
+A missing measurement repeats the last valid one (0 before the first) and is marked as not valid.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LONGEST_INTERVAL = 1_000_000  # steps between two samples
 
 @inlined
 def hold_missing(memory, b, j, target, last, valid, missing, begin):
-    """Where copy j's measurement is missing repeat the last one, kept in row `last`, and mark it as not valid."""
+    """If copy j's measurement is missing, repeat the last one, stored in row `last`, and mark it as not valid."""
     if begin:
         memory[b, last, j] = 0.0
     if missing:
@@ -32,7 +32,7 @@ def hold_missing(memory, b, j, target, last, valid, missing, begin):
 
 @inlined
 def dropout(memory, b, target, rows, number, numbers, at, begin):
-    """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
+    """Lose measurements in runs (a two-state Markov chain); a lost one repeats the last and is not valid."""
     begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
     last, lost = rows, rows + 1
     for j in range(memory.shape[2]):
@@ -85,7 +85,7 @@ class Dropout(Effect):
         set_field(self, "mean_length", length)
 
     def parameters(self, context: Context) -> list[float]:
-        """Probabilities that a run of missing measurements begins, and that it ends; where validity stands."""
+        """Probabilities that a run of missing measurements begins and ends; offset of the validity flag."""
         assert self.mean_length is not None  # it is set when the effect is made
         begins = self.probability / (1.0 - self.probability) / self.mean_length
         return [begins, 1.0 / self.mean_length, context.valid_offset]
@@ -115,7 +115,7 @@ class SampleEvery(Effect):
         set_field(self, "first", at_least("first", self.first, 0, LONGEST_INTERVAL) % steps)
 
     def parameters(self, context: Context) -> list[float]:
-        """Steps between two samples, the first one's number, and where validity stands."""
+        """Steps between two samples, number of the first one, and offset of the validity flag."""
         return [self.steps, self.first, context.valid_offset]
 
     def rows(self, context: Context) -> int:
@@ -192,7 +192,7 @@ class RecordedSeries(Effect):
         return max(map(abs, self._series))
 
     def parameters(self, context: Context) -> list[float]:
-        """What `recorded_value` takes."""
+        """The parameters of `recorded_value`."""
         return [self.sample_time, float(self.repeat), float(len(self._series)), *self._series]
 
 

@@ -71,7 +71,7 @@ def saturation(memory, b, target, rows, number, numbers, at, begin):
 
 @inlined
 def delay(memory, b, target, rows, number, numbers, at, begin):
-    """Report what was measured some steps ago, in a ring of rows; before that, the first measurement."""
+    """Report the measurement of `steps` steps ago, from a ring of rows; at first the first measurement."""
     steps, valid = int(numbers[at]), target + int(numbers[at + 1])
     for j in range(memory.shape[2]):
         if begin:
@@ -203,7 +203,7 @@ class Delay(Effect):
         set_field(self, "steps", steps)
 
     def parameters(self, context: Context) -> list[float]:
-        """Steps, and where validity stands."""
+        """Steps, and offset of the validity flag."""
         return [self.steps, context.valid_offset]
 
     def rows(self, context: Context) -> int:

@@ -177,5 +177,5 @@ class RecordedSignal(RecordedSeries):
     act = staticmethod(recorded)
 
     def parameters(self, context: Context) -> list[float]:
-        """The plant's sample time [s], and what `recorded_value` takes."""
+        """The plant's sample time [s], and the parameters of `recorded_value`."""
         return [context.dt, *super().parameters(context)]

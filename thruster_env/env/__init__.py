@@ -1,1 +1,1 @@
-"""What an env is made of, for any plant: memory of copies, channels, reports; envs of any model and of logs."""
+"""Parts of any plant's env: memory of copies, channels, reports; envs of any model and of logs."""

@@ -74,7 +74,7 @@ def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: n
 
 
 def _rows(quantities: tuple[Quantity, ...]) -> str:
-    """What the actions of many copies are."""
+    """The words for one row of actions in messages."""
     if len(quantities) == 1:
         return f"{quantities[0].name}s [{quantities[0].unit}]"
     return f"rows of {len(quantities)} numbers ({_labels(quantities)})"

@@ -54,7 +54,7 @@ class PlantCopies:
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix, or None.
 
-        Raises ValueError for options that are not such.
+        Raises ValueError for other options.
         """
         raise NotImplementedError
 
@@ -69,7 +69,7 @@ class PlantCopies:
         return {key: value for key, value in vars(self).items() if key not in ("advance", "_advance_in_parts")}
 
     def __setstate__(self, state: dict) -> None:
-        """Find the machine code for the memory that was kept."""
+        """Find the machine code for the restored memory."""
         vars(self).update(state)
         self._find_machine_code()
 

@@ -91,7 +91,7 @@ class RenderedEnv(gym.Env):
             self._renderer = None
 
     def _show(self, report: list[float], *, begin: bool = False) -> None:
-        """Note what a reset (`begin`) or a step reported, and draw it in a window."""
+        """Add the report of a reset (`begin`) or a step to the renderer, and draw it in a window."""
         if self._renderer is None:
             self._renderer = self.make_renderer()
         if begin:
@@ -248,7 +248,7 @@ class PlantEnv(RenderedEnv):
         self._set_views()
 
     def _set_views(self) -> None:
-        """Short ways into the memory of the one copy, for a step has to be quick."""
+        """Views into the memory of the one copy, because a step has to be fast."""
         copies = self._copies
         self._advance: Callable = copies.advance
         self._memory = copies.memory
@@ -263,12 +263,12 @@ class PlantEnv(RenderedEnv):
         return {key: value for key, value in vars(self).items() if key not in VIEWS}
 
     def __setstate__(self, state: dict) -> None:
-        """Make the views on the memory that was kept."""
+        """Make the views on the restored memory."""
         vars(self).update(state)
         self._set_views()
 
     def __copy__(self) -> PlantEnv:
-        """A deep copy: two envs with one memory would move one another."""
+        """A deep copy, because envs that share a memory would step each other."""
         return copy.deepcopy(self)
 
     @property

@@ -81,7 +81,7 @@ def _words(value) -> str:
 
 
 def _alike(first, other) -> bool:
-    """Whether two values of JSON are the same but for rounding."""
+    """Whether two JSON values are equal up to rounding."""
     if isinstance(first, Mapping) and isinstance(other, Mapping):
         return first.keys() == other.keys() and all(_alike(first[key], other[key]) for key in first)
     if isinstance(first, list) and isinstance(other, list):

@@ -67,7 +67,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         self._done = np.zeros(self.num_envs, dtype=bool)
 
     def __copy__(self) -> PlantVectorEnv:
-        """A deep copy: two envs with one memory would move one another."""
+        """A deep copy, because envs that share a memory would step each other."""
         return copy.deepcopy(self)
 
     @property

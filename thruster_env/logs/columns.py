@@ -1,4 +1,4 @@
-"""Which column of a file is which quantity of a model: by its header, or as the caller says."""
+"""The column of a file for each quantity of a model, by its header or by the caller's choice."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 
 
 def parted(header: str) -> tuple[str, str | None]:
-    """The header of a column without its unit, and the unit, None where it gives none.
+    """The header of a column without its unit, and the unit, None if it has none.
 
     Units stand in brackets ("speed [rad/s]"), or at the end as `thruster simulate` writes them
     ("omega_m_rad_per_s", also "omega_m_rad_s"); these are of WORDS.
@@ -160,7 +160,7 @@ def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
 
 
 def _example(wanted: str) -> str:
-    """How a unit is named."""
+    """An option that names a unit."""
     return f"--column NAME=HEADER[{wanted or 'UNIT'}]"
 
 
@@ -229,7 +229,7 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
 
 
 def _unit(header: str, units: Mapping[str, str]) -> str | None:
-    """The unit that is said of a header, else that in it; None where it is said that there is none."""
+    """The unit set for a header, else the one in the header; None if it is set to none."""
     return units[header] or None if header in units else parted(header)[1]
 
 
@@ -306,7 +306,7 @@ def _check_found(
 
 
 def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
-    """Add the columns whose headers tell what they are."""
+    """Add the columns whose headers name a quantity."""
     used = {column.header for column in columns.values()}
     left = [header for header in headers if header not in used]
     bare = {header: parted(header) for header in left}

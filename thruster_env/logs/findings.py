@@ -99,7 +99,7 @@ def found_in(log: Log) -> tuple[Finding, ...]:
 
 
 def sentences(findings: Sequence[Finding]) -> list[str]:
-    """The findings in words; of many of one kind and channel how many there are, and the longest."""
+    """The findings as sentences; for many of one kind and channel the longest, and their number."""
     texts: list[str] = []
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
@@ -115,9 +115,9 @@ def sentences(findings: Sequence[Finding]) -> list[str]:
 
 
 def remarks_on(logs: Sequence[Log]) -> list[str]:
-    """The findings in some logs in words; of pieces those in the whole log.
+    """The findings in logs as sentences; for a piece those in the log it was cut from.
 
-    Each begins with the name of its log; what several logs have in common is one sentence, on the longest.
+    Each begins with the name of its log; findings of one kind in several logs are one sentence, on the longest.
     """
     uncut = {log.name: log for log in (log.whole or log for log in logs)}
     groups: dict[tuple[str, str], dict[str, list[Finding]]] = {}
@@ -139,7 +139,7 @@ def remarks_on(logs: Sequence[Log]) -> list[str]:
 
 
 def has_outliers(logs: Sequence[Log]) -> bool:
-    """Whether there are outliers in any of some logs."""
+    """Whether any of the logs has outliers."""
     return any(finding.kind == OUTLIER for log in logs for finding in (log.whole or log).findings)
 
 
@@ -206,20 +206,20 @@ def outliers(log: Log, channel: str) -> np.ndarray:
 
 
 def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
-    """First sample and length of each stretch of equal samples."""
+    """First sample and length of each run of equal samples."""
     starts = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return list(zip(starts.tolist(), np.diff(np.append(starts, len(values))).tolist(), strict=True))
 
 
 def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: int) -> bool:
-    """Whether a stretch of equal samples is explained by how common equal neighbours are otherwise.
+    """Whether a run of equal samples is explained by the frequency of equal neighbours elsewhere.
 
     Args:
         values: of the channel.
-        first: place where the stretch begins.
+        first: index of the first sample of the run.
         count: its length.
-        equal: neighbours that are equal, without those in the stretch.
-        pairs: neighbours, without those in the stretch.
+        equal: number of equal neighbours outside the run.
+        pairs: number of neighbours outside the run.
     """
     share = (equal + 1) / (pairs + 2)
     here = np.flatnonzero(values[:-1] == values[first])
@@ -245,7 +245,7 @@ def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int,
 def _saturated(
     log: Log, channel: str, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]
 ) -> tuple[list[Finding], list[float]]:
-    """Findings, and the values at which the channel ends."""
+    """Findings of saturation, and the values at which the channel saturates."""
     levels, counts = np.unique(values, return_counts=True)
     findings: list[Finding] = []
     ends: list[float] = []
@@ -268,7 +268,7 @@ def _saturated(
 
 
 def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
-    """Places of samples that stand out from both neighbours."""
+    """Indices of samples that stand out from both neighbours."""
     steps = difference(values[1:, None], values[:-1, None], (angle,))[:, 0]
     sizes = abs(steps[steps != 0])
     if len(sizes) < SHORTEST:

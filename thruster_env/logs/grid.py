@@ -96,7 +96,7 @@ def grid_of(stamps: np.ndarray, dt: float | None = None, clock: np.ndarray | Non
 
 
 def _usual(since: np.ndarray) -> float:
-    """About the sample time: the median interval, of stamps 1, 2, 4, ... apart, for jitter counts less there."""
+    """The approximate sample time: the median interval of stamps 1, 2, 4, ... apart, less affected by jitter."""
     usual, lag = float(np.median(np.diff(since))), 2
     while lag <= len(since) // 4:
         apart = since[lag:] - since[:-lag]
@@ -106,12 +106,12 @@ def _usual(since: np.ndarray) -> float:
 
 
 def _pieces(since: np.ndarray, dt: float) -> list[np.ndarray]:
-    """Places of the stamps between pauses."""
+    """Indices of the stamps between pauses."""
     return np.split(np.arange(len(since)), np.flatnonzero(np.diff(since) > (MOST_HELD + 1.5) * dt) + 1)
 
 
 def _slope(since: np.ndarray, pieces: list[np.ndarray], dt: float) -> tuple[float, float]:
-    """The sample time by least squares with a beginning for each piece, and its standard error."""
+    """The sample time by least squares with a phase for each piece, and its standard error."""
     products = squares = errors = 0.0
     centred = []
     for piece in pieces:
@@ -190,7 +190,7 @@ def mean_held(series: Series, dt: float, steps: int, offset: float = 0.0, angle:
 
 
 def _lies_on_grid(times: np.ndarray) -> bool:
-    """Whether times in steps are whole numbers but for rounding."""
+    """Whether times in steps are whole numbers up to rounding."""
     return bool((abs(times - np.round(times)) <= CLOSE * np.maximum(1.0, abs(times))).all())
 
 
@@ -280,7 +280,7 @@ def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
 
 
 def date_of(text: str) -> datetime | None:
-    """The date that a text is as of ISO 8601, None for other text."""
+    """The date of a text in ISO 8601, None for other text."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:

@@ -103,12 +103,12 @@ class Log:
 
     @property
     def resolution(self) -> float:
-        """How exact the stamps of the file are [s], as float64 has them."""
+        """The resolution of the file's stamps in float64 [s]."""
         return resolution_of(abs(self.start) + float(self.times[-1]))
 
     @property
     def pieces(self) -> tuple[tuple[int, int], ...]:
-        """First row and number of rows of what lies between gaps; one piece where there is none."""
+        """First row and number of rows of each piece between gaps; one piece if there is no gap."""
         ends = [(first, first + count) for first, count in self.recording.gaps]
         starts = [0, *(end for _, end in ends)]
         lasts = [*(first for first, _ in ends), self.steps + 1]
@@ -209,7 +209,7 @@ def at_offset(log: Log, channel: str, seconds: float) -> Log:
 
 
 def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
-    """The pieces of a log between its gaps that have so many rows, each a log; the log itself without gaps."""
+    """The pieces of a log between gaps with at least `shortest` rows, each a log; the log itself without gaps."""
     long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
     return [log] if len(log.pieces) == 1 else [_piece(log, first, rows) for first, rows in long]
 
@@ -293,7 +293,7 @@ FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, of the hash of a window
 
 
 def shared_by(first: Sequence[Log], second: Sequence[Log]) -> tuple[Log, Log] | None:
-    """The first pair of logs, one of each kind, with the same rows in a row; None where there is none.
+    """The first pair of logs, one from each group, that share consecutive rows; None if there is none.
 
     Rows with measurements are compared by inputs and measurements, independent of their times and the logs' names.
     Rows in which no measurement changes, as at rest, are ignored, except in identical logs.
@@ -327,7 +327,7 @@ def _measured_rows(log: Log) -> np.ndarray:
 
 
 def _hashes(numbers: np.ndarray, measured: np.ndarray, width: int) -> np.ndarray:
-    """A hash of each stretch of `width` rows in which measurements change at least every other row."""
+    """A hash of each window of `width` rows in which measurements change at least every other row."""
     count = len(numbers) - width + 1
     if count < 1:
         return np.empty(0, np.uint64)

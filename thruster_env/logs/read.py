@@ -204,12 +204,12 @@ def read_log(
 
 
 def _as_recorded(of_file: Grid) -> Recording:
-    """What became of a file's rows without a grid: at most of two with one stamp the last one counts."""
+    """The recording of a file's rows without a grid: of two rows with one stamp the last counts."""
     return Recording(doubled=int((np.diff(of_file.times) == 0).sum()))
 
 
 def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...]) -> Recording:
-    """What became of a file's rows, of which some hold samples (rows,)."""
+    """Count the gaps and holes between rows with samples (rows,), the shifts onto the grid and dropped samples."""
     numbers = np.unique(np.floor(grid.times[rows] / grid.dt + 0.5).astype(int))
     apart = np.diff(numbers)
     usual = max(float(np.median(apart)), 1.0) if len(apart) else 1.0
@@ -223,7 +223,7 @@ def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...
 
 
 def _described(path: Path) -> Description:
-    """What the TOML file beside a log says, nothing if there is none."""
+    """The description in the TOML file beside a log, empty if there is none."""
     description = path.with_suffix(".toml")
     if not description.is_file():
         return Description()
@@ -244,7 +244,7 @@ def _described(path: Path) -> Description:
 
 
 def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid: bool) -> tuple[Grid, float, str]:
-    """The grid of a file's rows, or its sample time with their own times; the first stamp [s]; how it was read."""
+    """The grid of a file's rows, or its sample time and their own times; the first stamp [s]; the assumed unit."""
     count = len(table.lines)
     if dt is not None:
         dt = positive("dt", dt)
@@ -311,7 +311,7 @@ def _offsets(
 
 
 def _series(table: Table, column: Column, wanted: Wanted, grid: Grid) -> tuple[Series, np.ndarray]:
-    """The samples of a column in the model's unit, and in which rows they are.
+    """The samples of a column in the model's unit, and the mask of their rows.
 
     Raises:
         ValueError: for a late input, or a sensor that never changes.

@@ -1,4 +1,4 @@
-"""Models of steps of any length: how long a step is, is one more input.
+"""Models of steps of any length: the length of a step is one more input.
 
     x_{k+1} = f(x_k, u_k, r_k dt) + w_k,  w_k ~ N(0, r_k Q);   r_k dt is the length of step k
 
@@ -44,7 +44,7 @@ class AnyStepModel(StateSpaceModel):
 
     @property
     def shape(self) -> Shape:
-        """Sizes, and that pages multiply Q by the last input."""
+        """Sizes, with the flag that pages multiply Q by the last input."""
         return super().shape._replace(step_ratio=True)
 
 
@@ -88,7 +88,7 @@ def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
 
 @makes_functions
 def with_ratio(function: Callable, form: type, count: int, index: int, inputs: int) -> Callable:
-    """`function(x, u, c)` with the constant at a place times u[inputs], of the other inputs."""
+    """`function(x, u, c)` with constant `index` multiplied by the last input, u[inputs]."""
     constants = (f"c[{i}] * u[{inputs}]" if i == index else f"c[{i}]" for i in range(count))
     names: dict[str, Any] = {"function": inlined(function), "form": form}
     return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
@@ -118,7 +118,7 @@ def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sample_time_place(model: StateSpaceModel, what: str) -> tuple[int, int]:
-    """Where the constant lies that says the sample time, and how many of it are a step.
+    """Index of the constant that is the sample time, and the number of substeps in a step.
 
     Args:
         model: any.

@@ -27,7 +27,7 @@ SIGMAS = 2  # half the width of a band, in standard deviations
 class Canvas:
     """A picture laid out on 640 x 400 pixels; points are (x, y) in these, y downward, fractions allowed.
 
-    Of another size it is the same picture, enlarged or made smaller as far as it fits, in the middle.
+    At another size the picture is scaled to fit and centred.
     """
 
     def __init__(self, size: tuple[int, int] = SIZE):

@@ -54,7 +54,7 @@ class Axis(NamedTuple):
 
 
 def fitting_axis(values: np.ndarray, scale: float, top: float, height: float) -> Axis:
-    """An axis with all values that are numbers on it, from LEAST to MOST of full scale."""
+    """An axis that contains all finite values, from LEAST to MOST of full scale."""
     values = np.clip(values[np.isfinite(values)], -MOST * scale, MOST * scale)
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     least = LEAST * scale if max(-low, high) < LEAST * scale else 0.0
@@ -107,7 +107,7 @@ class History:
         self.count += 1
 
     def amend(self, overlay: tuple) -> None:
-        """Note what a filter believes of the moment added last."""
+        """Add a filter's estimate to the newest moment."""
         self.label = overlay[0]
         self._rows[(self.count - 1) % STEPS, self._of_moment :] = overlay[1:]
 
@@ -119,7 +119,7 @@ class History:
 
 
 def newest(columns: dict[str, np.ndarray], name: str) -> float:
-    """The newest value of a column; that of the step before if a filter has not got to the last step yet."""
+    """The newest value of a column; the previous one if a filter has not processed the last step yet."""
     last = columns[name][-2:]
     known = last[np.isfinite(last)]
     return float(known[-1]) if len(known) else math.nan
@@ -247,6 +247,6 @@ class Charts:
 
 
 def _runs(drawn: np.ndarray) -> Iterator[slice]:
-    """Stretches of a boolean array that are true."""
+    """Slices of a boolean array that are true."""
     edges = np.flatnonzero(np.diff(np.concatenate(((False,), drawn, (False,)))))
     return (slice(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True))

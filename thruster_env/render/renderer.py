@@ -81,7 +81,7 @@ class PlantRenderer:
         raise NotImplementedError
 
     def __getstate__(self) -> tuple[dict, dict]:
-        """Its arguments and what it remembers; pygame's surfaces cannot be copied."""
+        """Its arguments and history; pygame's surfaces cannot be copied."""
         return self._made_with, {name: getattr(self, name) for name in ("_history", *self.remembered)}
 
     def __setstate__(self, state: tuple[dict, dict]) -> None:
@@ -91,7 +91,7 @@ class PlantRenderer:
         vars(self).update(remembered)
 
     def begin(self) -> None:
-        """Start an episode: nothing is remembered."""
+        """Start an episode with an empty history."""
         self._history.clear()
 
     def add(self, moment: Any, overlay: Any = None) -> None:
@@ -100,7 +100,7 @@ class PlantRenderer:
         self.amend(overlay)
 
     def amend(self, overlay: tuple | None) -> None:
-        """Add what a filter believes of the moment noted last."""
+        """Add a filter's estimate to the newest moment."""
         if overlay is not None and self._history.count:
             self._history.amend(overlay)
 

@@ -1,4 +1,4 @@
-"""Plant and task as one row of numbers, the form that compiled steps read; places are in `memory`."""
+"""Plant and task as one row of numbers, the form that compiled steps read; offsets are in `memory`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
     Args:
         size: number of rows.
         first: the first of them.
-        root: the place of the lower triangular L (size, size) in numbers, by rows.
+        root: the offset of the lower triangular L (size, size) in numbers, by rows.
         stream: the purpose of the noise, from `thruster_env.core.streams`.
     """
     of_copy = "memory[b, KEY_0, j], memory[b, KEY_1, j]"
@@ -126,7 +126,7 @@ _SPACING = 64  # effects of each list have numbers of their own, whatever the ot
 
 
 def known_effects() -> tuple[tuple[type[Effect], ...], ...]:
-    """Effects, a tuple for each registry, that compiled code has to know."""
+    """Tuples of effects, one for each registry, that compiled code supports."""
     return tuple(tuple(registry.effects.values()) for registry in REGISTRIES)
 
 

@@ -57,14 +57,14 @@ LARGEST_ERROR = 1e6  # [m], [m/s]: a reward stays finite when a state does not
 
 @inlined
 def _measured(memory, b, j, numbers, i):
-    """What copy j measures of state i; 0 if it has no channel for it."""
+    """Copy j's measurement of state i; 0 if no channel measures it."""
     row = int(numbers[MEASURED_IN + i])
     return memory[b, row, j] if row > 0 else 0.0
 
 
 @inlined
 def reckon(memory, b, numbers, begin):
-    """Where each copy takes itself to be, from its measurements; speeds are averaged over the step."""
+    """Each copy's dead-reckoned position from its measurements; speeds are averaged over the step."""
     half = 0.5 * numbers[SAMPLE_TIME]
     has_yaw, has_depth = numbers[MEASURED_IN + PSI] > 0.0, numbers[MEASURED_IN + Z] > 0.0
     for j in range(memory.shape[2]):
@@ -136,7 +136,7 @@ def _off_path(numbers, piece, x, y, z):
 
 @inlined
 def find_true_errors(memory, b, numbers, begin):
-    """How far each copy is off the path, as it is."""
+    """Each copy's true distance from the path."""
     for j in range(memory.shape[2]):
         x, y, z = memory[b, STATE + X, j], memory[b, STATE + Y, j], memory[b, STATE + Z, j] - memory[b, OFFSET, j]
         piece = _piece(numbers, 0 if begin else int(memory[b, PIECE, j]), x, y, z)
@@ -146,7 +146,7 @@ def find_true_errors(memory, b, numbers, begin):
 
 @inlined
 def find_errors(memory, b, numbers, begin):
-    """How far each copy takes itself to be off the path and its speed, in the next step."""
+    """Each copy's errors of path and speed by dead reckoning, for the next step."""
     has_speed = numbers[MEASURED_IN + U] > 0.0
     for j in range(memory.shape[2]):
         x, y, z = memory[b, RECKONED, j], memory[b, RECKONED + 1, j], memory[b, RECKONED + 2, j]

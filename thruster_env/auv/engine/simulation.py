@@ -112,7 +112,7 @@ def take_commands(memory, b, numbers):
     """Clip the commands to the action space, and let the propeller and the planes follow them."""
     top, torque, plane, ratio = numbers[MAX_THRUST], numbers[MAX_TORQUE], numbers[MAX_PLANE], numbers[TORQUE_RATIO]
     of_propeller, of_planes = numbers[PROPELLER_DECAY], numbers[PLANE_DECAY]
-    has_torque = numbers[INPUT_COUNT] > 3.0  # of the torque
+    has_torque = numbers[INPUT_COUNT] > 3.0  # the torque is an input of its own
     stern = COMMAND + (2 if has_torque else 1)
     for j in range(memory.shape[2]):
         thrust = min(max(memory[b, COMMAND, j], 0.0), top)

@@ -33,7 +33,7 @@ class Moment(NamedTuple):
 
 
 class Overlay(NamedTuple):
-    """What a filter believes of a moment; None where it believes nothing."""
+    """A filter's estimate of a moment; None for states that it does not estimate."""
 
     label: str  # name of the filter in the legend
     x: float | None = None  # [m]
@@ -122,5 +122,5 @@ class Renderer(PlantRenderer):
 
 
 def _named(name: str) -> tuple[str, str]:
-    """Columns of what is measured of a quantity, and of its reference."""
+    """Columns of a quantity's measurement and reference."""
     return f"measured_{name}", f"reference_{name}"

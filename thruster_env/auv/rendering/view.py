@@ -94,7 +94,7 @@ class View:
         self._middle = np.array([WIDTH, HEIGHT]) / 2 - self._scale * (low + high) / 2
 
     def _at(self, points: np.ndarray) -> np.ndarray:
-        """Where points (..., 3) are in the picture, (..., 2) [px]."""
+        """Points (..., 3) projected into the picture, (..., 2) [px]."""
         return np.asarray(points) @ PROJECTION * self._scale + self._middle
 
     def _on_bottom(self, points: np.ndarray, floor: float) -> np.ndarray:
@@ -112,7 +112,7 @@ class View:
         canvas.text(f"grid {number(step, 0 if step >= 1 else 1)} m", (WIDTH - 8, HEIGHT - 10), 10, SOFT_INK, 1.0)
 
     def _draw_band(self, columns: dict[str, np.ndarray], position: np.ndarray) -> None:
-        """The ellipse of two standard deviations of the position, taken as independent of one another."""
+        """The ellipse of two standard deviations of the position, with independent components."""
         mean = np.array([newest(columns, f"estimated_{name}") for name in ("x", "y", "depth")])
         std = np.array([newest(columns, f"estimated_{name}_std") for name in ("x", "y", "depth")])
         if not np.isfinite(mean + std).all():
@@ -175,7 +175,7 @@ def _points(columns: dict[str, np.ndarray], prefix: str) -> np.ndarray:
 
 
 def _part_in_view(path: np.ndarray, visited: np.ndarray) -> np.ndarray:
-    """A path's points; of a single straight line those from where the vehicle was to some way ahead of it."""
+    """A path's points; of a single straight line a part from the vehicle's trail to some way ahead."""
     if len(path) > 2:
         return path
     piece = path[1] - path[0]
@@ -185,7 +185,7 @@ def _part_in_view(path: np.ndarray, visited: np.ndarray) -> np.ndarray:
 
 
 def _runs(points: np.ndarray) -> list[np.ndarray]:
-    """Stretches of points (K, 3) that are all numbers."""
+    """Runs of points (K, 3) without NaN."""
     present = np.isfinite(points).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate(((False,), present, (False,)))))
     return [points[start:stop] for start, stop in zip(edges[::2], edges[1::2], strict=True)]
@@ -290,7 +290,7 @@ class Gauges:
             canvas.box(middle - 7, TOP - 2, 14, GAUGE_HEIGHT + 4, (196, 206, 214), 3, 1)
 
     def draw(self, moment: Moment) -> None:
-        """Draw what acts at a moment."""
+        """Draw thrust and planes at a moment."""
         values = {THRUST: moment.thrust, STERN: math.degrees(moment.stern), RUDDER: math.degrees(moment.rudder)}
         for (x, axis), title in zip(self._axes.items(), ("thrust", "stern", "rudder"), strict=True):
             canvas, value, zero = self._canvas, values[x], axis.y(0.0)

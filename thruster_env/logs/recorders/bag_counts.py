@@ -39,7 +39,7 @@ def is_ros1(path: Path) -> bool:
 
 
 def counts_of(path: Path) -> dict[str, Counts]:
-    """The messages that a file of a bag says it has, by what says so and by connection.
+    """The stated numbers of messages in a file of a bag, by source of the statement and by connection.
 
     Args:
         path: of a .bag, .db3 or .mcap file.
@@ -62,7 +62,7 @@ def counts_of(path: Path) -> dict[str, Counts]:
 
 
 def check_counts(read: Counts, topics: Mapping[int, str], stated: Mapping[str, Counts], path: Path) -> None:
-    """Raise Refused unless as many messages were read as the file says it has.
+    """Raise Refused unless as many messages were read as the file states.
 
     Args:
         read: messages of those connections that were read.
@@ -151,7 +151,7 @@ def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
 
 
 def _statistics(content: bytes) -> dict[int, int]:
-    """Messages by channel; ValueError unless their sum is what is said, too."""
+    """Messages by channel; ValueError unless their sum is the stated total."""
     total, length = struct.unpack_from("<Q", content)[0], struct.unpack_from("<I", content, 42)[0]
     if 46 + length > len(content) or length % 10:
         raise ValueError("its statistics are damaged")
@@ -244,7 +244,7 @@ def _of_database(path: Path) -> dict[str, Counts]:
 
 
 def _check_defined_once(database: sqlite3.Connection, path: Path) -> None:
-    """Raise Refused for a type that has two definitions, of which the reader takes the first."""
+    """Raise Refused for a type with two definitions, because the reader takes the first."""
     twice = database.execute(
         "SELECT topic_type FROM message_definitions GROUP BY topic_type "
         "HAVING COUNT(DISTINCT encoded_message_definition) > 1"
@@ -273,7 +273,7 @@ PACKED = ("", "none", "file", "message")
 
 
 class Bag(NamedTuple):
-    """The files of a bag, and what its metadata says of them."""
+    """The files of a bag and their metadata."""
 
     files: tuple[Path, ...]
     is_packed: bool = False  # whether each message is
@@ -335,7 +335,7 @@ def unpacker(kind: str, path: Path) -> Any:
 
 
 def _unpacked(files: tuple[Path, ...], folder: Path, path: Path, kind: str) -> tuple[Path, ...]:
-    """Files unpacked into a folder, as far as they are at most MOST_BYTES in all."""
+    """Unpack files into a folder; Refused if they have more than MOST_BYTES in all."""
     zstd, total, unpacked = unpacker(kind, path), 0, []
     for file in files:
         unpacked.append(folder / file.stem)

@@ -85,7 +85,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
 
 
 class Contents:
-    """What is read of a bag, file by file.
+    """The samples of a bag, read file by file.
 
     Attributes:
         samples: the numbers of a topic by the leaves of its messages, by topic.
@@ -149,7 +149,7 @@ class Contents:
                     yield connection.id, decoder
 
     def check(self, bag: Bag) -> None:
-        """Raise ValueError unless the files have as many messages of each topic as the metadata of a bag says.
+        """Raise ValueError unless the files have as many messages of each topic as a bag's metadata states.
 
         Nor may a pair of frames have the name of a topic.
         """
@@ -167,7 +167,7 @@ class Decoder:
     """
 
     def __init__(self, types: Any, connection: Any, is_ros1: bool, pairs: Pairs):
-        """Find the fields that hold numbers, and say of others why they are not read."""
+        """Find the fields that hold numbers, and the reasons why others are not read."""
         store = types.get_typestore(types.Stores.EMPTY)
         text, kind = connection.msgdef.data, connection.msgtype
         if text:
@@ -194,7 +194,7 @@ class Decoder:
         self._topic, self._pairs = connection.topic, pairs
 
     def read(self, data: bytes) -> Iterator[tuple[str, int, tuple]]:
-        """Topic, stamp of the header [ns], 0 without one, and what each leaf holds, of each row of a message."""
+        """For each row of a message: topic, the header's stamp [ns] (0 without one) and the leaves' values."""
         message = self._message(data)
         assert self._fields is not None
         if not self.transforms:
@@ -208,7 +208,7 @@ class Samples:
     """The numbers of a topic, as they come."""
 
     def __init__(self, leaves: Sequence[Leaf]):
-        """Nothing is there yet."""
+        """Start without samples."""
         self.leaves = leaves
         self.received, self.stamps = array("q"), array("q")
         self.numbers = [array("d") for _ in leaves]

@@ -126,7 +126,7 @@ def _formats(
 def _units(
     index: Any, offsets: Sequence[np.ndarray], content: np.ndarray
 ) -> list[tuple[int, int, Callable[[Any], None]]]:
-    """Place and kind of the messages that give units, and what sets these in a format."""
+    """Offset and kind of the messages that give units, and a function that sets the units of a format."""
     kind = index.name_to_id.get("FMTU")
     form = index.formats.get(kind)
     if form is None or not {"UnitIds", "MultIds"} <= set(form.colhash):
@@ -154,7 +154,7 @@ def _text(part: bytes) -> str:
 def _damage(
     formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.ndarray], content: np.ndarray
 ) -> str:
-    """What of a log is not read, in words; a few bytes of 0 or 255 at its end are the rest of a page."""
+    """The parts of a log that are not read, in words; a few bytes of 0 or 255 at its end only fill a page."""
     begins = [np.empty(0, np.int64)]
     ends = [np.empty(0, np.int64)]
     for kind, each in formats.items():
@@ -201,7 +201,7 @@ def _without_clock(reader: type) -> type:
 
 
 def _instances(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[tuple[Topic, np.ndarray]]:
-    """The topics of a message, one or one an instance, and the places of their rows in the file.
+    """The topics of a message, one per instance if it has instances, and the offsets of their rows in the file.
 
     Args:
         form: pymavlink's format of the message.

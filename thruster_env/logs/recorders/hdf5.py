@@ -97,7 +97,7 @@ def topics_of(
 
 
 def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
-    """The units of fields: one for all or one for each; of any other number all texts, which are no unit."""
+    """The units of fields: one for all or one for each; any other number is joined to a text that is no unit."""
     each = texts if len(texts) == len(fields) else [", ".join(texts)] * len(fields)
     return {field: text for field, text in zip(fields, each, strict=True) if text}
 
@@ -154,7 +154,7 @@ def _clocks(name: str, vectors: Mapping[str, Mapping[str, int]]) -> Iterator[tup
 
 
 def _read(name: str, array: Any, path: Path) -> np.ndarray:
-    """An array, of which sides of one entry are left out."""
+    """An array without its dimensions of length one."""
     check_bytes(math.prod(array.shape) * max(array.dtype.itemsize, 8), f"the array {name!r}", path)
     return np.squeeze(np.asarray(array[...]))
 
@@ -201,7 +201,7 @@ class Dataset:
     """A dataset in a file that another process reads."""
 
     def __init__(self, file: Opened, number: int, description: Mapping[str, Any]):
-        """Keep what is known of it; nothing is read."""
+        """Take its description; nothing is read."""
         self._file, self._number = file, number
         self.shape = tuple(int(side) for side in description["shape"])
         self.dtype = np.dtype(description["dtype"] if description["kind"] in NUMERIC else object)
@@ -245,7 +245,7 @@ class Dataset:
 
 
 def _unit(dataset: Dataset) -> list[str]:
-    """The units that a dataset says it has; of "seconds since 2026-05-01", as of CF conventions, "seconds"."""
+    """The units in a dataset's attributes; "seconds" of "seconds since 2026-05-01" (CF conventions)."""
     for name in UNITS:
         value = dataset.attributes.get(name)
         texts = np.ravel(np.array(value, object)).tolist()

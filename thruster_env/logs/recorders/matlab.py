@@ -70,7 +70,7 @@ def arrays_of(path: Path) -> dict[str, Any]:
 
 
 def _unpacked(file: BinaryIO, count: int, order: str, total: int, path: Path) -> bytearray:
-    """What an element unpacks to, as much as its first bytes say; the total is of those before [bytes]."""
+    """Unpack an element, to the size in its first bytes; `total` is the size of the elements before it [bytes]."""
     packed, filled = zlib.decompressobj(), 0
     out = bytearray(TAG)
     end = file.tell() + count
@@ -119,7 +119,7 @@ def _add(
     arrays: dict[str, Any],
     path: Path,
 ) -> None:
-    """Add an array by its own name, or that of its field; of a structure its fields."""
+    """Add an array by its name or its field's, or the fields of a structure."""
     kind, begin, count = element
     if kind != MATRIX or sum(map(name.count, ".{(")) > DEEPEST:
         raise ValueError("it holds a damaged array")

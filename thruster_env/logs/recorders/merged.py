@@ -1,4 +1,4 @@
-"""A recorder's file as a table of a log: fields with times of their own, put into rows at all of their times."""
+"""A recorder's file as a table: fields with their own times, in one row for each time."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _of_choice(choice: Choice) -> list[Remark]:
 def _not_used(
     columns: Mapping[str, Column], fields: Mapping[str, Samples], clock: np.ndarray, path: Path
 ) -> list[Remark]:
-    """Channels of which many samples, or all, lie outside the log; ValueError for all of a measurement."""
+    """Channels with many or all samples outside the log; ValueError if these are all samples of a measurement."""
     remarks = []
     for key, column in columns.items():
         times = _times(fields[column.header])
@@ -153,7 +153,7 @@ def _not_used(
 def _without_units(
     columns: Mapping[str, Column], wanted: Sequence[Wanted], known: Mapping[str, str]
 ) -> dict[str, Column]:
-    """The columns, without a unit that is only known of a field for a quantity of a model that has none."""
+    """The columns, without a field's unit where the model's quantity has none."""
     plain = {channel.key for channel in wanted if not channel.quantity.unit}
     return {
         key: column._replace(unit=None) if key in plain and column.unit == known.get(column.header) else column
@@ -167,7 +167,7 @@ def _unit(name: str, samples: Samples) -> str | None:
 
 
 def _times(samples: Samples) -> np.ndarray:
-    """Times of samples that have some."""
+    """Times of samples, empty if there are none."""
     return np.empty(0) if samples.times is None else samples.times
 
 
@@ -187,7 +187,7 @@ def _check(name: str, samples: Samples, path: Path) -> None:
 
 
 def _plain(fields: Mapping[str, Samples], path: Path) -> Table:
-    """A table of fields of equal length, of which one may hold the times."""
+    """A table of fields of equal length; one of them may hold the times."""
     lengths = {name: len(samples.values) for name, samples in fields.items()}
     if len(set(lengths.values())) > 1:
         sizes = listed(f"{name} {length}" for name, length in lengths.items())
@@ -198,7 +198,7 @@ def _plain(fields: Mapping[str, Samples], path: Path) -> Table:
 
 
 def _damage(fields: Mapping[str, Samples]) -> tuple[str, ...]:
-    """What of the files of some fields is damaged, each once."""
+    """Descriptions of the damage in the files of fields, without repetition."""
     return tuple(dict.fromkeys(samples.damage for samples in fields.values() if samples.damage))
 
 

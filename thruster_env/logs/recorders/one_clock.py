@@ -28,7 +28,7 @@ class Clocked(NamedTuple):
 
     @property
     def order(self) -> np.ndarray:
-        """Places of the messages in the order in which they were received."""
+        """Indices of the messages in the order of reception."""
         return np.argsort(self.times if self.received is None else self.received, kind="stable")
 
 

@@ -1,4 +1,4 @@
-"""Files that another process reads: their libraries, in C, break off at some that are damaged."""
+"""Files that are read in another process, because their libraries, in C, crash on some damaged files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Opened:
     """A file that another process has opened.
 
     Attributes:
-        told: what is in it.
+        told: its contents, as the other process describes them.
     """
 
     def __init__(self, child: subprocess.Popen, form: str, path: Path):

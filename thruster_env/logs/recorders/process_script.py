@@ -1,4 +1,4 @@
-"""A process of its own that reads HDF5 and Parquet, for their libraries break off at some files that are damaged.
+"""A process that reads HDF5 and Parquet, because their libraries crash on some damaged files.
 
 Run as a script, it imports nothing of this package. Its input is a line of JSON with format, path and limits, then
 a line with the number of an array for each that is to be read. Its output is a line of JSON with what is in the
@@ -110,7 +110,7 @@ class Walk:
             self.found |= {f"{name}.{field}": (dataset, field) for field in names}
 
     def _referred(self, dataset: Any, name: str, depth: int, brackets: str) -> None:
-        """Add what the entries of a cell array, or those of a field of an array of structures, refer to."""
+        """Add the objects to which the entries of a cell array, or of a field of an array of structures, refer."""
         group, _, field = name.rpartition(".")
         self.found[name if brackets == "{}" else group] = MANY[brackets]
         if dataset.size > MOST_OBJECTS or depth >= DEEPEST:
@@ -143,7 +143,7 @@ def _why_not_whole(dataset: Any, most_bytes: int) -> str:
 
 
 def _address(node: Any) -> int:
-    """Where an object stands in its file."""
+    """The address of an object in its file."""
     import h5py
 
     return h5py.h5o.get_info(node.id).addr
@@ -209,7 +209,7 @@ Reader = Callable[[int], np.ndarray]
 
 
 def hdf5(request: dict) -> tuple[dict[str, Any], Reader]:
-    """The datasets of an HDF5 file, and what reads one of them."""
+    """The datasets of an HDF5 file, and a function that reads one of them."""
     import h5py
 
     contents = Walk(h5py.File(request["path"], "r"), request["bytes"]).found

@@ -1,4 +1,4 @@
-"""Recorders' files by their ending and first bytes: what is in them, and samples of what is wanted."""
+"""Recorders' files by their ending and first bytes: their fields, and the samples of chosen fields."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Samples(NamedTuple):
 
 
 class Field(NamedTuple):
-    """What there is of a field; NaN where there are no times or no finite numbers."""
+    """The size, rate and range of a field; NaN without times or finite numbers."""
 
     name: str  # of its column, TOPIC.FIELD
     topic: str  # empty for an array that stands alone
@@ -120,7 +120,7 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def contents(path: str | Path, stamps: str | None = None) -> Contents:
-    """All fields of a recorder's file or a table that hold numbers, and what of it is not read.
+    """All numeric fields of a recorder's file or a table, and the reasons why others are not read.
 
     Args:
         path: of the file.
@@ -193,7 +193,7 @@ def check_stamps(stamps: str | None, form: Format | None, path: str | Path) -> N
 
 
 def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
-    """The samples of some fields that a file has, by name, None for all; what it does not have is left out.
+    """The samples of fields by name, None for all; names that the file does not have are left out.
 
     Args:
         path: of the file.

@@ -1,4 +1,4 @@
-"""What readers of recorders' files give: topics, whose fields have samples at the same times; and their limits."""
+"""The topics that readers of recorders' files return, whose fields share their times; and limits of sizes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Topic(NamedTuple):
 
 
 def joined(parts: Sequence[Topic], order: Sequence[np.ndarray] | None = None) -> Topic:
-    """A topic of which a file has several definitions, matched by the names of fields; NaN in rows without one.
+    """Join parts of a topic with several definitions by the names of fields; NaN in rows without a field.
 
     Args:
         parts: of the same name, all with times.
@@ -91,7 +91,7 @@ def package(module: str, kind: str, path: Path) -> Any:
 
 
 class Refused(ValueError):
-    """A file is what its name says, but holds what is not read."""
+    """A file has the format of its name, but contents that are not read."""
 
 
 def check_bytes(count: int | float, what: str, path: Path) -> None:
@@ -101,14 +101,14 @@ def check_bytes(count: int | float, what: str, path: Path) -> None:
 
 
 def unreadable(kind: str, path: Path, why: object) -> ValueError:
-    """The error for a file that is not what its name says."""
+    """The error for a file that does not have the format of its name."""
     text = " ".join(str(why).split())
     return ValueError(f"a {kind} must be one, but {path} is not: {text[:200] or type(why).__name__}")
 
 
 @contextmanager
 def reading(kind: str, path: Path) -> Iterator[None]:
-    """Make one line of whatever packages raise for bytes that are not as they should be: of a dozen kinds."""
+    """Turn any error that a package raises for damaged bytes into one line."""
     try:
         yield
     except Refused:
@@ -201,7 +201,7 @@ class Pairs:
     """Names of the topics of pairs of frames: TOPIC/PARENT/CHILD, without slashes at the beginning of a frame."""
 
     def __init__(self, path: Path):
-        """There is none yet; the path of the bag is for messages."""
+        """Start without pairs; the path of the bag is for messages."""
         self._path = path
         self._pairs: dict[str, tuple[str, str, str]] = {}
 

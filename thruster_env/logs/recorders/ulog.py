@@ -124,7 +124,7 @@ def _whole_parts(content: bytes) -> list[tuple[int, int]]:
 
 
 def _after(content: bytes, offset: int) -> int | None:
-    """Where the message ends that begins at a place, None where none does."""
+    """The end of the message that begins at an offset, None if none does."""
     if offset + HEADER > len(content):
         return None
     count, kind = struct.unpack_from("<HB", content, offset)
@@ -136,7 +136,7 @@ def _after(content: bytes, offset: int) -> int | None:
 
 
 def _begins(content: bytes, offset: int) -> bool:
-    """Whether several messages follow one another from a place on."""
+    """Whether several messages follow one another from an offset on."""
     if offset + HEADER > len(content) or content[offset + 2] not in KINDS:
         return False
     for _ in range(SEVERAL):
@@ -150,7 +150,7 @@ def _begins(content: bytes, offset: int) -> bool:
 
 
 def _checked_definitions(content: bytes, parts: Sequence[tuple[int, int]], path: Path) -> int:
-    """How many messages cannot be what their kind says, as where it is damaged; the package passes over them.
+    """The number of messages that contradict their kind, for instance after damage; the package skips them.
 
     Raises Refused for a format that is defined twice, or a number that stands for two topics: the package keeps
     the last one, and drops what belongs to the first.
