@@ -1,6 +1,6 @@
 """Canvas of the pictures: coordinates in pixels, smooth edges, text, and the colours.
 
-Imports pygame, as most modules of this folder do: `renderer` imports them only when a picture is wanted.
+pygame is imported with the first canvas, because every env imports this module and few draw.
 """
 
 from __future__ import annotations
@@ -8,9 +8,12 @@ from __future__ import annotations
 import math
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pygame
+
+if TYPE_CHECKING:
+    import pygame
 
 SIZE = (640, 400)  # [px]
 SCALE = 4  # everything is drawn this many times larger and averaged: 16 samples a pixel, 4 ms a frame
@@ -33,6 +36,9 @@ class Canvas:
     def __init__(self, size: tuple[int, int] = SIZE):
         """A picture of a size [px]."""
         width, height = SIZE
+        global pygame
+        import pygame
+
         self.large = pygame.Surface((width * SCALE, height * SCALE), depth=32)
         self._zoom = min(size[0] / width, size[1] / height)
         inner = round(width * self._zoom), round(height * self._zoom)

@@ -9,10 +9,9 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-import pygame
 from gymnasium.error import DependencyNotInstalled
 
 from thruster_env.core.checks import one_of, positive
@@ -20,6 +19,9 @@ from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.modules import to_install
 from thruster_env.render.canvas import SIZE
 from thruster_env.render.charts import History
+
+if TYPE_CHECKING:
+    import pygame
 
 MODES = ("human", "rgb_array")
 
@@ -143,6 +145,9 @@ class Window:
 
     def __init__(self, frame_time: float, caption: str, size: tuple[int, int] = SIZE):
         """Keep calls of `show` frame_time [s] apart; the window of a size [px] opens with the first."""
+        global pygame
+        import pygame
+
         self._size = size
         self._caption = caption
         self._frame_time = frame_time
