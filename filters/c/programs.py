@@ -140,11 +140,11 @@ class FilterPrograms(NamedTuple):
         start: the filter's extras at the prior; of an ensemble the members.
         begin: X, which is predicted in place of mean and covariance: points in a row, or a mean and a root.
         advance: a substep under u of the belief or of X; of one point, x; of all members of an ensemble.
-        settle: the belief at the end of a step.
+        add_noise: the belief at the end of a step.
         update: the belief after z, the innovation, its covariance and its log-likelihood.
         summarise: mean and covariance of an ensemble.
-        kept: shapes of the extras that the filter keeps, by name.
-        flying: how many numbers X has.
+        extras: shapes of the extras that the filter keeps, by name.
+        predicted_size: how many numbers X has.
         points: how many points X has, if they are propagated one by one; else 0.
         members: how many members an ensemble has; else 0.
         model: the filter's model.
@@ -154,11 +154,11 @@ class FilterPrograms(NamedTuple):
     start: Program
     begin: Program
     advance: Program
-    settle: Program
+    add_noise: Program
     update: Program
     summarise: Program
-    kept: Mapping[str, tuple[int, ...]]
-    flying: int
+    extras: Mapping[str, tuple[int, ...]]
+    predicted_size: int
     points: int
     members: int
     model: StateSpaceModel
@@ -206,14 +206,14 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     extras = {name: matrix.shape for name, matrix in memory.kept.items()}
     if wrong := [name for name in extras if name in RESERVED or not is_name(name) or is_macro(name)]:
         raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
-    point_count = memory.end - layout.extras - sum(prod(size) for size in extras.values())
-    points = _points_of(stages[2], equations, memory, point_count)
+    predicted_size = memory.end - layout.extras - sum(prod(size) for size in extras.values())
+    points = _points_of(stages[2], equations, memory, predicted_size)
     if points:
         stages[2] = {layout.mean: equations.f(memory.x, memory.u)}
     stages[4][NIS] = _nis(stages[4][layout.innovation], stages[4][layout.innovation_cov])
     extra_parts = [
         *((matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.kept.items()),
-        (memory.end - point_count, (point_count,), "X"),
+        (memory.end - predicted_size, (predicted_size,), "X"),
     ]
     means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
     start, begin, advance, add_noise, update = (
@@ -222,7 +222,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
         for lies in [_where(shape, mean, argument, extra_parts, points)]
     )
     programs = start, begin, advance, add_noise, update, Program([], [], [])
-    return FilterPrograms(*programs, extras, point_count, points, 0, model, page.update.__module__)
+    return FilterPrograms(*programs, extras, predicted_size, points, 0, model, page.update.__module__)
 
 
 def _of_members(paged: EnsembleFilter) -> FilterPrograms:
@@ -272,10 +272,10 @@ def _check_traced(
         ) from error
 
 
-def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowMemory, point_count: int) -> int:
+def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowMemory, predicted_size: int) -> int:
     """How many points a substep propagates by f alone; 0 if it has other operations."""
     (at, propagated), *rest = advance.items()
-    if point_count == 0 or rest or not propagated.of or propagated.of[0].operation != Place("rows", at):
+    if predicted_size == 0 or rest or not propagated.of or propagated.of[0].operation != Place("rows", at):
         return 0
     return propagated.shape[1] if propagated is equations.f(propagated.of[0], memory.u) else 0
 
@@ -365,9 +365,9 @@ def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.
     """Means of a run, (K + 1, n), without restarts."""
     model, n, m = programs.model, programs.model.n, programs.model.m
     start, begin, advance, add_noise, update, _ = map(_compiled, programs.all)
-    names = {**work_names(), "float": _Single, "X": np.zeros(programs.flying, np.float32)}
+    names = {**work_names(), "float": _Single, "X": np.zeros(programs.predicted_size, np.float32)}
     names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
-    names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.kept.items()}
+    names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.extras.items()}
     x = names["x"] = wrapped_where(model.prior_mean, model.shape.state_angles).astype(np.float32)
     names["innovation"], means = np.zeros(m, np.float32), []
     size, width = programs.members, padded(programs.members, LANES)

@@ -82,7 +82,7 @@ enum {{ {guard}_STATES = {n}, {guard}_INPUTS = {model.inputs}, {guard}_MEASUREME
     {real} S[{m * m}];            /* covariance of the innovation, by rows */
     {real} nis;             /* v' S^-1 v of the innovation v: chi-square of `channels` degrees of freedom */
     {real} log_likelihood;  /* log N(v; 0, S) */
-{self.kept()}    int channels;           /* that were measured */
+{self.extra_members()}    int channels;           /* that were measured */
     unsigned long restarts; /* from the prior, after an estimate that was not finite or had a negative variance */
 {members}}} {name};
 
@@ -183,10 +183,10 @@ void {name}_update({name} *filter{z})
 {test}}}
 """
 
-    def kept(self) -> str:
+    def extra_members(self) -> str:
         """The members of the struct for the filter's extras."""
         members = ""
-        for name, shape in self.programs.kept.items():
+        for name, shape in self.programs.extras.items():
             size = f"[{prod(shape)}]" * bool(shape)
             how = ", by rows" * (len(shape) == 2)
             members += f"    {self.real} {name}{size}; /* kept besides x and P{how} */\n"
@@ -201,19 +201,19 @@ void {name}_update({name} *filter{z})
     def functions(self) -> list[str]:
         """Functions of the programs."""
         programs, belief, real = self.programs, f"{self.name} *filter", self.real
-        predicted = f", {real} *X" * bool(programs.flying)
+        predicted = f", {real} *X" * bool(programs.predicted_size)
         advanced = f"{real} *x" if programs.points else belief + predicted
         return [
-            *[self.function("start", belief, programs.start)] * bool(programs.kept),
-            *[self.function("begin", belief + predicted, programs.begin)] * bool(programs.flying),
+            *[self.function("start", belief, programs.start)] * bool(programs.extras),
+            *[self.function("begin", belief + predicted, programs.begin)] * bool(programs.predicted_size),
             self.function("advance", advanced + self.of_u, programs.advance),
-            self.function("settle", belief + predicted, programs.settle),
+            self.function("settle", belief + predicted, programs.add_noise),
             self.function("correct", f"{belief}, const {real} *z", programs.update),
         ]
 
     def prior(self) -> str:
         """Statements that set the belief."""
-        n, start = self.model.n, "    start(filter);\n" * bool(self.programs.kept)
+        n, start = self.model.n, "    start(filter);\n" * bool(self.programs.extras)
         return f"""\
     for (int i = 0; i < {n}; i++) {{
         filter->x[i] = prior_mean[i];
@@ -226,10 +226,10 @@ void {name}_update({name} *filter{z})
     def predict(self) -> str:
         """Statements of a step."""
         programs, n = self.programs, self.model.n
-        points = ", X" * bool(programs.flying)
+        points = ", X" * bool(programs.predicted_size)
         begin, step = "", f"        advance(filter{points}{self.by_u});\n"
-        if programs.flying:
-            begin = f"    {self.real} X[{programs.flying}];\n\n    begin(filter, X);\n"
+        if programs.predicted_size:
+            begin = f"    {self.real} X[{programs.predicted_size}];\n\n    begin(filter, X);\n"
         if programs.points:
             move = f"            advance(X + {n} * i{self.by_u});\n"
             step = f"        for (int i = 0; i < {programs.points}; i++) {{\n{move}        }}\n"
@@ -326,7 +326,7 @@ class EnsembleWriter(Writer):
         self._width = padded(programs.members, LANES)  # so that normals are those of Python
         self._rows = {"table": ("filter->members", programs.members), "draws": ("filter->normals", self._width)}
 
-    def kept(self) -> str:
+    def extra_members(self) -> str:
         """The members of the struct for the ensemble."""
         size, rows = self.programs.members, max(cut(program, self.model.n).rows for program in self.programs.all)
         normals = max(self.model.n, self.model.m) * self._width
@@ -335,7 +335,7 @@ class EnsembleWriter(Writer):
     {self.real} normals[{normals}]; /* scratch */
     uint32_t key[2];        /* with the step, what random numbers depend on */
     uint32_t step;          /* steps predicted */
-{super().kept()}"""
+{super().extra_members()}"""
 
     def constants(self) -> Mapping[str, np.ndarray]:
         """Arrays by their names."""
@@ -352,7 +352,7 @@ class EnsembleWriter(Writer):
             self.function("start", belief, programs.start),
             self.function("summarise", belief, programs.summarise),
             self.function("advance", belief + self.of_u, programs.advance),
-            self.function("settle", belief, programs.settle),
+            self.function("settle", belief, programs.add_noise),
             self.function("correct", f"{belief}, const {real} *z", programs.update),
         ]
 

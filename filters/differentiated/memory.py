@@ -25,7 +25,7 @@ class Memory(NumbersMemory):
     its points in the place of x and P.
 
     Attributes:
-        flying: the predicted quantities: x and P, or the points.
+        predicted: the predicted quantities: x and P, or the points.
         moves: the slope of each matrix that a parameter may move, except constants and own parameters.
         constants_slope, own_slopes: slopes of the constants, and of the filter's own parameters.
     """
@@ -44,9 +44,9 @@ class Memory(NumbersMemory):
         started = page.started(model)
         self.begun, self.notes = n + n * n, m + m * m
         starts = starts_of(*(prod(matrix.shape) for matrix in predicted))
-        self.kept_from = max(self.begun, starts[-1])
-        of_kept = starts_of(self.kept_from, *(prod(matrix.shape) for matrix in started.values()))[1:]
-        self.state = of_kept[-1]
+        self.extras_from = max(self.begun, starts[-1])
+        of_extras = starts_of(self.extras_from, *(prod(matrix.shape) for matrix in started.values()))[1:]
+        self.state = of_extras[-1]
         self.left, self.input, self.measured, self.level, self.true, self.length = starts_of(
             self.state, self.state, shape.inputs, m, 1, n
         )[1:]
@@ -66,11 +66,11 @@ class Memory(NumbersMemory):
             self.Q: self.read("move", 0, n, n, symmetric=True),
             self.R: self.read("move", r, m, m, symmetric=True),
         }
-        self.flying = [self.x, self.P]
+        self.predicted = [self.x, self.P]
         if page.represent is not None:
-            self.flying = [self._moving(at, matrix) for at, matrix in zip(starts, predicted, strict=False)]
+            self.predicted = [self._moving(at, matrix) for at, matrix in zip(starts, predicted, strict=False)]
         self.kept = {
-            name: self._moving(at, matrix) for at, (name, matrix) in zip(of_kept, started.items(), strict=False)
+            name: self._moving(at, matrix) for at, (name, matrix) in zip(of_extras, started.items(), strict=False)
         }
         slopes = page.parameters(lambda offset, size: self.read("move", own_slopes + offset, *size))
         self.own_slopes = dict(zip(self.own[: len(page.own)], slopes, strict=False))

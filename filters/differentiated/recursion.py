@@ -180,8 +180,8 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     if page.represent is not None:
         stages.append(belief_stage(page.represent(model, x, p)))
     stages += [
-        belief_stage(page.propagate(model, *memory.flying, memory.u)),
-        belief_stage(page.add_process_noise(model, *memory.flying)),
+        belief_stage(page.propagate(model, *memory.predicted, memory.u)),
+        belief_stage(page.add_process_noise(model, *memory.predicted)),
     ]
     mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
     if wanted.of_truth:

@@ -20,8 +20,8 @@ class TrackedBelief(TensorBelief):
 
     def detach(self) -> TrackedBelief:
         """The same belief, detached from its derivatives."""
-        extras = {name: tensor.detach() for name, tensor in self.kept.items()}
-        return self._replace(mean=self.mean.detach(), cov=self.cov.detach(), kept=extras)
+        extras = {name: tensor.detach() for name, tensor in self.extras.items()}
+        return self._replace(mean=self.mean.detach(), cov=self.cov.detach(), extras=extras)
 
 
 class DifferentiableEnsembleFilter(LearnedEstimator):

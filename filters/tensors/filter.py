@@ -32,7 +32,7 @@ class TensorBelief(NamedTuple):
         mean: of the states, (..., n), in the units of the model.
         cov: covariances of the errors, (..., n, n).
         divergences: restarts from the prior, (...,).
-        kept: the page's extras by name, such as an estimate of R; of an ensemble its `members` (..., n, N).
+        extras: the page's extras by name, such as an estimate of R; of an ensemble its `members` (..., n, N).
         key: (..., 2) whole numbers, which determine an ensemble's random numbers together with `step`.
         step: steps predicted.
     """
@@ -40,14 +40,14 @@ class TensorBelief(NamedTuple):
     mean: Tensor
     cov: Tensor
     divergences: Tensor
-    kept: dict[str, Tensor]
+    extras: dict[str, Tensor]
     key: np.ndarray = np.zeros(2)
     step: int = 0
 
     @property
     def anomalies(self) -> Tensor:
         """The distances (..., n, N) of an ensemble's members from their mean."""
-        members = self.kept["members"]
+        members = self.extras["members"]
         return members - members.mean(-1, keepdim=True)
 
 
@@ -297,7 +297,7 @@ class TensorFilter:
     def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
         """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
         u = self._finite("u", u, (self._model.inputs,))
-        known, step = (belief.mean, belief.cov, belief.kept), belief.step + 1
+        known, step = (belief.mean, belief.cov, belief.extras), belief.step + 1
         draw, substeps = self._normals(belief.key, step), self._model.substeps
         mean, cov, extras = self._stages.predict(self._known(), known, u, substeps, draw)
         return TensorBelief(mean, cov, belief.divergences, extras, belief.key, step)
@@ -308,7 +308,7 @@ class TensorFilter:
         A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
         """
         z = self._finite("z", z, (self._model.m,), missing_allowed=True)
-        known = belief.mean, belief.cov, belief.kept
+        known = belief.mean, belief.cov, belief.extras
         draw = self._normals(belief.key, belief.step)
         (mean, cov, extras), (v, s, level) = self._stages.update(self._known(), known, z, draw)
         lost = ~_all_finite(mean, cov, v, s, level)
@@ -319,8 +319,8 @@ class TensorFilter:
             mean, v = where(lost, prior.mean, mean, 1), where(lost, torch.zeros_like(v), v, 1)
             cov, s = where(lost, prior.cov, cov, 2), where(lost, self.measurement_noise_cov, s, 2)
             level = torch.where(lost, 0.0, level)
-            sizes = self._stages.kept
-            extras = {name: where(lost, prior.kept[name], extra, sizes[name]) for name, extra in extras.items()}
+            sizes = self._stages.extra_dimensions
+            extras = {name: where(lost, prior.extras[name], extra, sizes[name]) for name, extra in extras.items()}
         belief = TensorBelief(mean, cov, counted, extras, belief.key, belief.step)
         return belief, TensorInnovation(v, s, level)
 

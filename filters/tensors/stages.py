@@ -360,7 +360,7 @@ class Stages:
     Attributes:
         memory: the layout of a filter's numbers.
         reads: the matrices that the page reads.
-        kept: dimensions of the extras, besides those of a batch.
+        extra_dimensions: dimensions of the extras, besides those of a batch.
     """
 
     memory: NumbersMemory
@@ -372,13 +372,13 @@ class Stages:
         parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
         self.reads = {matrix for part in parts for matrix in part.inputs}
         self._belief, self._outputs = memory.belief, memory.told
-        self._kept = {name: matrix.operation for name, matrix in memory.kept.items()}
-        self.kept = {name: len(matrix.shape) for name, matrix in memory.kept.items()}
+        self._extras = {name: matrix.operation for name, matrix in memory.kept.items()}
+        self.extra_dimensions = {name: len(matrix.shape) for name, matrix in memory.kept.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The belief at the prior, of its mean and covariance."""
         started = self._start(numbers, prior[0])
-        return *prior, {name: started[source] for name, source in self._kept.items()}
+        return *prior, {name: started[source] for name, source in self._extras.items()}
 
     def predict(
         self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int, draw: Draw
@@ -398,12 +398,12 @@ class Stages:
     def _tensors(self, numbers: Mapping[Place, Tensor], belief: tuple, argument: Tensor) -> dict[Place, Tensor]:
         *known, extras = belief
         rows = dict(zip(self._belief, known, strict=True)) | {
-            self._kept[name]: extra for name, extra in extras.items()
+            self._extras[name]: extra for name, extra in extras.items()
         }
         return {**numbers, **rows, Place("given", 0): argument}
 
     def _belief_of(self, tensors: Mapping[Place, Tensor]) -> tuple:
-        return *(tensors[at] for at in self._belief), {name: tensors[at] for name, at in self._kept.items()}
+        return *(tensors[at] for at in self._belief), {name: tensors[at] for name, at in self._extras.items()}
 
 
 class EnsembleStages(Stages):
@@ -419,8 +419,8 @@ class EnsembleStages(Stages):
         self.reads = {matrix for part in parts.values() for matrix in part.inputs}
         self._belief, self._outputs = memory.belief, memory.told
         matrices = {"members": memory.x, **memory.kept}
-        self._kept = {name: matrix.operation for name, matrix in matrices.items()}
-        self.kept = {name: len(matrix.shape) + matrix.member for name, matrix in matrices.items()}
+        self._extras = {name: matrix.operation for name, matrix in matrices.items()}
+        self.extra_dimensions = {name: len(matrix.shape) + matrix.member for name, matrix in matrices.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The members at the prior, their mean and covariance."""
@@ -428,7 +428,7 @@ class EnsembleStages(Stages):
         mean, cov, extras = self._after(tensors, ("start", "summarise"), prior[0])
         batch = prior[0].shape[:-1]
         extras = {
-            name: extra.expand(*batch, *extra.shape[extra.ndim - self.kept[name] :])
+            name: extra.expand(*batch, *extra.shape[extra.ndim - self.extra_dimensions[name] :])
             for name, extra in extras.items()
         }
         return mean.expand(*batch, -1), cov.expand(*batch, -1, -1), extras

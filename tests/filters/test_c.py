@@ -133,7 +133,7 @@ def built(filter_, folder, *, single=False, compiler="gcc", flags=(), key=None):
     u, real = ", u" * (model.inputs > 0), "float" if single else "double"
     kept = "".join(
         f"show({math.prod(shape)}, {'' if shape else '&'}filter.{name});\n        "
-        for name, shape in programs_of(filter_).kept.items()
+        for name, shape in programs_of(filter_).extras.items()
     )
     main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u, kept=kept, key=key)
     for name, text in {"one.h": made.header, "one.c": made.source, "main.c": main}.items():

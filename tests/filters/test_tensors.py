@@ -84,7 +84,7 @@ def test_what_a_filter_keeps_is_that_of_its_belief(name):
     for u, seen in zip(inputs[0], z[0, 1:], strict=True):
         belief, beliefs = filter_.predict(belief, u), tensors.predict(beliefs, u)
         (belief, _), (beliefs, _) = filter_.update(belief, seen), tensors.update(beliefs, seen)
-    kept = {key: one for key, one in beliefs.kept.items() if key != "members"}
+    kept = {key: one for key, one in beliefs.extras.items() if key != "members"}
     assert list(kept) == KEPT[name]
     found = torch.cat([one.expand(2, *one.shape[1:]).reshape(2, -1) for one in kept.values()], -1)
     assert_same(found, np.array([belief.extras] * 2))

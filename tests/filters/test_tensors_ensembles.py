@@ -60,14 +60,18 @@ def test_steps_are_those_of_the_filter_with_its_members(name):
     filter_, (inputs, z) = made(name, model), simulated(model, 3)
     tensors = filters.torch(filter_)
     belief, beliefs = filter_.init(key), tensors.init(5, key)
-    assert beliefs.mean.shape == (5, 2) and beliefs.kept["members"].shape == beliefs.anomalies.shape == (5, 2, 13)
+    assert beliefs.mean.shape == (5, 2) and beliefs.extras["members"].shape == beliefs.anomalies.shape == (
+        5,
+        2,
+        13,
+    )
     for u, seen in zip(inputs[0], z[0, 1:], strict=True):
         belief, beliefs = filter_.predict(belief, u), tensors.predict(beliefs, u)
         assert_same([beliefs.mean[-1], beliefs.cov[-1]], [belief.mean, belief.cov])
         (belief, told), (beliefs, of_tensors) = filter_.update(belief, seen), tensors.update(beliefs, seen)
         assert_same([one[-1] for one in of_tensors], list(map(np.asarray, told)))
     members = belief.members
-    assert_same([beliefs.kept["members"][2]], [members])
+    assert_same([beliefs.extras["members"][2]], [members])
     assert_same([beliefs.anomalies[2]], [members - members.mean(axis=1, keepdims=True)])
 
 
