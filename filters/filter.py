@@ -70,7 +70,7 @@ class Filter:
 
         Raises ValueError for another key.
         """
-        session = self._borrowed()
+        session = self._borrow()
         session.set_key(key)
         session.run("start")
         belief = session.belief()
@@ -86,7 +86,7 @@ class Filter:
         Raises ValueError for an input that is not p finite numbers, and for a belief of another filter type, not
         finite, or with a covariance that is not positive semidefinite.
         """
-        session = self._borrowed()
+        session = self._borrow()
         session.load(belief)
         if process_noise_cov is not None:
             session.set_noise(process_noise_cov=process_noise_cov)
@@ -102,7 +102,7 @@ class Filter:
 
         Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
         """
-        session = self._borrowed()
+        session = self._borrow()
         session.load(belief)
         if measurement_noise_cov is not None:
             session.set_noise(measurement_noise_cov=measurement_noise_cov)
@@ -115,7 +115,7 @@ class Filter:
         """Members that stand for a belief, (n, N); where they have weights, a row behind holds the logarithms."""
         return belief.members[: self.kernel_model.n + 1]
 
-    def _borrowed(self) -> Session:
+    def _borrow(self) -> Session:
         """A spare session in its initial state, else a new one, which takes longer to make than a step.
 
         `_put_back` returns it, except after an error.

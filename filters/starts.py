@@ -212,7 +212,7 @@ def _states_and_cause(
         z: measurement (m,).
     """
     modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
-    models = [mode.kernel_model for mode in modes] or [_as_set(filter_.kernel_model, numbers)]
+    models = [mode.kernel_model for mode in modes] or [_model_of_numbers(filter_.kernel_model, numbers)]
     begun = before if before is None or len(before) == len(models) else before * len(models)
     for j, model in enumerate(models):
         states, cause = likely_cause(model, None if begun is None else begun[j], u, z)
@@ -222,7 +222,7 @@ def _states_and_cause(
     return tuple(symbols), f"{cause} in modes[{j}]" if modes and cause != UNKNOWN else cause
 
 
-def _as_set(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:
+def _model_of_numbers(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:
     """The model with the Q, R and constants that a session was set to."""
     if numbers is None or np.array_equal(numbers[: len(model.numbers)], model.numbers):
         return model

@@ -107,17 +107,17 @@ class _OfStates:
 @makes_functions
 def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...]) -> dict[str, Callable]:
     """The functions of the new model, and T and X themselves."""
-    by_place = {bound.place: bound for bound in bounds}
+    bound_of = {bound.place: bound for bound in bounds}
 
     def entry(logit: str, above: str, below: str) -> Callable:
-        def of(i: int) -> str:
-            if i not in by_place:
+        def component(i: int) -> str:
+            if i not in bound_of:
                 return f"x[{i}]"
-            _, low, high = by_place[i]
+            _, low, high = bound_of[i]
             text = above if high == np.inf else below if low == -np.inf else logit
             return text.format(x=f"x[{i}]", low=repr(low), high=repr(high), width=repr(high - low))
 
-        return of
+        return component
 
     of_bounded = entry("log(({x} - {low}) / ({high} - {x}))", "log({x} - {low})", "-log({high} - {x})")
     of_free = entry("{low} + {width} / (1.0 + exp(-{x}))", "{low} + exp({x})", "{high} - exp(-{x})")

@@ -141,7 +141,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
             f"{short_repr(content.get('hash'))}"
         )
     try:
-        content = _of_this_version(content)
+        content = _upgraded(content)
         of_a_plant = content["version"] < FILE_VERSION or content.get("plant") is not None
         _check_filter(content.get("filter"), known=MODEL_KEYS if of_a_plant else None)
     except ValueError as error:
@@ -203,7 +203,7 @@ def compared(content: Mapping[str, Any], path: str | Path) -> Iterator[None]:
         raise ValueError(f"{error}; {path} was made with {made_with(content)}") from None
 
 
-def _of_this_version(content: dict) -> dict:
+def _upgraded(content: dict) -> dict:
     """Content of any version, checked, with the entries of this version that follow from it."""
     if content["version"] < FILE_VERSION:
         if content["version"] > 2:

@@ -106,11 +106,11 @@ def is_taken(name: str, texts: Iterable[str]) -> bool:
     """
     if name in OF_LIBRARIES or name in HEADERS or name == "board" or name.endswith("_t") or is_macro(name):
         return True
-    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _without_comments(text))}
+    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _strip_comments(text))}
     return not used.isdisjoint([name, *(pattern.format(name) for pattern in FUNCTIONS)])
 
 
-def _without_comments(text: str) -> str:
+def _strip_comments(text: str) -> str:
     """A text of C without its comments, strings and characters, of which one may be a quote."""
     return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)
 
@@ -191,12 +191,12 @@ def programs_of(filter_: Filter) -> FilterPrograms:
     try:
         _check_traced("transition", f, by_f, 2, shape)
         _check_traced("observe", h, by_h, 1, shape)
-        return _of_members(paged) if isinstance(paged, EnsembleFilter) else _of_rows(paged)
+        return _member_programs(paged) if isinstance(paged, EnsembleFilter) else _row_programs(paged)
     except TooLarge as error:
         raise ValueError(f"a filter in C must have few operations, but got a model for which {error}") from error
 
 
-def _of_rows(paged: FilterWithPage) -> FilterPrograms:
+def _row_programs(paged: FilterWithPage) -> FilterPrograms:
     """The programs of a filter of mean and covariance."""
     model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
     shape = model.shape
@@ -225,7 +225,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
     return FilterPrograms(*programs, extras, predicted_size, points, 0, model, page.update.__module__)
 
 
-def _of_members(paged: EnsembleFilter) -> FilterPrograms:
+def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
     """The programs of an ensemble filter."""
     check_page_is_all(paged, "in C")
     model, page, numbers, size = paged.kernel_model, paged.written_page, paged.numbers, paged.size
@@ -364,7 +364,7 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
 def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Means of a run, (K + 1, n), without restarts."""
     model, n, m = programs.model, programs.model.n, programs.model.m
-    start, begin, advance, add_noise, update, _ = map(_compiled, programs.all)
+    start, begin, advance, add_noise, update, _ = map(_compile_program, programs.all)
     names = {**work_names(), "float": _Single, "X": np.zeros(programs.predicted_size, np.float32)}
     names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
     names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.extras.items()}
@@ -396,6 +396,6 @@ def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.
     return np.array(means)
 
 
-def _compiled(program: Program):
+def _compile_program(program: Program):
     text = "\n".join(program.text).replace("filter->", "")
     return compile(text, "<a filter in single precision>", "exec")

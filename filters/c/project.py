@@ -367,7 +367,7 @@ def write_project(
         "update": update,
         "draws": DRAWS.format(name=generated.name, members=programs.members) if programs.members else "",
         "alarms": "" if watch is None else TestsWriter(watch, generated.name, model.m, single).readme,
-        "board": _of_board(generated.name) if board else "",
+        "board": _board_section(generated.name) if board else "",
     }
     texts = {
         f"{generated.name}.h": generated.header,
@@ -386,7 +386,7 @@ def write_project(
     return files
 
 
-def _of_board(name: str) -> str:
+def _board_section(name: str) -> str:
     """The part of the README on the emulated controller."""
     build = BUILD.format(name=name, flags="-std=c99 -O2")
     return BOARD_README.format(build=build, emulate=EMULATE.format(name=name))

@@ -27,13 +27,13 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     """
     with np.errstate(over="ignore", invalid="ignore"):  # of a filter that has diverged: NaN
         if errors.shape[-1] <= LARGEST_BY_ENTRIES:
-            return _by_entries(errors, covs)
+            return _whiten_by_entries(errors, covs)
         if errors.ndim > 2:
-            return _by_runs(errors, covs)
-        return _by_columns(errors, covs)
+            return _whiten_by_runs(errors, covs)
+        return _whiten_by_columns(errors, covs)
 
 
-def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+def _whiten_by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     """`whitened` run by run, on all cores: NumPy lets other threads run meanwhile."""
     out = np.empty(errors.shape)
 
@@ -45,7 +45,7 @@ def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     return out
 
 
-def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+def _whiten_by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     d = errors.shape[-1]
     root: dict[tuple[int, int], np.ndarray] = {}
     solved: list[np.ndarray] = []
@@ -61,7 +61,7 @@ def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     return np.where(regular[..., None], np.stack(solved, axis=-1), np.nan)
 
 
-def _by_columns(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+def _whiten_by_columns(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     root, solved = np.zeros(covs.shape), np.empty(errors.shape)
     regular = np.ones(errors.shape[:-1], dtype=bool)
     for j in range(errors.shape[-1]):

@@ -104,11 +104,11 @@ def findings(
         _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late], mask),
         present,
         estimates.divergences,
-        None if measurements is None else longest_stretches(_without_padding(measurements, counted)[:, late]),
+        None if measurements is None else longest_stretches(_mask_padding(measurements, counted)[:, late]),
     )
 
 
-def _without_padding(measurements: np.ndarray, counted: np.ndarray | None) -> np.ndarray:
+def _mask_padding(measurements: np.ndarray, counted: np.ndarray | None) -> np.ndarray:
     """Measurements (B, K + 1, m), NaN after each run's last step that counts."""
     if counted is None:
         return measurements
@@ -129,15 +129,15 @@ def joined(parts: Sequence[Findings]) -> Findings:
     """Findings of all runs, from parts in their order."""
     present = [part.present for part in parts if part.present is not None]
     return Findings(
-        _joined([part.errors for part in parts]),
-        _joined([part.innovations for part in parts]),
+        _join_residuals([part.errors for part in parts]),
+        _join_residuals([part.innovations for part in parts]),
         np.concatenate(present) if present else None,
         np.concatenate([part.divergences for part in parts]),
         None if any(part.repeats is None for part in parts) else np.concatenate([part.repeats for part in parts]),
     )
 
 
-def _joined(parts: Sequence[Residuals]) -> Residuals:
+def _join_residuals(parts: Sequence[Residuals]) -> Residuals:
     values, whitened_ones, deviations = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Residuals(values, whitened_ones, deviations)
 
@@ -213,8 +213,8 @@ def report_of(
     if len(errors) < 2:
         raise ValueError(f"a consistency report must have at least two runs, but got {len(errors)}")
     n, m, present = errors.shape[-1], innovations.shape[-1], result.present
-    names = _named("names", names, n, "state")
-    channels = _named("channels", channels, m, "channel")
+    names = _component_names("names", names, n, "state")
+    channels = _component_names("channels", channels, m, "channel")
     measured = innovations if present is None else np.where(present, innovations, np.nan)
     crps = np.where(deviations > 0, gaussian_crps(errors, deviations), np.nan)
     expected = expected_gaussian_crps(deviations)
@@ -269,7 +269,7 @@ def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] 
     )
 
 
-def _named(rule: str, names: Sequence[str] | None, count: int, kind: str) -> tuple[str, ...]:
+def _component_names(rule: str, names: Sequence[str] | None, count: int, kind: str) -> tuple[str, ...]:
     """Names of `count` components, numbered if there are none; ValueError for another number of names."""
     names = tuple(names or (f"{kind} {i + 1}" for i in range(count)))
     if len(names) != count:

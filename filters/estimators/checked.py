@@ -43,13 +43,13 @@ class Checks:
         parts = returned if isinstance(returned, tuple) else (returned,)
         if not 1 <= len(parts) <= len(PARTS):
             raise ValueError(
-                f"{self._of} must give a mean, or a tuple of mean, covariance, innovation and its covariance, "
+                f"{self._label} must give a mean, or a tuple of mean, covariance, innovation and its covariance, "
                 f"but gave a tuple of {len(parts)} at {where}"
             )
         output = Output(*parts)
         if self._has_covariance and output.cov is None:
             raise ValueError(
-                f"{self._of} must give a covariance, or say has_covariance = False, but gave none at {where}"
+                f"{self._label} must give a covariance, or say has_covariance = False, but gave none at {where}"
             )
         checked = {
             name: None if value is None and name != "mean" else self._part(name, value, where, leading)
@@ -58,7 +58,7 @@ class Checks:
         return Output(**checked)
 
     @property
-    def _of(self) -> str:
+    def _label(self) -> str:
         return f"the estimator {self.name!r}"
 
     def _part(self, name: str, value, where: str, leading: tuple[int, ...]) -> np.ndarray:
@@ -74,11 +74,13 @@ class Checks:
         if array.shape != shape:
             got = f"shape {array.shape}" if array.size else short_repr(value)
             raise ValueError(
-                f"{NAMES[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
+                f"{NAMES[name]} of {self._label} must be numbers of shape {shape}, but got {got} at {where}"
             )
         if not np.isfinite(array).all():
             location = _first(~np.isfinite(array), leading)
-            raise ValueError(f"{NAMES[name]} of {self._of} must be finite, but it is not at {location or where}")
+            raise ValueError(
+                f"{NAMES[name]} of {self._label} must be finite, but it is not at {location or where}"
+            )
         return self._covariance(name, array, where, leading) if is_cov else array
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
@@ -89,7 +91,7 @@ class Checks:
         if wrong.any():
             location = _first(wrong, leading)
             raise ValueError(
-                f"{NAMES[name]} of {self._of} must be symmetric and positive semidefinite, "
+                f"{NAMES[name]} of {self._label} must be symmetric and positive semidefinite, "
                 f"but it is not at {location or where}"
             )
         return covs

@@ -91,11 +91,11 @@ class ForeignFilter(Filter):
         """
         means, covs, innovations, innovation_covs, likelihoods, divergences = out
         divergences[:] = 0.0
-        fill = self._at_once if callable(getattr(self.estimator, "run", None)) else self._one_by_one
+        fill = self._fill_at_once if callable(getattr(self.estimator, "run", None)) else self._fill_one_by_one
         fill(keys, inputs, measurements, (means, covs, innovations, innovation_covs))
         likelihoods[:] = log_likelihoods(innovations, innovation_covs, measurements, self.gaussian_likelihood)
 
-    def _at_once(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
+    def _fill_at_once(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
         generators, arguments = GlobalGenerators(), (keys.astype(np.int64), inputs.copy(), z.copy())
         seed = seed_of(arguments[0][0]) if len(keys) else 0
         generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
@@ -112,7 +112,7 @@ class ForeignFilter(Filter):
         for part, values in zip(out, Output(output.mean, output.cov, innovation, s), strict=True):
             part[...] = absent(part is out[1]) if values is None else values
 
-    def _one_by_one(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
+    def _fill_one_by_one(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
         session, again = self.session(), np.empty(out[0].shape[1:])
         for b in range(len(keys)):
             _run(session, b, (keys, inputs, z), tuple(part[b] for part in out))

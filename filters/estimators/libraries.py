@@ -91,27 +91,27 @@ class FilterPyEstimator(Estimator):
             if present.all():
                 filter_.update(measured, **self._arguments)
             else:
-                self._update_some(measured, present)
+                self._update_present(measured, present)
             innovation[present] = np.ravel(filter_.y)
             s[np.ix_(present, present)] = filter_.S
         return Output(np.ravel(filter_.x).copy(), np.array(filter_.P), innovation, s)
 
-    def _update_some(self, measured: np.ndarray, present: np.ndarray) -> None:
+    def _update_present(self, measured: np.ndarray, present: np.ndarray) -> None:
         """Update with the present channels alone; functions of angles see vectors of all channels."""
         filter_, arguments = self.filter, dict(self._arguments)
         if "residual" in arguments:
-            arguments["residual"] = _for_some(arguments["residual"], present)
+            arguments["residual"] = _restricted(arguments["residual"], present)
         originals = {name: getattr(filter_, name, None) for name in ("residual_z", "z_mean")}
         replaced = {
-            name: _for_some(function, present)
+            name: _restricted(function, present)
             for name, function in originals.items()
             if function not in (None, np.subtract)
         }
         vars(filter_).update(replaced)
-        filter_.update(measured, **{**arguments, **self._of_some(present)})
+        filter_.update(measured, **{**arguments, **self._reduced_arguments(present)})
         vars(filter_).update({name: originals[name] for name in replaced})
 
-    def _of_some(self, present: np.ndarray) -> dict:
+    def _reduced_arguments(self, present: np.ndarray) -> dict:
         """Arguments of an update with the present channels alone."""
         filter_, arguments = self.filter, self._arguments
         reduced = {"R": np.asarray(filter_.R)[np.ix_(present, present)]}
@@ -125,7 +125,7 @@ class FilterPyEstimator(Estimator):
         return reduced | {"hx": lambda x, **rest: np.asarray(filter_.hx(x, **rest))[present]}
 
 
-def _for_some(function: Callable, present: np.ndarray) -> Callable:
+def _restricted(function: Callable, present: np.ndarray) -> Callable:
     """Make a function of all channels one of the present channels; the others are zero."""
 
     def padded(part):
@@ -133,11 +133,11 @@ def _for_some(function: Callable, present: np.ndarray) -> Callable:
         out[..., present] = part
         return out
 
-    def of_some(first, second):
+    def of_present(first, second):
         weights = np.ndim(first) == 2  # a mean, of sigma points and their weights
         return np.asarray(function(padded(first), second if weights else padded(second)))[..., present]
 
-    return of_some
+    return of_present
 
 
 def _predict(filter: Any, u: np.ndarray) -> None:

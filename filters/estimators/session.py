@@ -73,13 +73,13 @@ class EstimatorSession:
 
     def set_dt(self, dt: float) -> None:
         """Raise ValueError: an estimator has no dt."""
-        raise self._fixed("dt")
+        raise self._fixed_error("dt")
 
     def set_parameter(self, name: str, value: float) -> None:
         """Raise ValueError: an estimator keeps its numbers to itself."""
-        raise self._fixed(str(name))
+        raise self._fixed_error(str(name))
 
-    def _fixed(self, name: str) -> ValueError:
+    def _fixed_error(self, name: str) -> ValueError:
         return ValueError(
             f"{name} of the estimator {self._filter.name!r} cannot vary from step to step, but got another "
             f"{name}: make the estimator for a model with it, or take a filter of filters.FILTERS"

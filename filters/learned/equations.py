@@ -37,7 +37,7 @@ class Equations:
 
     def moved_with_jacobian(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """f(x, u) over a whole step, (B, n), and df/dx, (B, n, n), along which nothing is differentiated."""
-        propagated, slopes = _WithSlopes.apply(x, u.numpy(), self._moved)
+        propagated, slopes = _WithSlopes.apply(x, u.numpy(), self._propagate)
         return self.of_state(propagated), slopes
 
     def measured(self, x: Tensor) -> Tensor:
@@ -46,17 +46,17 @@ class Equations:
 
     def measured_with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """h(x), (B, m), and dh/dx, (B, m, n), along which nothing is differentiated."""
-        return _WithSlopes.apply(x, np.zeros((len(x), self.model.inputs)), self._measured)
+        return _WithSlopes.apply(x, np.zeros((len(x), self.model.inputs)), self._observe)
 
     def transition(self, x: tuple[Tensor, ...], u: tuple[Tensor, ...], c: Any) -> tuple[Tensor, ...]:
         """The model's `transition` of components (...), for `filters.torch`."""
-        return self._of_components(0, x, u)
+        return self._evaluate_components(0, x, u)
 
     def observe(self, x: tuple[Tensor, ...], c: Any) -> tuple[Tensor, ...]:
         """The model's `observe` of components (...), for `filters.torch`."""
-        return self._of_components(1, x, (x[0],) * self.model.inputs)
+        return self._evaluate_components(1, x, (x[0],) * self.model.inputs)
 
-    def _of_components(self, which: int, x: tuple[Tensor, ...], u: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    def _evaluate_components(self, which: int, x: tuple[Tensor, ...], u: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         empty = x[0].new_zeros(x[0].numel(), 0)
         rows, inputs = (torch.stack(tuple(a), -1).flatten(0, -2) if len(a) else empty for a in (x, u))
         result = _WithSlopes.apply(rows, inputs.detach().numpy(), partial(self._at, which))[0]
@@ -70,14 +70,14 @@ class Equations:
         """A difference of measurements, its angles in (-pi, pi]."""
         return wrapped_where(z, self.model.shape.measurement_angles)
 
-    def _moved(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _propagate(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, jacobian = self._at(0, x, u)
         for _ in range(self.model.substeps - 1):
             x, slopes = self._at(0, x, u)
             jacobian = slopes @ jacobian
         return x, jacobian
 
-    def _measured(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _observe(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._at(1, x, u)
 
     def _at(self, which: int, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

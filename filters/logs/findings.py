@@ -213,7 +213,7 @@ def alarms_of(estimate: LogEstimate, monitor: Monitor, first: int = 0, *, isolat
         if channels < 2:
             raise ValueError("a faulty channel can be isolated among two or more, but the filter has one")
         without = tuple(
-            len(_statistical(_without(estimate, monitor, first, channel))) for channel in range(channels)
+            len(_statistical(_alarms_without(estimate, monitor, first, channel))) for channel in range(channels)
         )
     return LogAlarms(monitor, first, tuple(_alarms(estimate, monitor, first)), without)
 
@@ -225,7 +225,7 @@ def _alarms(estimate: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
     ]
 
 
-def _without(estimate: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
+def _alarms_without(estimate: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
     """Alarms of the other channels if the filter runs without one."""
     measurements = estimate.log.measurements.copy()
     measurements[:, channel] = np.nan

@@ -42,7 +42,9 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
     values: dict[Matrix, Any] = dict(known)
     for matrix in order:
         if matrix not in values:
-            arguments = (_with(a, matrix, values) if isinstance(a, Matrix) else a for a in matrix.arguments)
+            arguments = (
+                _argument_value(a, matrix, values) if isinstance(a, Matrix) else a for a in matrix.arguments
+            )
             if matrix.operation in CONSTANT:
                 size = matrix.arguments[0].shape
                 values[matrix] = torch.as_tensor(matrix.operation.compute(np.zeros(size)), dtype=like.dtype).to(
@@ -55,7 +57,7 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
     return values
 
 
-def _with(a: Matrix, result: Matrix, values: Mapping[Matrix, Any]) -> Any:
+def _argument_value(a: Matrix, result: Matrix, values: Mapping[Matrix, Any]) -> Any:
     """The value of an argument; a number, or a vector beside those of members, gets the result's dimensions."""
     value, missing = values[a], len(result.shape) + result.member - len(a.shape) - a.member
     return value[(..., *[None] * missing)] if result.operation in BY_ENTRIES and missing else value
@@ -76,7 +78,7 @@ def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
     return solution.mT if dimensions == 2 else solution[..., 0]
 
 
-def _only(dimensions: int, mask: Tensor, a: Tensor) -> Tensor:
+def _mask_missing(dimensions: int, mask: Tensor, a: Tensor) -> Tensor:
     return torch.where(mask if dimensions == 1 else mask[..., None], a, 0.0)
 
 
@@ -216,7 +218,7 @@ CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
     operations.quotient: _quotient,
-    operations.only: _only,
+    operations.only: _mask_missing,
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
     members.on_one_branch: _on_one_side,

@@ -148,7 +148,7 @@ def times(slope: Slope, factor: Callable[[], Number | float]) -> Slope:
     return None if slope is None else slope * factor()
 
 
-def _of_choice(y, condition, a, b, of_condition, da, db):
+def _choice_slope(y, condition, a, b, of_condition, da, db):
     return where(condition, 0.0 if da is None else da, 0.0 if db is None else db)
 
 
@@ -163,11 +163,11 @@ def _fading(slope: Slope, x: Number, factor: Callable[[], Number]) -> Slope:
     return _unless_zero(factor(), product) if product is not None and x.may_overflow else product
 
 
-def _of_quotient(y, a, b, da, db):
+def _quotient_slope(y, a, b, da, db):
     return added(times(da, lambda: 1.0 / b), _fading(db, b, lambda: -y / b))
 
 
-def _of_power(y, x, e, dx, de):
+def _power_slope(y, x, e, dx, de):
     by_base = times(dx, lambda: e * x ** (e - 1.0))
     if e.value is None:
         by_base = None if by_base is None else where((x == 0.0) & (e < 1.0), 0.0, by_base)
@@ -176,13 +176,13 @@ def _of_power(y, x, e, dx, de):
     return added(by_base, _unless_zero(x, times(de, lambda: y * abs(x).log())))
 
 
-def _of_angle(y, a, b, da, db):
+def _angle_slope(y, a, b, da, db):
     square = a * a + b * b
     slope = added(times(da, lambda: b / square), times(db, lambda: -a / square))
     return _unless_zero(square, slope)
 
 
-def _of_length(y, a, b, da, db):
+def _length_slope(y, a, b, da, db):
     """Half the slope of the square over the length; 0 at zero, as in between."""
     products = times(da, lambda: a), times(db, lambda: b)
     of_square = added(*map(_twice, products))
@@ -198,7 +198,7 @@ def _bell(x: Number) -> Number:
     return (2.0 / math.sqrt(math.pi)) * (-x * x).exp()
 
 
-def _none(y, *arguments):
+def _no_slope(y, *arguments):
     """No slope, for functions that are constant except for jumps."""
     return None
 
@@ -207,7 +207,7 @@ _RULES: dict[str, Callable] = {
     "+": lambda y, a, b, da, db: added(da, db),
     "-": lambda y, a, b, da, db: added(da, None if db is None else -db),
     "*": lambda y, a, b, da, db: added(times(da, lambda: b), times(db, lambda: a)),
-    "/": _of_quotient,
+    "/": _quotient_slope,
     "negative": lambda y, x, dx: -dx,
     "abs": lambda y, x, dx: where(x < 0.0, -dx, dx),
     "sqrt": lambda y, x, dx: _unless_zero(y, 0.5 * dx / y),
@@ -231,11 +231,11 @@ _RULES: dict[str, Callable] = {
     "arctanh": lambda y, x, dx: dx / ((1.0 - x) * (1.0 + x)),
     "erf": lambda y, x, dx: _fading(dx, x, lambda: _bell(x)),
     "erfc": lambda y, x, dx: _fading(dx, x, lambda: -_bell(x)),
-    "pow": _of_power,
-    "arctan2": _of_angle,
-    "where": _of_choice,
-    "hypot": _of_length,
+    "pow": _power_slope,
+    "arctan2": _angle_slope,
+    "where": _choice_slope,
+    "hypot": _length_slope,
     "fmod": lambda y, a, b, da, db: added(da, times(db, lambda: (y - a) / b)),
     "copysign": lambda y, a, b, da, db: times(da, lambda: where(a < 0.0, -1.0, 1.0) * where(y < 0.0, -1.0, 1.0)),
-    **dict.fromkeys((*CONDITIONS, "floor", "ceil", "rint"), _none),
+    **dict.fromkeys((*CONDITIONS, "floor", "ceil", "rint"), _no_slope),
 }

@@ -121,10 +121,10 @@ class _Writer:
 def functions_called_by(programs: Iterable[Program], single: bool) -> list[str]:
     """The functions of C that programs call, each once: work(given, found) in rounds."""
     calls = {number.arguments[0] for program in programs for number in program.works if number.operation == "call"}
-    return [_in_rounds(str(name), single) for name in sorted(calls)]
+    return [_function_in_rounds(str(name), single) for name in sorted(calls)]
 
 
-def _in_rounds(name: str, single: bool) -> str:
+def _function_in_rounds(name: str, single: bool) -> str:
     first, again, last, rounds, size = CALLED_IN_ROUNDS[name]()
     kind = "float" if single else "double"
     texts = [

@@ -213,53 +213,53 @@ class Number:
         """Whether it is true or false, and no float yet."""
         return self.operation in CONDITIONS
 
-    def _with(self, other) -> Number | None:
+    def _as_number(self, other) -> Number | None:
         """The other one as a Number of this graph; None where it is no number."""
         if isinstance(other, Number):
             return as_number(other)
         return self.graph.constant(other) if isinstance(other, (int, float)) or _is_scalar(other) else None
 
-    def _of_two(self, work: Callable, other, turned: bool = False):
+    def _binary(self, work: Callable, other, turned: bool = False):
         """What an operation makes of this number and another one, or of the two in turn."""
-        if (b := self._with(other)) is None:
+        if (b := self._as_number(other)) is None:
             return NotImplemented
         return work(b, as_number(self)) if turned else work(as_number(self), b)
 
     def __add__(self, other):
-        return self._of_two(total, other)
+        return self._binary(total, other)
 
     def __radd__(self, other):
-        return self._of_two(total, other, turned=True)
+        return self._binary(total, other, turned=True)
 
     def __sub__(self, other):
-        return self._of_two(difference, other)
+        return self._binary(difference, other)
 
     def __rsub__(self, other):
-        return self._of_two(difference, other, turned=True)
+        return self._binary(difference, other, turned=True)
 
     def __mul__(self, other):
-        return self._of_two(product, other)
+        return self._binary(product, other)
 
     def __rmul__(self, other):
-        return self._of_two(product, other, turned=True)
+        return self._binary(product, other, turned=True)
 
     def __truediv__(self, other):
-        return self._of_two(_over, other)
+        return self._binary(_over, other)
 
     def __rtruediv__(self, other):
-        return self._of_two(_over, other, turned=True)
+        return self._binary(_over, other, turned=True)
 
     def __mod__(self, other):
-        return self._of_two(modulus, other)
+        return self._binary(modulus, other)
 
     def __rmod__(self, other):
-        return self._of_two(modulus, other, turned=True)
+        return self._binary(modulus, other, turned=True)
 
     def __floordiv__(self, other):
-        return self._of_two(floor_quotient, other)
+        return self._binary(floor_quotient, other)
 
     def __rfloordiv__(self, other):
-        return self._of_two(floor_quotient, other, turned=True)
+        return self._binary(floor_quotient, other, turned=True)
 
     def __lt__(self, other):
         return self._compared("<", other)
@@ -281,7 +281,7 @@ class Number:
 
     def _compared(self, operation: str, other):
         """A condition; of numbers that are known now whether it holds."""
-        if (b := self._with(other)) is None:
+        if (b := self._as_number(other)) is None:
             return NotImplemented
         a = as_number(self)
         if a.value is not None and b.value is not None:
@@ -314,7 +314,7 @@ class Number:
         return unit if power == 0 else worked_out("pow", self, self.graph.constant(power))
 
     def __rpow__(self, base):
-        return self._with(base) ** self
+        return self._as_number(base) ** self
 
     def __divmod__(self, other):
         return self // other, self % other
@@ -385,7 +385,7 @@ def where(condition, a, b):
         return a if condition.value else b
     if not condition.is_condition:
         condition = condition != 0.0
-    a, b = known._with(a), known._with(b)  # type: ignore[union-attr]
+    a, b = known._as_number(a), known._as_number(b)  # type: ignore[union-attr]
     return a if a is b else condition.graph.make("where", condition, a, b)
 
 

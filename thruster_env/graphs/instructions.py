@@ -97,7 +97,7 @@ class Writer:
         """The vector of a number that is the same for all; a constant is one already."""
         if number.operation == "constant":
             return ir.Constant(self._vector, [number.value] * self._width)
-        return self._to_all(value, ir.Constant(value.type, ir.Undefined))
+        return self._broadcast(value, ir.Constant(value.type, ir.Undefined))
 
     def _pointer(self, location: Place) -> ir.Value:
         of_all = location.array in SIDE_BY_SIDE
@@ -111,9 +111,11 @@ class Writer:
         if of_all:
             return value
         nothing = ir.Constant(self._vector, ir.Undefined)
-        return self._to_all(self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing)
+        return self._broadcast(
+            self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing
+        )
 
-    def _to_all(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
+    def _broadcast(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
         lanes = ir.VectorType(ir.IntType(32), self._width)
         return self._builder.shuffle_vector(value, nothing, ir.Constant(lanes, [0] * self._width))
 
@@ -296,7 +298,7 @@ class _LoopWriter:
         each.store(body.stores)
         following = builder.add(at, ir.Constant(LONG, width))
         if body.sums:
-            left = self._to_all(builder.sub(self._size, at), ir.VectorType(LONG, width))
+            left = self._broadcast(builder.sub(self._size, at), ir.VectorType(LONG, width))
             counts = builder.icmp_signed("<", mask, left)
             for number, total in zip(body.sums, sums, strict=True):
                 value = each.values[number.of[0].place]
@@ -325,7 +327,7 @@ class _LoopWriter:
     def _lanes(self) -> ir.Value:
         return ir.Constant(ir.VectorType(LONG, self._width), list(range(self._width)))
 
-    def _to_all(self, value: ir.Value, vector: ir.VectorType) -> ir.Value:
+    def _broadcast(self, value: ir.Value, vector: ir.VectorType) -> ir.Value:
         first = self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
         lanes = ir.Constant(ir.VectorType(INT, self._width), [0] * self._width)
         return self._builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), lanes)

@@ -98,7 +98,7 @@ def _plain(result: Any) -> Any:
 def _is_caught() -> bool:
     """Whether the user's code that is running catches exceptions where it is."""
     frame = sys._getframe(2)
-    while frame is not None and frame.f_code is not _by_ieee.__code__:
+    while frame is not None and frame.f_code is not _call_with_ieee.__code__:
         if any(first <= frame.f_lasti < end for first, end in caught(frame.f_code)):
             return True
         frame = frame.f_back  # type: ignore[assignment]
@@ -106,11 +106,11 @@ def _is_caught() -> bool:
 
 
 @functools.cache
-def _in_place_of(module, name: str) -> Any:
+def _replacement(module, name: str) -> Any:
     """What a copy finds under a name in `math` or NumPy: functions of the latter in place of what raises."""
     function = getattr(module, name)
     if function is np.linalg:
-        return Module(np.linalg, _in_place_of)
+        return Module(np.linalg, _replacement)
     if not callable(function) or isinstance(function, type):
         return function
 
@@ -132,7 +132,7 @@ def _in_place_of(module, name: str) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def _copy(function: Callable) -> Callable:
-    return Copies(_in_place_of, {"float": Float}).called(function)
+    return Copies(_replacement, {"float": Float}).called(function)
 
 
 class Floats(np.ndarray):
@@ -188,7 +188,7 @@ def _is_real(value: Any) -> bool:
     return all(map(_is_real, value)) if isinstance(value, (tuple, list)) else not isinstance(value, complex)
 
 
-def _by_ieee(function: Callable, arguments: tuple) -> Any:
+def _call_with_ieee(function: Callable, arguments: tuple) -> Any:
     return _copy(function)(*with_floats(Float, arguments))
 
 
@@ -221,7 +221,7 @@ def with_python_floats(function: Callable, arguments: str = "", sizes=(), form=0
             if not any(isinstance(component, float) for component in arguments[0][:1]):  # Numbers or tensors
                 raise
         with np.errstate(all="ignore"):
-            for other in (_by_ieee, _by_numpy):
+            for other in (_call_with_ieee, _call_with_numpy):
                 with contextlib.suppress(*WITHOUT_VALUE):
                     return other(function, arguments)
         raise failure
@@ -232,7 +232,7 @@ def with_python_floats(function: Callable, arguments: str = "", sizes=(), form=0
     return stand_in(compiled_in_place_of(called, written, rounded_as=function), function)
 
 
-def _by_numpy(function: Callable, arguments: tuple) -> Any:
+def _call_with_numpy(function: Callable, arguments: tuple) -> Any:
     """The result for NumPy's scalars, for which 1/(x > 0) has a value; their `%` of conditions is wrong."""
     if needs_python(function) or any(rounds(part.__code__) for part in functions_in(function)):
         raise TypeError

@@ -133,7 +133,7 @@ def _interpolated(x, xp, fp, left=None, right=None, period=None):
             value = where(x < xp[j + 1], line, value)
         return where(x == x, where(x < xp[0], fp[0] if left is None else left, value), x)
 
-    return _of_entries(at)(x)
+    return _elementwise(at)(x)
 
 
 def _polynomial(p, x):
@@ -152,7 +152,7 @@ def _variance(a, axis=None, dtype=None, out=None, ddof=0, keepdims=False):
 
 def _selected(conditions, choices, default=0):
     for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
-        default = _in_place_of(np, "where")(condition, choice, default)
+        default = _replacement(np, "where")(condition, choice, default)
     return default
 
 
@@ -168,11 +168,11 @@ def _square_matrix(a) -> np.ndarray:
 def _determinant(a):
     """By the first row; that of no rows is 1."""
     a = _square_matrix(a) if len(a) else a
-    terms = [(-1.0) ** j * a[0, j] * _determinant(_without(a, 0, j)) for j in range(len(a))]
+    terms = [(-1.0) ** j * a[0, j] * _determinant(_minor(a, 0, j)) for j in range(len(a))]
     return sum(terms[1:], terms[0]) if terms else 1.0
 
 
-def _without(a: np.ndarray, row: int, column: int) -> np.ndarray:
+def _minor(a: np.ndarray, row: int, column: int) -> np.ndarray:
     return np.delete(np.delete(a, row, 0), column, 1)
 
 
@@ -180,7 +180,7 @@ def _solved(a, b):
     """X of A x = b, by the inverse's numerators and the determinant."""
     a, b = _square_matrix(a), np.asarray(b, dtype=object)
     indices = range(len(a))
-    numerators = [[(-1.0) ** (i + j) * _determinant(_without(a, j, i)) for j in indices] for i in indices]
+    numerators = [[(-1.0) ** (i + j) * _determinant(_minor(a, j, i)) for j in indices] for i in indices]
     return np.array(numerators, dtype=object) @ b / _determinant(a)
 
 
@@ -247,7 +247,7 @@ OF_ARRAYS: dict[str, Callable] = {
     "interp": _interpolated,
     "polyval": _polynomial,
     "var": _variance,
-    "std": lambda *arguments, **named: _in_place_of(np, "sqrt")(_variance(*arguments, **named)),
+    "std": lambda *arguments, **named: _replacement(np, "sqrt")(_variance(*arguments, **named)),
     "select": _selected,
 }
 """In place of NumPy's functions of vectors, where there is a Number among these."""
@@ -313,11 +313,11 @@ BUILTINS = {
 }
 
 
-def _in_place_of(module: types.ModuleType, name: str):
+def _replacement(module: types.ModuleType, name: str):
     """The replacement for a function of `math` or NumPy in traced functions."""
     value, name = getattr(module, name), OTHER_NAMES.get(name, name)
     if value is np.linalg:
-        return Module(np.linalg, _in_place_of)
+        return Module(np.linalg, _replacement)
     of_arrays = OF_MATRICES.get(name) if module is np.linalg else OF_ARRAYS.get(name) if module is np else None
     known = {} if module is np.linalg else (OF_MATH if module is math else ARRAYS)
     ours = of_arrays or known.get(name) or (None if module is np.linalg else FUNCTIONS.get(name))
@@ -329,12 +329,12 @@ def _in_place_of(module: types.ModuleType, name: str):
             return value(*arguments, **named)
         if module is math or of_arrays:
             return ours(*arguments, **named)
-        return _of_entries(ours)(*arguments, **named)
+        return _elementwise(ours)(*arguments, **named)
 
     return function
 
 
-def _of_entries(function: Callable) -> Callable:
+def _elementwise(function: Callable) -> Callable:
     """A function of numbers as one of arrays, too."""
 
     def of_arrays(*arguments, **named):
@@ -361,7 +361,7 @@ def traced(function: Callable) -> Callable:
     """
     if reason := needs_floats(function):
         raise TypeError(reason)
-    copy = Copies(_in_place_of, BUILTINS, silent=True).called(function)
+    copy = Copies(_replacement, BUILTINS, silent=True).called(function)
 
     def as_written(*arguments):
         known = next(_numbers_in(arguments), None)

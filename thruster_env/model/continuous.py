@@ -152,7 +152,7 @@ class ContinuousModel:
         object.__setattr__(self, "densities", covariance("densities", self.densities, len(mean)))
         if isinstance(self.observe, Mapping):
             channels = self.observe
-            object.__setattr__(self, "observe", _together(tuple(channels.values())))
+            object.__setattr__(self, "observe", _joint_observation(tuple(channels.values())))
             object.__setattr__(self, "arguments", {"measurements": list(channels), **self.arguments})
 
     @classmethod
@@ -283,7 +283,7 @@ def _check_constants(constants: Any) -> None:
 
 
 @makes_functions
-def _together(functions: tuple[Callable, ...]) -> Callable:
+def _joint_observation(functions: tuple[Callable, ...]) -> Callable:
     """`observe(x, c)` of a function h_i(x, c) a channel."""
     names: dict[str, Any] = {f"h_{i}": inlined(function) for i, function in enumerate(functions)}
     return written_out("observe", "x, c", tuple_of(f"{name}(x, c)" for name in names), **names)

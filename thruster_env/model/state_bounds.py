@@ -61,10 +61,10 @@ def scales_of(model) -> np.ndarray:
     scales = np.sqrt(np.diag(model.prior_cov) + np.diag(model.process_noise_cov))
     if (scales > 0.0).all():
         return scales
-    start = _moved(model, model.prior_mean)
+    start = _propagated(model, model.prior_mean)
     shares = 0.75 + 0.25 * np.cos(np.arange(model.n))  # unequal, so that no two changes cancel
     for _ in range(model.n):
-        reached = _sizes(_moved(model, model.prior_mean + shares * scales) - start)
+        reached = _sizes(_propagated(model, model.prior_mean + shares * scales) - start)
         if not ((scales == 0.0) & (reached > 0.0)).any():
             break
         scales = np.where(scales > 0.0, scales, reached)
@@ -78,7 +78,7 @@ def _sizes(changes: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(changes), abs(changes), 0.0)
 
 
-def _moved(model, x: np.ndarray) -> np.ndarray:
+def _propagated(model, x: np.ndarray) -> np.ndarray:
     """The state after x with inputs of zero, as Python has it; NaN where there is none."""
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
