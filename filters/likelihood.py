@@ -47,10 +47,8 @@ def likelihood(
         measurements: (B, K + 1, m); NaN where missing.
         q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
-        filter: one of `differentiated.differentiable.KINDS`, or your own, of which the type and its own parameters
-            count: it is used with `model` in place of its own.
-        own_slopes: how `own_parameters` of the filter change, (parameters, count); not at
-            all if None.
+        filter: one of `differentiated.runs.KINDS`, or your own; its model is replaced by `model`.
+        own_slopes: slopes of the filter's `own_parameters`, (parameters, count); zero if None.
 
     Raises:
         ValueError: if shapes do not fit, or for another filter.

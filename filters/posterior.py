@@ -175,7 +175,7 @@ def _least_direction(q: np.ndarray) -> float:
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance, of whatever variances: it enters the recursion itself, as a weight."""
+    """The inverse of a covariance of any magnitude, which enters the recursion as a weight."""
     scaled, deviations = correlations(cov)
     return np.linalg.inv(scaled) / deviations / deviations[:, None]
 

@@ -60,9 +60,9 @@ def sensitivity(
             with: such as a load cell that is there for the identification only. Their prediction errors enter as
             innovations do. As nothing corrects them, they are correlated in time, and the information is
             overestimated.
-        starts: of trajectories that do not begin as the prior says: their priors do not move with parameters
-            (unless they are not held), and the innovations of their lead-ins do not count. That is the likelihood
-            of what follows, given them.
+        starts: of trajectories that do not begin at the prior: parameters do not move their priors (unless these
+            are not held), and the innovations of their lead-ins do not count. The likelihood is that of the other
+            measurements, given the lead-ins.
         filter: as `likelihood` takes it; the (extended) Kalman filter by default.
         own_slopes: as `likelihood` takes them.
 

@@ -28,7 +28,7 @@ UNKNOWN = "numbers of the filter itself overflow, or a variance became negative 
 
 
 class RestartWarning(RuntimeWarning):
-    """A filter restarted from the prior, so that what it knew is lost."""
+    """A filter restarted from the prior, so its estimate so far is lost."""
 
 
 class Restarts(NamedTuple):

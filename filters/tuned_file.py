@@ -233,7 +233,7 @@ def _check_version(path: str | Path, version) -> None:
 
 
 def _check_filter(entry, known: tuple[str, ...] | None) -> None:
-    """Raise ValueError unless an entry names a filter, some of its numbers, and what it assumes, all as data.
+    """Raise ValueError unless an entry names a filter, some of its numbers and its model's arguments, as data.
 
     Arguments of the model are those that are known, or any names if None.
     """

@@ -111,7 +111,7 @@ def is_taken(name: str, texts: Iterable[str]) -> bool:
 
 
 def _strip_comments(text: str) -> str:
-    """A text of C without its comments, strings and characters, of which one may be a quote."""
+    """C code without its comments, strings and character constants, one of which may be a quote."""
     return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)
 
 
@@ -348,7 +348,7 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
 
     Args:
         filter_: the filter.
-        programs: what it is made of.
+        programs: its programs.
         inputs: u of a run, (K, p).
         z: its measurements, (K + 1, m).
     """

@@ -157,7 +157,7 @@ def c_filter(
     return called(name)
 
 
-# How many bytes a filter in C takes: its struct, its stack, and its code, as gcc tells.
+# Bytes of a filter in C according to gcc: its struct, its stack and its code.
 
 
 CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"

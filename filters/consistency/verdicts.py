@@ -47,7 +47,7 @@ SIGNIFICANT = 0.05
 NEVER = ("dt", "time_step")  # constants that are no quantity of the plant
 EVEN = "even, as far as these runs show"
 MOST_CONSTANTS = 8  # of a model, that are named
-MOST_STATES = 6  # of which there are sentences
+MOST_STATES = 6  # that get a sentence
 NO_TRUTH = "These data have no truth: the following is based on the innovations alone."
 
 

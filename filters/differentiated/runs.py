@@ -79,7 +79,7 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
     return Differentiable(used.kernel_model, used.written_page, used.own_parameters)
 
 
-STEP = 1e-6  # of parameters, of which 1 is a sensible change
+STEP = 1e-6  # of parameters, which are scaled to sensible changes of 1
 
 
 class ModelSlopes(NamedTuple):

@@ -115,11 +115,11 @@ def log_likelihoods(
 ) -> np.ndarray:
     """Log-likelihood of measurements, log N(innovation; 0, S) over the channels present, (B, K + 1).
 
-    It is 0 where nothing was measured, and NaN where something was, but it or S is not given (NaN), not positive
-    definite, or not the covariance of a Gaussian.
+    It is 0 where nothing was measured. It is NaN where an innovation or S is missing, where S is not positive
+    definite, and if the likelihood is not Gaussian.
 
     Args:
-        innovations: (B, K + 1, m), of which those of missing channels do not matter.
+        innovations: (B, K + 1, m); those of missing channels do not matter.
         covs: S, (B, K + 1, m, m), likewise.
         measurements: (B, K + 1, m), NaN where missing.
         gaussian: whether the likelihood is Gaussian.

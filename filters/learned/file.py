@@ -81,8 +81,8 @@ class TrainedEstimator:
     def _check(self, model: StateSpaceModel, needs_model: bool) -> None:
         """Raise ValueError for another model; without a model's equations for other names and units of quantities.
 
-        Names that nobody has chosen, such as x_1 without a unit, are those of any plant, and so are missing ones:
-        then the equations must agree.
+        Default names, such as x_1 without a unit, or missing names do not identify a plant: then the equations
+        must agree.
         """
         quantities = quantities_of(model)
         if model.digest == self._digest:

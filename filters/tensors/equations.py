@@ -27,7 +27,7 @@ from thruster_env.graphs.folding import POSITIVE, as_single
 from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
 from thruster_env.model.shape import Shape, constants_are_array
 
-# Graphs of numbers, worked out of tensors: an operation of torch for each number, for a whole batch.
+# Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
 
 
 WORK: dict[str, Callable] = {
@@ -129,10 +129,10 @@ def sizes_of(further_arguments: int, shape: Shape) -> tuple[int, ...]:
 
 
 class OfGraph:
-    """An equation whose function can be traced; the Jacobian shares with the value what it can."""
+    """An equation whose function can be traced; the Jacobian shares operations with the value."""
 
     def __init__(self, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape):
-        """Trace the function, and raise whatever it raises of numbers that are not known yet."""
+        """Trace the function; raises any exception of the function."""
         value, matrix, *_ = Traced(function, jacobian, further_arguments, shape).parts
         graph = Graph(MOST)
         x, *rest = (
@@ -345,7 +345,7 @@ def equation_of(
         raise ValueError(f"{name}_jacobian must come with {name}, but got it alone")
     try:
         return OfGraph(*of_model, further_arguments, shape)
-    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+    except Exception:  # a user's function cannot be traced, whatever it raises: it is called instead
         if reason := needs_floats(*of_model):
             raise ValueError(f"{name} must accept tensors, but {reason}") from None
         return Called(name, *of_model, shape, of_floats=True)

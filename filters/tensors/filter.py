@@ -269,10 +269,10 @@ class TensorFilter:
         return replaced
 
     def init(self, batch: int | tuple[int, ...] = (), key: Any = (0, 0)) -> TensorBelief:
-        """The prior, for a batch of so many trajectories, or of such a shape.
+        """The prior for a batch of trajectories.
 
         Args:
-            batch: its size or shape.
+            batch: its size or its shape.
             key: two whole numbers, or (..., 2) for a batch, on which an ensemble's random numbers depend.
         """
         shape, key = (batch,) if isinstance(batch, int) else tuple(batch), np.asarray(key, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a plain function of floats computes, as a graph of numbers, and programs made of such graphs.
+"""Plain functions of floats as graphs of numbers, and programs made from these graphs.
 
 graphs, folding, tracing          the graph of a function
 branches                          the same of a function that decides: a choice between what it does on each side

@@ -1,4 +1,4 @@
-"""A program as statements of C99, which read arrays, work out numbers, and store them.
+"""A program as statements of C99, which read arrays, evaluate numbers, and store them.
 
     const double t0 = x[0];
     const double t1 = 0.5 * t0;

@@ -201,7 +201,7 @@ class Number:
         return f"<number {self.place}: {self.operation}>"
 
     def __format__(self, spec: str) -> str:
-        return repr(self)  # of a message, which nobody reads: what makes a float of it raises TypeError
+        return repr(self)  # for messages only; a conversion to float raises TypeError
 
     def __bool__(self) -> bool:
         if self.graph.decide is None:

@@ -220,7 +220,7 @@ class Writer:
 
 
 def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
-    """The function of some arguments of a kind that returns such a one, by its name."""
+    """The external function of this name, with `count` arguments and a result of one type."""
     return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
 
 

@@ -45,9 +45,9 @@ class Cut(NamedTuple):
     """A program as turns.
 
     Attributes:
-        reads: numbers that are the same for all members, read at first.
-        turns: what is done, in this order.
-        stores: of such numbers, at last.
+        reads: numbers that are the same for all members, read first.
+        turns: the turns in their order.
+        stores: of numbers that are the same for all members, last.
         rows: how many rows of the table it uses.
     """
 

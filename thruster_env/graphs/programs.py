@@ -66,7 +66,7 @@ class Place(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Numbers that are read, worked out, and stored."""
+    """Numbers that are read, evaluated and stored."""
 
     reads: list[tuple[Place, Number]]
     works: list[Number]
@@ -151,7 +151,7 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
 
 
 class Text:
-    """Lines of a program, and what runs them as Python, once somebody has."""
+    """Lines of a program, and the Python function made from them at its first call."""
 
     def __init__(self, lines: list[str]):
         """Take the lines."""

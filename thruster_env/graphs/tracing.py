@@ -301,7 +301,7 @@ ARRAYS: dict[str, Callable] = {
     "ones": _filled(1.0),
     "float64": _Float,
 }
-"""In place of functions of NumPy, whatever they get."""
+"""Replacements for functions of NumPy, for any arguments."""
 
 BUILTINS = {
     "max": _largest,
@@ -309,7 +309,7 @@ BUILTINS = {
     "float": _Float,
     "bool": _condition,
     "pow": pow,
-    "print": lambda *_, **__: None,  # of numbers that nobody knows
+    "print": lambda *_, **__: None,  # the numbers are unknown
 }
 
 

@@ -194,7 +194,7 @@ def digest_of(model: StateSpaceModel) -> str:
 
 
 def _points(sizes: tuple[int, ...]) -> list[list[tuple[float, ...]]]:
-    """Vectors of the sizes for each point, of which every other one has positive components only."""
+    """Vectors of the sizes for each point; every other point has positive components only."""
     points = []
     for k, magnitude in enumerate(MAGNITUDES):
         signs = (1.0, -1.0) if k % 2 else (1.0, 1.0)
