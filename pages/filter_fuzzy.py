@@ -45,7 +45,7 @@ def picture(path: Path) -> Path:
         for label, filter_ in filters.items():
             errors[label].append(errors_of(filter_, runs)[1])
             if width == SHOWN_WIDTH:
-                estimate = run(filter_, *runs.given).means[0, :, 1]
+                estimate = run(filter_, *runs.arguments).means[0, :, 1]
                 right.plot(times(len(estimate)), estimate, **looks[label])
         if width == SHOWN_WIDTH:
             right.plot(times(501), runs.states[0, :, 1], **STYLES["truth"])
@@ -83,7 +83,7 @@ def _rows(name: str, model: StateSpaceModel, runs: Runs, filters: dict[str, Filt
     filters = filters | {f"`{other}`": make_filter(other, model) for other in ("kf", "ekf")}
     rows, first = [], None
     for label, filter_ in filters.items():
-        estimates = run(filter_, *runs.given)
+        estimates = run(filter_, *runs.arguments)
         errors = (estimates.means - runs.states)[:, FIRST_SCORED_STEP:]
         squares = (errors**2).mean(axis=1)  # of each run, (B, 2)
         cells = [name if first is None else "", label]

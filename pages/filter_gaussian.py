@@ -42,9 +42,9 @@ def kalman(path: Path) -> Path:
     left, right = figure.subplots(1, 2, width_ratios=(2, 3))
     tidy((left, right))
     for name, filter_ in filters.items():
-        errors = [rmse(run(filter_, *runs.given), runs)[1] for runs in steady]
+        errors = [rmse(run(filter_, *runs.arguments), runs)[1] for runs in steady]
         left.plot(voltages, errors, label=names[name], **STYLES[name])
-        estimate = run(filter_, *reversing.given).means[0, :, 1]
+        estimate = run(filter_, *reversing.arguments).means[0, :, 1]
         right.plot(times(len(estimate)), estimate, **STYLES[name])
     right.plot(times(501), reversing.states[0, :, 1], **STYLES["truth"])
     left.plot([], [], label="truth", **STYLES["truth"])
@@ -105,7 +105,7 @@ def sigma_points(path: Path) -> Path:
     tidy((left, right))
     runs, model, window = held_runs(1, **PUBLISHED_NOISE), thruster_model(**PUBLISHED_NOISE), slice(50, 201)
     for name in ("ekf", "ukf", "gsf"):
-        estimates = run(make_filter(name, model), *runs.given)
+        estimates = run(make_filter(name, model), *runs.arguments)
         error, spread = (part[0, window] for part in (estimates.means[..., 1], deviations(estimates, 1)))
         error = error - runs.states[0, window, 1]
         left.plot(times(501)[window], error, **(STYLES[name] | {"linewidth": 1.2}))
@@ -178,5 +178,5 @@ def _over_the_bound(names: tuple[str, ...], std: float) -> list[float]:
 
 
 def _smoothed_rmse(filter_, runs, lag: int) -> float:
-    errors = smooth(filter_, *runs.given, lag=lag).means[..., 1] - runs.states[..., 1]
+    errors = smooth(filter_, *runs.arguments, lag=lag).means[..., 1] - runs.states[..., 1]
     return float((errors[:, FIRST_SCORED_STEP:] ** 2).mean() ** 0.5)

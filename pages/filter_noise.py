@@ -77,7 +77,7 @@ def baselines(path: Path) -> Path:
     for axis, flow in zip(axes, (0.0, 1.0), strict=True):
         runs, window = held_runs(1, ambient_velocity=flow), slice(100, 251)
         for name in ("inversion", "low-pass", "open-loop", "ekf"):
-            estimate = run(make_filter(name, thruster_model()), *runs.given).means[0, window, 1]
+            estimate = run(make_filter(name, thruster_model()), *runs.arguments).means[0, window, 1]
             axis.plot(times(501)[window], estimate, label=name, **STYLES[name])
         axis.plot(times(501)[window], runs.states[0, window, 1], label="truth", **STYLES["truth"])
         axis.set_title(f"ambient flow {flow:g} m/s, believed to be 0", fontsize=10)
@@ -99,7 +99,7 @@ def augmented(path: Path) -> Path:
     }
     for label, (amplitude, start, colour) in examples.items():
         runs = held_runs(1, amplitude, ambient_velocity=0.6, **start)
-        estimates = run(ExtendedKalmanFilter(model=joint), *runs.given)
+        estimates = run(ExtendedKalmanFilter(model=joint), *runs.arguments)
         mean, spread = estimates.means[0, :, 2], deviations(estimates, 2)[0]
         left.plot(times(501), mean, color=colour, label=label)
         left.fill_between(
@@ -136,8 +136,8 @@ def varying(path: Path) -> Path:
     left, right = figure.subplots(1, 2)
     tidy((left, right))
     covs = (stds**2)[:, None, None]
-    known = run(ExtendedKalmanFilter(model=model), *runs.given, measurement_noise_covs=covs)
-    fixed = run(ExtendedKalmanFilter(model=model), *runs.given)
+    known = run(ExtendedKalmanFilter(model=model), *runs.arguments, measurement_noise_covs=covs)
+    fixed = run(ExtendedKalmanFilter(model=model), *runs.arguments)
     for label, estimates, colour, dashes in (("R of each step", known, BLUE, "-"), ("one R", fixed, RUST, "--")):
         squares = ((estimates.means[..., 1] - runs.states[..., 1]) ** 2).mean(axis=0)
         smooth = np.sqrt(np.convolve(squares, np.ones(10) / 10, "same"))
@@ -152,7 +152,7 @@ def varying(path: Path) -> Path:
     for share in shares:
         dropout = [{"name": "dropout", "probability": share, "mean_length": 20.0}] if share else []
         runs = held_runs(sensors={"thrust": dropout})
-        filled = runs._replace(measurements=_held(runs.measurements))
+        filled = runs._replace(measurements=_last_valid(runs.measurements))
         cases = ((ExtendedKalmanFilter, runs), (ExtendedKalmanFilter, filled))
         for values, (kind, data) in zip(errors.values(), cases, strict=False):
             values.append(errors_of(kind(model=model), data)[1])
@@ -177,7 +177,7 @@ def _learnt_noise(filter_, runs: Runs, number: int) -> list[float]:
     return noises
 
 
-def _held(measurements: np.ndarray) -> np.ndarray:
+def _last_valid(measurements: np.ndarray) -> np.ndarray:
     """Measurements (B, K + 1, 1) with the last valid one, 0 at first, where one is missing."""
     measured = ~np.isnan(measurements)
     last = np.maximum.accumulate(np.where(measured, np.arange(measurements.shape[1])[None, :, None], -1), axis=1)

@@ -37,7 +37,7 @@ class Runs(NamedTuple):
     states: np.ndarray  # (B, K + 1, 2)
 
     @property
-    def given(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The arguments of `filters.run`."""
         return self.keys, self.inputs, self.measurements
 
@@ -72,7 +72,7 @@ def nees(estimates: Estimates, runs: Runs) -> float:
 
 def errors_of(filter_: Filter, runs: Runs) -> tuple[float, float, float]:
     """RMSE of omega_m [rad/s], RMSE of U_a [m/s] and mean NEES of a filter."""
-    estimates = run(filter_, *runs.given)
+    estimates = run(filter_, *runs.arguments)
     return (*rmse(estimates, runs), nees(estimates, runs))
 
 

@@ -67,7 +67,7 @@ def modes(path: Path) -> Path:
     figure = new_figure((9.6, 3.8))
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     tidy((left, right))
-    recorded = record_members(ParticleFilter(model=model, ensemble_size=20_000), *runs.given)
+    recorded = record_members(ParticleFilter(model=model, ensemble_size=20_000), *runs.arguments)
     edges, steps = np.linspace(-12, 12, 97), range(window.start, window.stop)
     density = np.array(
         [np.histogram(recorded.members[0, k, 0], edges, weights=recorded.weights[0, k])[0] for k in steps]
@@ -106,4 +106,4 @@ def modes(path: Path) -> Path:
 
 
 def _mean(filter_, runs: Runs) -> np.ndarray:
-    return run(filter_, *runs.given).means[0, :, 0]
+    return run(filter_, *runs.arguments).means[0, :, 0]

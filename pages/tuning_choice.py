@@ -51,7 +51,10 @@ class Case(NamedTuple):
     """Logs or runs, and the Q and R that the user had."""
 
     about: str
-    given: tuple[float, float] = (1.0, 1.0)  # factors on Q and R: of the plant, or of the optimum on other logs
+    user_factors: tuple[float, float] = (
+        1.0,
+        1.0,
+    )  # factors on Q and R: of the plant, or of the optimum on other logs
     runs: Mapping[str, Any] = {}  # of `simulated`, for all logs
     second: Mapping[str, Any] | None = None  # of the second of three logs, if it differs
     rows: int = ROWS
@@ -246,7 +249,7 @@ def case_rates(case: Case, truth: bool, studies: int = STUDIES, chunk: int = CHU
     """
     plan, counts = plan_of(truth), np.zeros((2, 3))
     start = _optimum(case.runs) if case.from_optimum else np.array([Q, R])
-    grid = np.vstack([GRID, start * case.given])
+    grid = np.vstack([GRID, start * case.user_factors])
     for first in range(0, studies, chunk):
         generator = np.random.default_rng(first)
         count = min(chunk, studies - first)

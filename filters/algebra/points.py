@@ -215,7 +215,7 @@ def _hats(result: tuple, u: tuple, nodes: tuple) -> Callable:
         sides = [f"(u[0] - x[{s - 1}]) / (x[{s}] - x[{s - 1}])"] * (s > 0)
         sides += [f"(x[{s + 1}] - u[0]) / (x[{s + 1}] - x[{s}])"] * (s < result[0] - 1)
         source.line(f"{weights[s]} = max(0.0, min(1.0, {', '.join(sides)}))")
-    return source.function(source.whole(weights))
+    return source.function(source.all_entries(weights))
 
 
 FUNCTIONS: dict[Operation, Callable] = {

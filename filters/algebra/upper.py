@@ -185,7 +185,7 @@ def _of_arrays(function: Callable, part: str = "") -> Callable:
         out = source.local("out", *result)
         source.line(f"out = work({', '.join(source.array_of(name) for name in named)}){part}")
         names: dict[str, Any] = {"work": function}
-        return source.function(source.whole(out), **names)
+        return source.function(source.all_entries(out), **names)
 
     return make
 

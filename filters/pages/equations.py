@@ -213,7 +213,7 @@ def _by_columns(function: Callable, arguments: str, rows: int, **matrices: Any) 
     for i in store.range(rows):
         store.line(f"out[{i}, j] = y[{i}]")
     column = entrywise("column", "x, j", (n,), lambda i: f"x[{i}, j]")
-    return source.function(source.whole(out), function=function, column=column, store=store.function())
+    return source.function(source.all_entries(out), function=function, column=column, store=store.function())
 
 
 class PagedModel:

@@ -42,7 +42,7 @@ class DepthAndCourse:
     plant: Plant
     task: Task
     seen: str  # what observations begin with, one of SEEN
-    places: dict[str, int]  # of theta, q, r and u in an observation
+    index_of: dict[str, int]  # of theta, q, r and u in an observation
     look_ahead: float = 1.2  # L [m]
     depth_gain: float = 1.0  # k_z
     depth_integral: float = 0.2  # k_i [1/s]
@@ -85,7 +85,7 @@ class DepthAndCourse:
         integral, piece = np.moveaxis(
             remembered(state, episode_start, np.zeros((*observation.shape[:-1], 2))), -1, 0
         )
-        u, q, r, theta = (observation[..., self.places[name]] for name in ("u", "q", "r", "theta"))
+        u, q, r, theta = (observation[..., self.index_of[name]] for name in ("u", "q", "r", "theta"))
         across, below, course, piece = self._errors(observation, piece)
         pitch = np.arctan((self.depth_gain * below + integral) / self.look_ahead)
         limited = np.clip(pitch, -self.largest_pitch, self.largest_pitch)

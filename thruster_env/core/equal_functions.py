@@ -86,7 +86,7 @@ def first_equal(value: Any) -> Any:
     value = bound_call(value)
     try:
         with _finding:
-            return _found(value)
+            return _first_of(value)
     except TypeError:  # nothing that a weak reference can be had of
         return value
 
@@ -108,7 +108,7 @@ def original_of(value: Any) -> Any:
         return value
 
 
-def _found(value: Any) -> Any:
+def _first_of(value: Any) -> Any:
     key = _key_of(value)
     first = None if key is None else _first.get(key)
     if first is not None and (first is value or _key_of(first) == key):  # it may read other values since

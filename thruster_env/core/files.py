@@ -20,7 +20,7 @@ def check_target(path: str | Path) -> None:
     """Raise ValueError if a file could not be written there, before long work is done for it."""
     path = Path(path)
     try:
-        status = _found(path)
+        status = _status(path)
         if status is not None and not _is_replaced(status):
             return
         target = _target(path)
@@ -62,7 +62,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     content = content.encode() if isinstance(content, str) else content
     path = Path(path)
     try:
-        status = _found(path)
+        status = _status(path)
         if status is None or _is_replaced(status):
             _replace(_target(path), content, status)
         else:
@@ -72,7 +72,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
         raise _refusal(path, error) from None
 
 
-def _found(path: Path) -> os.stat_result | None:
+def _status(path: Path) -> os.stat_result | None:
     """The status of an existing file, links followed; OSError if it cannot be written."""
     try:
         status = os.stat(path)

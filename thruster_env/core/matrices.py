@@ -286,7 +286,7 @@ def row_solver(rows: int, size: int) -> Callable:
         for i in source.reversed(size):
             rest = source.less(y[r, i], (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
             source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
-    return source.function(source.whole(x))
+    return source.function(source.all_entries(x))
 
 
 @cache
@@ -297,7 +297,7 @@ def vector_solver(size: int) -> Callable:
     for i in source.reversed(size):
         rest = source.less(y[i], (f"l[{k}][{i}] * {x[k]}" for k in source.range(i + 1, size)))
         source.line(f"{x[i]} = ({rest}) / l[{i}][{i}]")
-    return source.function(source.whole(x))
+    return source.function(source.all_entries(x))
 
 
 @cache
@@ -310,7 +310,7 @@ def triangle_divider(rows: int, size: int) -> Callable:
         for i in source.reversed(size):
             rest = source.less(f"b[{r}][{i}]", (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
             source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
-    return source.function(source.whole(x))
+    return source.function(source.all_entries(x))
 
 
 def _forward(source: Source, size: int, each: Callable = lambda i, y: None, missing: str = "") -> Local:
@@ -327,7 +327,7 @@ def _forward(source: Source, size: int, each: Callable = lambda i, y: None, miss
 def forward_solver(size: int) -> Callable:
     """Return `solve(l, v)`: the tuple l^-1 v, for l lower triangular and v of `size` components."""
     source = Source("solve", "l, v", result=(size,), l=(size, size), v=(size,), work=size * size // 2)
-    return source.function(source.whole(_forward(source, size)))
+    return source.function(source.all_entries(_forward(source, size)))
 
 
 @cache
@@ -340,7 +340,7 @@ def column_solver(size: int, columns: int) -> Callable:
         for i in source.range(size):
             rest = source.less(f"b[{i}][{c}]", (f"l[{i}][{k}] * {y[k, c]}" for k in source.range(i)))
             source.line(f"{y[i, c]} = ({rest}) / l[{i}][{i}]")
-    return source.function(source.whole(y))
+    return source.function(source.all_entries(y))
 
 
 @cache

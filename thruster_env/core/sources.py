@@ -304,7 +304,7 @@ class Source:
         out = self.local(f"{self._fresh('v')}", count)
         for i in self.range(count):
             self.line(f"{out[i]} = {entry(i)}")
-        return self.whole(out)
+        return self.all_entries(out)
 
     def matrix(self, rows: int, columns: int, entry: Callable) -> str:
         """Source of a matrix whose entries have the sources entry(i, j)."""
@@ -314,7 +314,7 @@ class Source:
         for i in self.range(rows):
             for j in self.range(columns):
                 self.line(f"{out[i, j]} = {entry(i, j)}")
-        return self.whole(out)
+        return self.all_entries(out)
 
     def entries(self, shape: tuple[int, ...], entry: Callable) -> str:
         """Source of a vector or matrix of this shape, as `vector` or `matrix` has it."""
@@ -328,7 +328,7 @@ class Source:
                 self.line(f"{out[i, j]} = {entry(i, j)}")
         return self.mirrored(out)
 
-    def whole(self, local: Local) -> str:
+    def all_entries(self, local: Local) -> str:
         """Source of a local vector or matrix, of its lower triangle if ..."""
         return self._value(local, lambda i, j: local[i, j])
 
@@ -461,7 +461,7 @@ def joiner(first: int, second: int) -> Callable:
         source.line(f"{both[i]} = x[{i}]")
     for i in source.range(second):
         source.line(f"{both[i + first]} = y[{i}]")
-    return source.function(source.whole(both))
+    return source.function(source.all_entries(both))
 
 
 def assembled(name: str, arguments: str, shape: tuple[int, int], parts: dict) -> Callable:
@@ -486,7 +486,7 @@ def assembled(name: str, arguments: str, shape: tuple[int, int], parts: dict) ->
         for i in source.range(size[0]):
             for j in source.range(size[1]):
                 source.line(f"{matrix[i + top, j + left]} = {part}[{i}][{j}]")
-    return source.function(source.whole(matrix))
+    return source.function(source.all_entries(matrix))
 
 
 @cache

@@ -107,9 +107,9 @@ class Registry:
             raise ValueError(
                 f"{self.argument} must be a list of mappings with a name, but got {short_repr(effects)}"
             )
-        return tuple(self._make_one(entry) for entry in effects)
+        return tuple(self._make_effect(entry) for entry in effects)
 
-    def _make_one(self, entry) -> Effect:
+    def _make_effect(self, entry) -> Effect:
         known: tuple[type[Effect], ...] = tuple(self.effects.values())
         if isinstance(entry, known):
             return entry

@@ -71,17 +71,17 @@ class ModelEnv(gym.Env):
         """Draw a key from the env's generator, and by it an initial state and a first measurement."""
         super().reset(seed=checked_seed(seed))
         self._key, self._step = draw_key(self.np_random), 0
-        return self._moved()
+        return self._propagated()
 
     def step(self, action):
         """Apply an input (p,), clipped to its bounds, for one step; ValueError for one that is not p numbers."""
         inputs = some_numbers(action, self.truth.input_quantities)
         self._u[:] = np.clip(inputs, self.action_space.low, self.action_space.high)
         self._step += 1
-        observation, info = self._moved()
+        observation, info = self._propagated()
         return observation, 0.0, False, False, info
 
-    def _moved(self) -> tuple[np.ndarray, dict]:
+    def _propagated(self) -> tuple[np.ndarray, dict]:
         move = _mover(*truth_steps_of(self.truth), max(self.truth.n, self.truth.m), is_interpreting())
         move(self._x, self._z, self._u, self._step, self._key, self._numbers)
         return self._z.copy(), {"state": self._x.copy(), "measurement": self._z.copy()}

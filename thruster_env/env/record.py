@@ -160,9 +160,9 @@ def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceM
     offer = object_named(model, "model") if isinstance(model, str) else model
     if not isinstance(log, Log):
         known = {name: value for name, value in options.items() if value is not None}
-        log = read_log(log, _made(_maker(offer, options.get("dt") or ANY_DT), model), **known)
+        log = read_log(log, _model_of(_maker(offer, options.get("dt") or ANY_DT), model), **known)
     maker = _maker(offer, log.dt)
-    made_model = _made(maker, model)
+    made_model = _model_of(maker, model)
     for logged, modelled, what in (
         (log.input_quantities, made_model.input_quantities, "inputs"),
         (log.measured, made_model.measurements, "measurements"),
@@ -197,7 +197,7 @@ def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
     )
 
 
-def _made(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
+def _model_of(maker: Callable[..., StateSpaceModel], named) -> StateSpaceModel:
     try:
         result = maker()
     except ValueError:

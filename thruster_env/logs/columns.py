@@ -279,11 +279,11 @@ def find_columns(
         if header not in known_headers:
             raise ValueError(f"units must be of columns {listed(headers)}, but got {short_repr(header)} ({file})")
     _by_headers(columns, wanted, headers, units)
-    _check_found(columns, wanted, headers, needs_time, file)
+    _check_columns(columns, wanted, headers, needs_time, file)
     return columns
 
 
-def _check_found(
+def _check_columns(
     columns: Mapping[str, Column], wanted: Sequence[Wanted], headers: Sequence[str], needs_time: bool, file: str
 ) -> None:
     """Raise ValueError, naming all that is missing, unless inputs, measurements and times are there."""

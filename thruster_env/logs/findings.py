@@ -60,7 +60,7 @@ class Recording(NamedTuple):
     gaps: tuple[tuple[int, int], ...] = ()  # first row and number of rows that are missing, where a run is cut
     missing: int = 0  # other rows without any sample
     holes: int = 0  # in so many places
-    moved: int = 0  # samples whose stamps were further from the grid than a tenth of a step
+    shifted: int = 0  # samples whose stamps were further from the grid than a tenth of a step
     farthest: float = 0.0  # [s], of them
     doubled: int = 0  # rows with the stamp of the row before
     dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
@@ -119,7 +119,7 @@ def remarks_on(logs: Sequence[Log]) -> list[str]:
 
     Each begins with the name of its log; findings of one kind in several logs are one sentence, on the longest.
     """
-    uncut = {log.name: log for log in (log.whole or log for log in logs)}
+    uncut = {log.name: log for log in (log.uncut or log for log in logs)}
     groups: dict[tuple[str, str], dict[str, list[Finding]]] = {}
     for name, log in uncut.items():
         for finding in log.findings:
@@ -140,7 +140,7 @@ def remarks_on(logs: Sequence[Log]) -> list[str]:
 
 def has_outliers(logs: Sequence[Log]) -> bool:
     """Whether any of the logs has outliers."""
-    return any(finding.kind == OUTLIER for log in logs for finding in (log.whole or log).findings)
+    return any(finding.kind == OUTLIER for log in logs for finding in (log.uncut or log).findings)
 
 
 def _of_rows(log: Log) -> list[Finding]:
@@ -163,10 +163,10 @@ def _of_rows(log: Log) -> list[Finding]:
             f"{recording.doubled} {rows} the time of the row before; of two samples of a channel the last is used"
         )
         findings.append(Finding(DOUBLED, "", 0, last, recording.doubled, text))
-    if recording.moved:
+    if recording.shifted:
         farthest = f"by up to {recording.farthest:.3g} s"
-        text = f"{recording.moved} samples were moved to the grid of {log.dt:g} s, {farthest}"
-        findings.append(Finding(MOVED, "", 0, last, recording.moved, text))
+        text = f"{recording.shifted} samples were moved to the grid of {log.dt:g} s, {farthest}"
+        findings.append(Finding(MOVED, "", 0, last, recording.shifted, text))
     for channel, count in recording.dropped:
         what = f"{count} samples of {_name(channel)}" if count > 1 else f"1 sample of {_name(channel)}"
         text = f"{what} {('are' if count > 1 else 'is')} not used: another one is nearer to the same grid time"

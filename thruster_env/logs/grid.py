@@ -58,7 +58,7 @@ class Grid(NamedTuple):
     rows: int
     times: np.ndarray  # (rows of the file,) [s] since row 0
     irregular: bool
-    moved: np.ndarray = np.empty(0)  # (rows of the file,) [s], how far stamps were from the grid
+    shifts: np.ndarray = np.empty(0)  # (rows of the file,) [s], how far stamps were from the grid
 
 
 def grid_of(stamps: np.ndarray, dt: float | None = None, clock: np.ndarray | None = None) -> Grid:

@@ -45,7 +45,7 @@ class Log:
         offsets: how far the clock of a channel is ahead [s], by channel; it is subtracted from its times.
         irregular: whether the time stamps of the file lay on no grid.
         recording: what became of the file's rows on the grid; empty where the log is not from a file.
-        whole: the log that this one is a piece of, between gaps; None for one that is no piece.
+        uncut: the log that this one is a piece of, between gaps; None for one that is no piece.
         stamps: times of the rows [s], (K + 1,), 0 at row 0 and increasing; None for a log on a grid.
     """
 
@@ -62,7 +62,7 @@ class Log:
     offsets: Mapping[str, float] = field(default_factory=dict)
     irregular: bool = False
     recording: Recording = Recording()
-    whole: Log | None = None
+    uncut: Log | None = None
     stamps: np.ndarray | None = None
 
     def __post_init__(self):
@@ -233,7 +233,7 @@ def _piece(log: Log, first: int, rows: int) -> Log:
         start=log.start + since,
         source=source,
         recording=Recording(),
-        whole=log,
+        uncut=log,
     )
 
 

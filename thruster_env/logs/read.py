@@ -216,7 +216,7 @@ def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...
     is_gap = apart > (MOST_HELD + 1) * usual
     gaps = tuple((int(numbers[i]) + 1, int(apart[i]) - 1) for i in np.flatnonzero(is_gap))
     holes = np.maximum(np.round(apart[~is_gap] / usual).astype(int) - 1, 0)
-    shifts = grid.moved[grid.moved > TOLERANCE * grid.dt]
+    shifts = grid.shifts[grid.shifts > TOLERANCE * grid.dt]
     farthest = float(shifts.max()) if len(shifts) else 0.0
     doubled = int((np.diff(grid.times) == 0).sum())
     return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(shifts), farthest, doubled, dropped)
@@ -268,7 +268,7 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
         stamps, assumption = in_seconds(table.numbers(column.header), column.unit, column.header, where)
     if np.isnan(stamps).any():
         row = int(np.argmax(np.isnan(stamps)))
-        raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
+        raise ValueError(f"every row must have a time, but there is none in {table.location(row, column.header)}")
     if count <= FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
     clocked = stamps if table.clock is None else stamps[table.clock]
@@ -279,7 +279,7 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
         row = int(back[0]) + 1
         raise ValueError(
             f"times must increase from row to row, but {follows(clocked[row - 1], clocked[row])} in "
-            f"{table.place(row, column.header)}"
+            f"{table.location(row, column.header)}"
         )
     count = (clocked[-1] - clocked[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
@@ -323,7 +323,8 @@ def _series(table: Table, column: Column, wanted: Wanted, grid: Grid) -> tuple[S
         raise ValueError(f"a column must hold numbers, but {where} has none")
     if wanted.kind == INPUT and not present[0]:
         raise ValueError(
-            f"an input must be known from the first row on, but it is missing in {table.place(0, column.header)}"
+            f"an input must be known from the first row on, but it is missing in "
+            f"{table.location(0, column.header)}"
         )
     if wanted.kind == MEASUREMENT and present.sum() > 1 and np.ptp(values[present]) == 0.0:
         raise ValueError(f"a measurement must vary, but {where} is {values[present][0]:.10g} in all rows")

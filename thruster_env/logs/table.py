@@ -63,7 +63,7 @@ class Table:
         """Names of the columns, in order."""
         return tuple(self.cells)
 
-    def place(self, row: int, column: str) -> str:
+    def location(self, row: int, column: str) -> str:
         """The position of a number, for messages."""
         return f"{self.line_word} {self.lines[row]}, column {column!r} of {self.file}"
 
@@ -87,11 +87,11 @@ class Table:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
                 raise ValueError(
-                    f"{rule}, but got {short_repr(cells[row])} in {self.place(row, column)}"
+                    f"{rule}, but got {short_repr(cells[row])} in {self.location(row, column)}"
                 ) from None
         if np.isinf(numbers).any():
             row = int(np.argmax(np.isinf(numbers)))
-            raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.place(row, column)}")
+            raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.location(row, column)}")
         return numbers
 
     def dates(self, column: str) -> np.ndarray | None:
@@ -112,7 +112,7 @@ class Table:
             return None
         for row, text in enumerate(texts):
             if text != MISSING_TEXT and np.isnan(seconds[row]):
-                raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.place(row, column)}")
+                raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.location(row, column)}")
         return seconds
 
 
@@ -225,8 +225,8 @@ def _read_parquet(path: Path) -> Table:
     if not path.exists():
         raise FileNotFoundError(ENOENT, strerror(ENOENT))
     with _damaged("a Parquet file must be one, but {path} is not", path), opened("parquet", path) as file:
-        check_bytes(max(8 * file.told["numbers"], file.told["bytes"]), "what a Parquet file holds", path)
-        names = [str(name) for name in file.told["names"]]
+        check_bytes(max(8 * file.contents["numbers"], file.told["bytes"]), "what a Parquet file holds", path)
+        names = [str(name) for name in file.contents["names"]]
         _check_header(names, 1, path)
         cells = {name: file.read(number) for number, name in enumerate(names)}
     return _of_arrays(path, cells)

@@ -42,10 +42,10 @@ class Canvas:
         self.large = pygame.Surface((width * SCALE, height * SCALE), depth=32)
         self._zoom = min(size[0] / width, size[1] / height)
         inner = round(width * self._zoom), round(height * self._zoom)
-        self._whole = pygame.Surface(size, depth=32)
-        self._whole.fill(WHITE)
+        self._surface = pygame.Surface(size, depth=32)
+        self._surface.fill(WHITE)
         corner = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
-        self.small = self._whole.subsurface(pygame.Rect(corner, inner))
+        self.small = self._surface.subsurface(pygame.Rect(corner, inner))
         self._fonts: dict[int, pygame.font.Font] = {}
         self._words: dict[tuple, pygame.Surface] = {}
         self._on_top: list[tuple] = []
@@ -132,7 +132,7 @@ class Canvas:
         self.small.blits(self._on_top, False)
         self._on_top.clear()
         self.large.blit(self._background, (0, 0))
-        return self._whole
+        return self._surface
 
     @staticmethod
     def as_array(surface: pygame.Surface) -> np.ndarray:

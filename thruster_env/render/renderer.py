@@ -163,16 +163,16 @@ class Window:
             pygame.display.init()
             screen = self._screen = pygame.display.set_mode(self._size)
             pygame.display.set_caption(self._caption)
-            self._due, self._shown = time.perf_counter(), -math.inf
+            self._due, self._shown_at = time.perf_counter(), -math.inf
         if pygame.event.get((pygame.QUIT, pygame.WINDOWCLOSE)):  # all other events are left to the caller
             self.close()
             self._closed_by_hand = True
             return
         start = time.perf_counter()
-        if start <= self._due + self._frame_time or start - self._shown > 1 / LEAST_RATE:
+        if start <= self._due + self._frame_time or start - self._shown_at > 1 / LEAST_RATE:
             screen.blit(picture(), (0, 0))
             pygame.display.flip()
-            self._shown = start
+            self._shown_at = start
         now = time.perf_counter()
         # Time lost is made up for a little, not after a pause of whole seconds.
         self._due = max(self._due + self._frame_time, now - 2 / LEAST_RATE)

@@ -159,9 +159,9 @@ def with_recorder(
         *of_plant,
         recorder.dead_band_low,
         recorder.dead_band_high,
-        *_by_place(biases.get(channel, 0.0) for channel in channels),
-        *_by_place(lag_weights(lags.get(channel, 0.0), step)[0] for channel in channels),
-        *_by_place(lag_weights(lags.get(channel, 0.0), step)[1] for channel in channels),
+        *_padded(biases.get(channel, 0.0) for channel in channels),
+        *_padded(lag_weights(lags.get(channel, 0.0), step)[0] for channel in channels),
+        *_padded(lag_weights(lags.get(channel, 0.0), step)[1] for channel in channels),
     )
     constants = LaggingConstants(*values, 1.0) if any(lagging) else LoggedConstants(*values)
     f, f_slopes, h, h_slopes = _functions(channels, lagging)
@@ -225,7 +225,7 @@ def lag_weights(lag: float, step: float) -> tuple[float, float]:
     return ratio / math.expm1(ratio), 1.0 + math.expm1(-ratio) / ratio
 
 
-def _by_place(values) -> tuple[float, ...]:
+def _padded(values) -> tuple[float, ...]:
     entries = [float(value) for value in values]
     return (*entries, *(0.0,) * (MAX_CHANNELS - len(entries)))
 

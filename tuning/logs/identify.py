@@ -162,7 +162,7 @@ def remarks(runs: Sequence[Log], proving: Sequence[Log], found: Identification) 
     """
     logs = (*runs, *proving)
     said = remarks_on(logs)
-    if any(log.whole is not None for log in logs):
+    if any(log.uncut is not None for log in logs):
         said.append(
             "Runs are cut at gaps: each piece is a separate run with its own initial state (--hold-gaps, "
             "hold_gaps=True, does not cut)."

@@ -93,7 +93,7 @@ def topics_of(
         values = values if values.shape[0] == along else values.T
         fields = columns_of(field, values)
         times, clock_remark = known[clock] if clock is not None else (None, "")
-        yield Topic(group, times, fields, _units(unit(array), [*fields]), taken=clock_remark)
+        yield Topic(group, times, fields, _units(unit(array), [*fields]), assumption=clock_remark)
 
 
 def _units(texts: Sequence[str], fields: Sequence[str]) -> dict[str, str]:
@@ -192,7 +192,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     with reading(KIND, path), opened("hdf5", path) as file:
         datasets = {
             name: description if isinstance(description, str) else Dataset(file, number, description)
-            for number, (name, description) in enumerate(file.told["datasets"].items())
+            for number, (name, description) in enumerate(file.contents["datasets"].items())
         }
         yield from topics_of(datasets, path, wanted, _unit)
 

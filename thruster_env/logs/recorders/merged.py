@@ -108,7 +108,7 @@ class Recorded:
             cells[name][0] = fields[name].values[_times(fields[name]) <= stamps[0]][-1]
         rows = range(1, len(stamps) + 1)
         clock_remarks = [
-            Remark(CLOCK, "", text) for text in dict.fromkeys(part.taken for part in fields.values()) if text
+            Remark(CLOCK, "", text) for text in dict.fromkeys(part.assumption for part in fields.values()) if text
         ]
         is_clock = np.isin(stamps, clock)
         remarks = [*clock_remarks, *_of_choice(choice), *_not_used(columns, fields, clock, self.path)]

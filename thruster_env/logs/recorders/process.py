@@ -24,7 +24,7 @@ class Opened:
     """A file that another process has opened.
 
     Attributes:
-        told: its contents, as the other process describes them.
+        contents: of the file, as the other process describes them.
     """
 
     def __init__(self, child: subprocess.Popen, form: str, path: Path):
@@ -33,7 +33,7 @@ class Opened:
         files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
         request = {"format": form, "path": str(path.absolute()), "files": [str(file.absolute()) for file in files]}
         limits = {"memory": topics.MOST_MEMORY, "bytes": topics.MOST_BYTES}
-        self.told = self._ask(json.dumps({**request, **limits}))
+        self.contents = self._ask(json.dumps({**request, **limits}))
 
     def read(self, number: int) -> np.ndarray:
         """An array of the file: numbers and dates as they are stored, others as texts."""

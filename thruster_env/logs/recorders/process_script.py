@@ -37,13 +37,13 @@ class Walk:
     """The datasets of a file by name.
 
     Attributes:
-        found: a dataset with the field of it, None for all; or a text, why one is not read.
+        datasets: a dataset with the field of it, None for all; or a text, why one is not read.
     """
 
     def __init__(self, file: Any, most_bytes: int):
         """Collect all that the file has."""
-        self.found: dict[str, tuple[Any, str | None] | str] = {}
-        self._most, self._seen, self._count = most_bytes, {_address(file)}, 0
+        self.datasets: dict[str, tuple[Any, str | None] | str] = {}
+        self._most, self._visited, self._count = most_bytes, {_address(file)}, 0
         self._file = file
         self._members(file, "", 0)
 
@@ -54,21 +54,21 @@ class Walk:
             full_name = f"{name}.{key}" if name else key
             try:
                 if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                    self.found[full_name] = "a link"
+                    self.datasets[full_name] = "a link"
                     continue
                 member = group[key]
                 number = _address(member)
                 if key == REFERENCES:
                     continue
-                if number in self._seen and isinstance(member, h5py.Group):  # of which there might be no end
-                    self.found[full_name] = "a group that has another name, too"
+                if number in self._visited and isinstance(member, h5py.Group):  # of which there might be no end
+                    self.datasets[full_name] = "a group that has another name, too"
                     continue
-                self._seen.add(number)
+                self._visited.add(number)
                 self._add(member, full_name, depth, _text(group.attrs.get(CLASS)) == "struct")
             except TooMany:
                 raise
             except Exception as error:  # of this one alone
-                self.found[full_name] = f"damaged: {_line(error)}"
+                self.datasets[full_name] = f"damaged: {_line(error)}"
 
     def _add(self, node: Any, name: str, depth: int, in_structure: bool = False) -> None:
         """Add an object, a group with what is in it."""
@@ -78,7 +78,7 @@ class Walk:
         if self._count > MOST_OBJECTS:
             raise TooMany(f"it has more than {MOST_OBJECTS} objects")
         if OBJECT in node.attrs or SPARSE in node.attrs:
-            self.found[name] = "an object or a sparse matrix of MATLAB's"
+            self.datasets[name] = "an object or a sparse matrix of MATLAB's"
         elif isinstance(node, h5py.Group):
             if depth < DEEPEST:
                 self._members(node, name, depth + 1)
@@ -90,13 +90,13 @@ class Walk:
 
         kind = _text(dataset.attrs.get(CLASS))
         if dataset.is_virtual or dataset.external:
-            self.found[name] = "kept in another file"
+            self.datasets[name] = "kept in another file"
         elif dataset.chunks is not None and math.prod(dataset.chunks) * dataset.dtype.itemsize > self._most:
-            self.found[name] = "packed in parts that are too large"
+            self.datasets[name] = "packed in parts that are too large"
         elif dataset.size and not dataset.id.get_storage_size():
-            self.found[name] = "never written"
+            self.datasets[name] = "never written"
         elif dataset.size and (why := _why_not_whole(dataset, self._most)):
-            self.found[name] = why
+            self.datasets[name] = why
         elif dataset.attrs.get(EMPTY, 0) or kind == "char" or dataset.shape is None:
             return
         elif h5py.check_ref_dtype(dataset.dtype) is h5py.Reference and (
@@ -104,15 +104,15 @@ class Walk:
         ):
             self._referred(dataset, name, depth, "{}" if kind == "cell" else "()")
         elif dataset.dtype.names is None:
-            self.found[name] = (dataset, None)
+            self.datasets[name] = (dataset, None)
         else:
             names = [field for field in dataset.dtype.names if dataset.dtype[field].kind in NUMERIC]
-            self.found |= {f"{name}.{field}": (dataset, field) for field in names}
+            self.datasets |= {f"{name}.{field}": (dataset, field) for field in names}
 
     def _referred(self, dataset: Any, name: str, depth: int, brackets: str) -> None:
         """Add the objects to which the entries of a cell array, or of a field of an array of structures, refer."""
         group, _, field = name.rpartition(".")
-        self.found[name if brackets == "{}" else group] = MANY[brackets]
+        self.datasets[name if brackets == "{}" else group] = MANY[brackets]
         if dataset.size > MOST_OBJECTS or depth >= DEEPEST:
             return
         for index, reference in enumerate(
@@ -212,7 +212,7 @@ def hdf5(request: dict) -> tuple[dict[str, Any], Reader]:
     """The datasets of an HDF5 file, and a function that reads one of them."""
     import h5py
 
-    contents = Walk(h5py.File(request["path"], "r"), request["bytes"]).found
+    contents = Walk(h5py.File(request["path"], "r"), request["bytes"]).datasets
     names, descriptions = [*contents], dict[str, Any]()
     for name, entry in contents.items():
         try:

@@ -53,7 +53,7 @@ class Samples(NamedTuple):
     damage: str = ""  # what of the file is not read because it is damaged, in words
     clock: str = ""  # "header" or "receipt" in a bag
     received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
-    taken: str = ""  # how times without a unit were read, in words
+    assumption: str = ""  # how times without a unit were read, in words
 
     @property
     def clocked(self) -> Clocked:

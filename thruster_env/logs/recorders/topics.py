@@ -32,7 +32,7 @@ class Topic(NamedTuple):
     damage: str = ""  # what of the file is not read because it is damaged, in words
     clock: str = ""  # "header" or "receipt" in a bag
     received: np.ndarray | None = None  # (samples,) [s]; None where the times are these, or a file has no such
-    taken: str = ""  # how times without a unit were read, in words
+    assumption: str = ""  # how times without a unit were read, in words
 
     def column(self, field: str) -> str:
         """The name of a field's column: TOPIC.FIELD."""

@@ -59,7 +59,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()
     if plant.linear is not None:
         numbers[at.LINEAR] = 1.0
-        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = _held(plant.linear, plant.dt)
+        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = _discrete(plant.linear, plant.dt)
     numbers[at.REWARD_WEIGHTS : at.REWARD_WEIGHTS + 3] = task.weights
     numbers[at.THRUST_SCALE] = scale
     numbers[at.LIMITS : at.LIMITS + 2] = state_limits(plant)
@@ -68,7 +68,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     return np.concatenate([numbers, program]), rows + (at.CONSTANT_COUNT if plant.uncertainty else 0)
 
 
-def _held(linear: LinearModel, dt: float) -> np.ndarray:
+def _discrete(linear: LinearModel, dt: float) -> np.ndarray:
     a_d, b_d = zero_order_hold(linear.a, linear.b, dt)
     return np.concatenate([a_d.ravel(), b_d.ravel(), linear.c.ravel()])
 
