@@ -225,7 +225,7 @@ def _read_parquet(path: Path) -> Table:
     if not path.exists():
         raise FileNotFoundError(ENOENT, strerror(ENOENT))
     with _damaged("a Parquet file must be one, but {path} is not", path), opened("parquet", path) as file:
-        check_bytes(max(8 * file.contents["numbers"], file.told["bytes"]), "what a Parquet file holds", path)
+        check_bytes(max(8 * file.contents["numbers"], file.contents["bytes"]), "what a Parquet file holds", path)
         names = [str(name) for name in file.contents["names"]]
         _check_header(names, 1, path)
         cells = {name: file.read(number) for number, name in enumerate(names)}
