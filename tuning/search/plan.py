@@ -61,7 +61,7 @@ class Plan(NamedTuple):
     @property
     def identity(self) -> dict:
         """What must be the same for a study to be continued, including the code of a user's own estimator."""
-        own = {name: digest_of(filter_type(name).found) for name in self.filter_types if is_code(name)}
+        own = {name: digest_of(filter_type(name).estimator) for name in self.filter_types if is_code(name)}
         return {
             **({"estimators": own} if own else {}),
             **({"worst": True} if self.worst else {}),
