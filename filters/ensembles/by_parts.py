@@ -1,6 +1,6 @@
 """Analyses in parts: each state with the channels near it, or one channel after the other.
 
-The table has a row for each state, and behind these one for each channel with independent noise of variance 1.
+The table has a row for each state, then one for each channel with independent noise of variance 1.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape
 
-# Rows of the table of an ensemble, a state's or a channel's numbers of all members: moments, and their spread.
-
 
 @inlined
 def row_moments(table, i, size):
@@ -44,7 +42,7 @@ def row_moments(table, i, size):
 
 @inlined
 def stretch_row(table, i, factor, size):
-    """A row's distances from its mean, times a factor."""
+    """Multiply a row's deviations from its mean by a factor."""
     mean = 0.0
     for j in range(size):
         mean += table[i, j] / size
@@ -54,18 +52,15 @@ def stretch_row(table, i, factor, size):
 
 @inlined
 def relax_row(table, i, before, part, size):
-    """Give back a part of what the standard deviation of a row has lost, of its variance before an update."""
+    """Restore a part of an update's reduction of a row's standard deviation; `before` is the variance before."""
     _, after = row_moments(table, i, size)
     if after > 0.0:
         stretch_row(table, i, 1.0 + part * ((before / after) ** 0.5 - 1.0), size)
 
 
-# Analyses by parts, as loops over the table: of each state by itself, or of one channel after the other.
-
-
 @inlined
 def transform_state(table, i, n, v, z, taper, size):
-    """The transform filter for state i, with R of a channel over its taper."""
+    """Update state i by the transform filter, with R of each channel divided by its taper."""
     inner, along, near = np.zeros((size, size)), np.zeros(size), False
     for k in range(len(v)):
         if taper[k] > 0.0 and z[k] == z[k]:
@@ -85,21 +80,21 @@ def transform_state(table, i, n, v, z, taper, size):
         table[i, :] = np.nan
         return
     values, vectors = np.linalg.eigh(inner)
-    moved = np.full(size, mean)
-    for one in range(size):
+    updated = np.full(size, mean)
+    for axis in range(size):
         state, w = 0.0, 0.0
         for j in range(size):
-            state += vectors[j, one] * (table[i, j] - mean)
-            w += vectors[j, one] * along[j]
+            state += vectors[j, axis] * (table[i, j] - mean)
+            w += vectors[j, axis] * along[j]
         for j in range(size):
-            moved[j] += state * (w / values[one] + ((size - 1.0) / values[one]) ** 0.5 * vectors[j, one])
+            updated[j] += state * (w / values[axis] + ((size - 1.0) / values[axis]) ** 0.5 * vectors[j, axis])
     for j in range(size):
-        table[i, j] = moved[j]
+        table[i, j] = updated[j]
 
 
 @inlined
 def gaussian_moves(y, v, tail, moves, size):
-    """How a channel's y (N,), of variance 1 in R, moves to a measurement v as the adjustment filter has it."""
+    """Moves of a channel's y (N,), with R = 1, for a measurement v, by the adjustment filter."""
     squares = 0.0
     for j in range(size):
         squares += y[j] ** 2
@@ -110,7 +105,7 @@ def gaussian_moves(y, v, tail, moves, size):
 
 @inlined
 def regress(table, n, y, moves, taper, size):
-    """States moved by their regression on a channel, whose y moves."""
+    """Move states by their regression on a channel's y, from the moves of y."""
     squares = 0.0
     for j in range(size):
         squares += y[j] ** 2
@@ -126,16 +121,16 @@ def regress(table, n, y, moves, taper, size):
 
 def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
     """M^-1 (y - mean(y)) of members and M^-1 (z - mean(y)), with M M' = R: channels with independent noise."""
-    seen, n, m = present(memory.z), memory.shape.n, memory.shape.m
-    y, M = expect(model, memory.x, memory.z), root(uncorrelated(seen, model.R))
-    v = only(seen, wrap(memory.z - mean(y), model.measurement_angles))
+    measured, n, m = present(memory.z), memory.shape.n, memory.shape.m
+    y, M = expect(model, memory.x, memory.z), root(uncorrelated(measured, model.R))
+    v = only(measured, wrap(memory.z - mean(y), model.measurement_angles))
     rows = input_matrix(Place("table", n), (m,), member=True, like=memory.x)
-    place = memory.read("rows", scratch_place(page, memory.shape), m)
-    return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, place))}
+    target = memory.read("rows", scratch_place(page, memory.shape), m)
+    return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, target))}
 
 
 def scratch_place(page: Page, shape: Shape) -> int:
-    """The first place of a filter's row behind what a page keeps."""
+    """The offset of scratch in a filter's row, after the extras of a page."""
     return memory_places(shape.n, shape.m).extras + kept_size(page, shape)
 
 
@@ -143,15 +138,15 @@ def scratch_place(page: Page, shape: Shape) -> int:
 def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: Callable | None) -> Kernels:
     """Kernels of a page whose `model.own` has a taper (n, m) of states and channels, relaxation, and a tail.
 
-    The update goes through channels, each of which moves by `moves_of(y, v, tail, moves, size)`; through states if
-    that is None.
+    The update goes through the channels, whose y move by `moves_of(y, v, tail, moves, size)`; if that is None, it
+    goes through the states.
     """
     plain, n, m = members_kernels(page, functions, shape), shape.n, shape.m
     look, rows, _ = works_of(page, functions, shape, with_unit_noise, n + m)["update"]
     tell, summarise, first = plain.update, plain.summarise, scratch_place(page, shape)
     serial, move = moves_of is not None, gaussian_moves if moves_of is None else moves_of
-    places = page.parameter_offsets(own_place(shape))
-    taper, relaxation, tail = places["taper"], places["relaxation"], places["tail"]
+    offsets = page.parameter_offsets(own_place(shape))
+    taper, relaxation, tail = offsets["taper"], offsets["relaxation"], offsets["tail"]
 
     @inlined
     def update(memory, z, numbers, size):
@@ -182,24 +177,21 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     return plain._replace(update=update, table_rows=max(plain.table_rows, rows), scratch=m)
 
 
-# Analyses by parts: of each state with the channels near it, or of each channel in turn with the states near it.
-
-
-LEAST = 1e-3  # tapers below are zero
+LEAST = 1e-3  # tapers below are set to zero
 
 
 def look(model, x, z, e):
-    """The update of a page that moves no member."""
+    """An update that moves no member: it only returns innovation, S and likelihood."""
     _, _, v, S, _, level = compare(model, x, z)
     return x, v, S, level
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LocalisedByParts(LocalisedFilter, DeterministicUpdateFilter):
-    """Base of those whose update goes through states or channels, if there is a radius.
+    """Base of filters whose update goes through states or channels if there is a radius.
 
-    Channels with correlated noise are first made independent, by the lower triangular root of R, and lie where
-    they lay. Such an update is neither in C nor on tensors.
+    Channels with correlated noise are first made independent, by the lower triangular root of R, and keep their
+    positions. Such an update is neither in C nor on tensors.
     """
 
     moves_of: ClassVar[Callable | None] = None  # of one channel after the other, see `kernels_by_parts`
@@ -220,7 +212,7 @@ class LocalisedByParts(LocalisedFilter, DeterministicUpdateFilter):
 
     @property
     def plain_page(self) -> Page:
-        """The page without what controls the spread; one that goes by parts moves no member in an update."""
+        """The page without inflation and relaxation; if the update is by parts, its update moves no member."""
         page = super().plain_page
         return page._replace(update=look) if self.by_parts else page
 

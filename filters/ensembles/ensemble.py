@@ -1,25 +1,25 @@
 """The base of all ensemble filters: propagation of the members, inflation and its adaptation.
 
-Each takes a function of a page and returns one that does more.
+Inflation and relaxation take a function of a page and return one that does more. Adaptive inflation is
 
     predict: x_j = mean + t^1/2 (x_j - mean) at the end of the step
     update:  t = max(1, t + u), u the mode of  (1 + g u) exp(-u^2/(2 deviation^2)),
              g = d log N(v; 0, (t'/t) A + R)/dt' at t' = t,  A = S - R the forecast's own part of S
 
-One factor t is kept in the belief; it begins at 1. Before each update it is normal with a standard
-deviation that does not shrink, so that it can follow a model whose errors change; its likelihood is linear about
-the last value. An error of the model which is not in Q widens the innovations, and so the ensemble.
+The belief keeps one factor t, initially 1. Before each update it is normal with a constant standard deviation, so
+that it can follow a model whose errors change; its likelihood is linearised about the last value. An error of the
+model that is not in Q widens the innovations, and so the ensemble.
 
-With a factor for each state, t_i is that of state i, and its likelihood is that of all channels while it alone
-moves:
+With a factor for each state, t_i is that of state i, and its likelihood is that of all channels if only t_i
+changes:
 
     g_i = d log N(v; 0, D A D + R)/dt' at t' = t_i,  D_kk = (1 + c_ik (t'^1/2 - 1))/(1 + c_ik (t_i^1/2 - 1)),
     c_ik = taper of i and k times |correlation of x_i and y_k| in the forecast
 
-so that of a single state it is the same, if h is linear.
+so that for a single state and a linear h it equals the common factor.
 
-With an inverse gamma prior, p(t') ~ t'^-(a+1) exp(-(a+1) t/t'), whose mode is t, the standard deviation follows
-the measurements, too. It is kept in the belief as the width p = 1/(a+1), behind the factors:
+With an inverse gamma prior, p(t') ~ t'^-(a+1) exp(-(a+1) t/t'), whose mode is t, measurements also change the
+standard deviation. The belief keeps it as the width p = 1/(a+1), after the factors:
 
     (deviation/t)^2 = p/((1 - 2p)^2 (1 - 3p)),  p at first that of `adaptive_inflation`, later between it and
                       that of `least_deviation`
@@ -54,8 +54,6 @@ from filters.pages.page import Page
 from filters.pages.page_filter import FilterWithPage
 from thruster_env.core.checks import at_least, positive, short_repr, switch
 
-# What controls an ensemble's spread: rules of the parameters, and the prior of factors that adapt.
-
 
 def checked(filter_: Any) -> dict[str, float]:
     """The parameters of a filter as numbers; raise ValueError that states the rule and the value."""
@@ -74,7 +72,7 @@ def checked(filter_: Any) -> dict[str, float]:
 
 
 def limits(first: float, least: float) -> Mapping[str, float]:
-    """What pages read: the deviation of a factor, or the widest and narrowest width; nothing without a factor."""
+    """Parameters of pages: the deviation of a factor, or the widest and narrowest width; none without a factor."""
     if not first:
         return {}
     return {"widest": width_of(first), "narrowest": width_of(least)} if least else {"deviation": first}
@@ -87,83 +85,80 @@ def width_of(deviation: float) -> float:
         p = root * root
         return root - deviation * (1.0 - 2.0 * p) * max(1.0 - 3.0 * p, 0.0) ** 0.5
 
-    from scipy.optimize import brentq  # loads half of SciPy, for this line
+    from scipy.optimize import brentq  # here, because it loads half of SciPy
 
-    return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # of the root, so that small ones are exact, too
-
-
-# Control of an ensemble's spread: inflation by a factor a step, and relaxation to the spread before an update.
+    return brentq(excess, 0.0, 3.0**-0.5, xtol=1e-300) ** 2  # solved for the root of p, so that a small p is exact
 
 
 @cache
-def inflated(settle: Callable) -> Callable:
-    """The end of a step, then x = mean + inflation (x - mean)."""
+def inflated(add_process_noise: Callable) -> Callable:
+    """Add process noise, then x = mean + inflation (x - mean)."""
 
-    def settle_inflated(model, x, w):
-        x = settle(model, x, w)
+    def add_process_noise_inflated(model, x, w):
+        x = add_process_noise(model, x, w)
         return mean(x) + (x - mean(x)) * model.own.inflation
 
-    return settle_inflated
+    return add_process_noise_inflated
 
 
 @cache
 def relaxed(update: Callable) -> Callable:
     """An update, then x = mean + (1 + relaxation (b - a)/a) (x - mean), by components.
 
-    b and a are the sample standard deviations before and after the update. Where a component has no spread after
-    it, it keeps none. The means stay.
+    b and a are the sample standard deviations before and after the update. A component without spread after the
+    update stays without. The means do not change.
     """
 
     def update_relaxed(model, x, z, e):
-        after, *told = update(model, x, z, e)
+        after, *outputs = update(model, x, z, e)
         factors = stretches(variances(x), variances(after), model.own.relaxation)
-        return mean(after) + (after - mean(after)) * factors, *told
+        return mean(after) + (after - mean(after)) * factors, *outputs
 
     return update_relaxed
 
 
-# What the pages of ensemble filters share: motion, and what a measurement says of the members.
+# Functions that the pages of ensemble filters share.
 
 
 def propagate(model, x, u):
-    """One of the model's substeps."""
+    """Propagate a member by one substep."""
     return model.f(x, u)
 
 
 def add_process_noise(model, x, w):
-    """The end of a step."""
+    """Add noise of covariance Q to a member, at the end of a step."""
     return on_branch(x + model.Q_root @ w, model.state_angles)
 
 
 def expect(model, x, z):
-    """What a member expects to be measured; zero in channels that are NaN in z."""
+    """The predicted measurement of a member, zero in channels that are NaN in z."""
     return on_branch(only(present(z), model.h(x)), model.measurement_angles)
 
 
 def compare(model, x, z):
-    """A member's y less their mean, cov(x, y), innovation v, S, R, log N(v; 0, S).
+    """A member's y minus the mean of y, cov(x, y), innovation v, S, R, log N(v; 0, S).
 
-    Covariances are tapered where a filter has tapers between channels.
+    Covariances are tapered if the filter has tapers between channels.
     """
-    seen, y = present(z), expect(model, x, z)
-    R = uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - mean(y), model.measurement_angles))
+    measured, y = present(z), expect(model, x, z)
+    R = uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - mean(y), model.measurement_angles))
     C, A = covariance(x, y), covariance(y, y)
     if hasattr(model.own, "between"):
         C, A = C * model.own.taper, sym(A * model.own.between)
     S = A + R
-    return y - mean(y), C, v, S, R, log_density(v, S, seen)
+    return y - mean(y), C, v, S, R, log_density(v, S, measured)
 
 
-# Inflation that adapts to the innovations: a function of an ensemble's page that returns one that does more.
+# Inflation that adapts to the innovations.
 
 
 def slopes(model, x, z, v, S):
     """Return g, or each g_i, of members x before the update, by 1/2 tr((w w' - S^-1) dA/dt'), w = S^-1 v."""
-    seen, w, ones, t = present(z), divide(v, S), constant(1.0, v), model.extras["factor"]
-    A = S - uncorrelated(seen, model.R)
+    measured, w, ones, t = present(z), divide(v, S), constant(1.0, v), model.extras["factor"]
+    A = S - uncorrelated(measured, model.R)
     # Sums of the rows of M o A, M = w w' - S^-1, for 1/2 tr(M (E A + A E)) of a diagonal E is their sum by E.
-    scores = ((outer(w, w) - inverse(factor(S), seen)) * A) @ ones
+    scores = ((outer(w, w) - inverse(factor(S), measured)) * A) @ ones
     if not np.shape(t):
         return dot(scores, ones) / (2.0 * t)
     c, root = abs(correlations(x, expect(model, x, z))), t**0.5
@@ -172,23 +167,23 @@ def slopes(model, x, z, v, S):
     return ((c / (1.0 + diagonal(root - 1.0) @ c)) @ scores) / (2.0 * root)  # E = dD/dt' where D = I
 
 
-def moved(t, g, deviation):
+def updated_factor(t, g, deviation):
     """The mode of the normal prior times the likelihood, at least 1."""
-    # A root of u^2 + u/g - deviation^2, the larger one where g is positive, else the smaller; 1 where g is NaN.
+    # A root of u^2 + u/g - deviation^2: the larger one if g is positive, else the smaller; 1 if g is NaN.
     product = 2.0 * g * (deviation * deviation)
     return at_least_number(t + product / (1.0 + (1.0 + 2.0 * g * product) ** 0.5), 1.0)
 
 
 def relative_move(h, p):
-    """Return e where the mode is 1 + e of (1 + h e) times an inverse gamma density of mode 1 and width p."""
-    # The root with the sign of h of (1 - p) h e^2 + (1 - 2 p h) e - p h.
+    """Return e: (1 + h e) times an inverse gamma density with mode 1 and width p has its mode at 1 + e."""
+    # That root of (1 - p) h e^2 + (1 - 2 p h) e - p h which has the sign of h.
     along = 1.0 - 2.0 * p * h
     return 2.0 * p * h / (along + (along * along + 4.0 * p * (1.0 - p) * h * h) ** 0.5)
 
 
-def moved_with_width(t, p, g, narrowest, widest):
-    """The same of an inverse gamma prior, and its width; 1 and the widest where the likelihood is no number."""
-    e = relative_move(t * g, p)  # what follows compares NaN as false
+def factor_and_width(t, p, g, narrowest, widest):
+    """The mode for an inverse gamma prior, and the new width; 1 and the widest if the likelihood is NaN."""
+    e = relative_move(t * g, p)  # comparisons below are false for NaN
     d = e / (1.0 + e)
     p = p / (1.0 - 2.0 * d + d * d / p)
     p = choose(exceeds(widest - p, 0.0), p, widest)
@@ -200,28 +195,25 @@ def adapted(page: Page) -> Page:
     """A page with a factor for each number of `model.own.deviation`, or of the `widest` width."""
 
     def start(model):
-        own = model.own
-        if hasattr(own, "widest"):
-            return {"factor": constant(1.0, own.widest), "width": own.widest}
-        return {"factor": constant(1.0, own.deviation)}
+        parameters = model.own
+        if hasattr(parameters, "widest"):
+            return {"factor": constant(1.0, parameters.widest), "width": parameters.widest}
+        return {"factor": constant(1.0, parameters.deviation)}
 
-    def settle(model, x, w):
+    def add_inflated_noise(model, x, w):
         x = page.add_process_noise(model, x, w)
         return mean(x) + (x - mean(x)) * model.extras["factor"] ** 0.5
 
     def update(model, x, z, e):
         after, v, S, level = page.update(model, x, z, e)
-        t, own = model.extras["factor"], model.own
+        t, parameters = model.extras["factor"], model.own
         g = slopes(model, x, z, v, S)
-        if not hasattr(own, "widest"):
-            return after, v, S, level, {"factor": moved(t, g, own.deviation)}
-        t, p = moved_with_width(t, model.extras["width"], g, own.narrowest, own.widest)
+        if not hasattr(parameters, "widest"):
+            return after, v, S, level, {"factor": updated_factor(t, g, parameters.deviation)}
+        t, p = factor_and_width(t, model.extras["width"], g, parameters.narrowest, parameters.widest)
         return after, v, S, level, {"factor": t, "width": p}
 
-    return page._replace(initial=start, add_process_noise=settle, update=update)
-
-
-# The class of all ensemble filters: their page, and what controls the spread of the members.
+    return page._replace(initial=start, add_process_noise=add_inflated_noise, update=update)
 
 
 LARGEST_ENSEMBLE = 1_000_000
@@ -232,26 +224,27 @@ OF_THE_ENGINE = frozenset(  # parameters that no page reads
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EnsembleFilter(FilterWithPage):
-    """Base of the ensemble filters: subclasses name their page, whose functions say what is done with each member.
+    """Base of the ensemble filters: subclasses name their page, whose functions are written for one member.
 
-        x = settle(model, advance(model, x, u), w),  w ~ N(0, I), advance once for each of the model's substeps
+        x = add_process_noise(model, propagate(model, x, u), w),  w ~ N(0, I),  propagate once per substep
         x, v, S, log N(v; 0, S) = update(model, x, z, e),  e ~ N(0, I)
 
-    What is said of all members together (`filters.algebra.members`) is the same for each: `mean(x)`,
-    `covariance(x, y)`. Normals that a page does not use are not drawn. The belief's mean and covariance are those
-    of the members.
+    Results of all members, such as `mean(x)` and `covariance(x, y)` (`filters.algebra.members`), are the same for
+    each. Normals that a page does not use are not drawn. The belief's mean and covariance are those of the
+    members.
 
     Attributes:
         ensemble_size: number N of members, at least 2.
         inflation: factor on the spread of the members about their mean in every step of the model's dt, after the
             process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
-        relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is given back.
-        adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast that
-            is learnt from the innovations and never below 1, in steps of any length; 0 for none. See
-            `filters.ensembles.ensemble`.
-        inflation_by_state: 1 if adaptive_inflation learns a factor for each state, 0 if it is one for all.
-        least_deviation: if positive, the factor's prior is an inverse gamma density, and adaptive_inflation is its
-            first standard deviation, which measurements change and never take below this; both over the factor.
+        relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is restored.
+        adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast, in
+            steps of any length; the factor is estimated from the innovations and is at least 1. 0 for no factor.
+            See `filters.ensembles.ensemble`.
+        inflation_by_state: 1 for a factor of adaptive_inflation for each state, 0 for a common one.
+        least_deviation: if positive, the factor's prior is an inverse gamma density with the initial standard
+            deviation adaptive_inflation; measurements change it, but not below this. Both are relative to the
+            factor.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
@@ -273,7 +266,7 @@ class EnsembleFilter(FilterWithPage):
 
     @property
     def by_parts(self) -> bool:
-        """Whether an update goes through states or channels, or runs the motion, and is more than the page."""
+        """Whether an update goes through states or channels, or runs the motion, which a page does not contain."""
         return False
 
     @property
@@ -293,7 +286,7 @@ class EnsembleFilter(FilterWithPage):
 
     @property
     def written_page(self) -> Page:
-        """The page, with what controls the spread where that does something."""
+        """The page, with inflation and relaxation if they differ from none."""
         return self.page_with(self.inflation != 1.0, self.relaxation != 0.0)
 
     def page_with(self, inflation: bool = True, relaxation: bool = True) -> Page:
@@ -306,7 +299,7 @@ class EnsembleFilter(FilterWithPage):
         return adapted(page) if self.adaptive_inflation else page
 
     def sample(self, belief: Belief) -> np.ndarray:
-        """The members of a belief, (n, N), without what a filter keeps beside them."""
+        """The members (n, N) of a belief, without further rows that a filter keeps."""
         return belief.members[: self.kernel_model.n]
 
     def kernels(self) -> Kernels:
@@ -314,11 +307,8 @@ class EnsembleFilter(FilterWithPage):
         return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
 
 
-# Ensembles whose update is more than their page: where there is only that, they are refused.
-
-
 def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
-    """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
+    """Raise ValueError for an ensemble whose update is more than its page: `where` says what runs only pages."""
     if getattr(filter_, "rotations", 0):
         raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
     if filter_.by_parts:
@@ -327,6 +317,6 @@ def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:
 
 
 def named(filter_: EnsembleFilter) -> str:
-    """The name of a filter, with what makes its update more than its page."""
+    """The name of a filter, with the parameters by which its update is more than its page."""
     chosen = ((name, getattr(filter_, name, 0)) for name in ("radius", "window"))
     return f"{filter_.name!r}" + "".join(f" with a {name} of {number:g}" for name, number in chosen if number)

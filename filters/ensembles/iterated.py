@@ -2,10 +2,10 @@
 
     window   x_0j the members L steps ago, w_kj ~ N(0, Q) the noise of the steps since; both are in the belief
     motion   x_kj = f(x_(k-1)j, u_k) + w_kj,  k = 1 ... L, so that y_j = h(x_Lj) is a function of all these
-    update   Gauss-Newton as in `filters.ensembles.iterated`, of which the state is (x_0, w_1 ... w_L)
+    update   Gauss-Newton as in `IteratedEnsembleKalmanFilter`, for the state (x_0, w_1 ... w_L)
 
-Each iteration runs the motion again from where the window then starts; each step keeps the model's constants, such
-as dt. The next step moves x_0 by the first step of the window, drops that, and adds noise of its own.
+Each iteration runs the motion again from the new start of the window; each step keeps its constants of the model,
+such as dt. The next step moves x_0 by the first step of the window, drops that step, and adds its own noise.
 """
 
 from __future__ import annotations
@@ -31,72 +31,70 @@ from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_places
 
-# The iterated ensemble filter over a window of steps, whose start and process noise it estimates again.
 
-
-def seen_anew(model, y, z, Y, v, S, R):
-    """Slopes Y T^-1 and innovation z - mean(y) + Y w of members y that the last Y, v and S have moved."""
+def linearised_again(model, y, z, Y, v, S, R):
+    """Slopes Y T^-1 and innovation z - mean(y) + Y w from y of members that the last Y, v and S have moved."""
     E = covariance(y, Y)
     D = divide(E, R + geometric_mean(R, S))
-    moved = divide(E + D @ (S - R), S) @ v
-    v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + moved
+    shift = divide(E + D @ (S - R), S) @ v
+    v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + shift
     return y - mean(y) + D @ Y, v
 
 
 def pull(Y, v, S, R):
-    """S^-1 v - (S + R # S)^-1 Y: what is correlated with Y moves by its covariance times this."""
+    """S^-1 v - (S + R # S)^-1 Y: the update moves a variable by its covariance with Y times this."""
     return divide(v, S) - divide(Y, S + geometric_mean(R, S))
 
 
 class WindowPlaces(NamedTuple):
-    """Where the window lies: rows of the table, then places of the belief's row."""
+    """Layout of the window: rows of the table, then offsets in the belief's row."""
 
     window: int  # x_0, then the noise, n rows for each step
-    moved: int  # the same in an iteration, scratch
+    moved: int  # the window of an iteration, scratch
     slopes: int  # Y, m rows
     pull: int  # m rows
     scratch: int  # of programs
-    steps: int  # how many steps the window has so far
-    inputs: int  # of these steps, and behind each its constants
-    numbers: int  # those of a step, scratch
+    steps: int  # number of steps in the window so far
+    inputs: int  # of these steps, each followed by its constants
+    numbers: int  # of a step, scratch
     innovation: int  # v of an iteration, scratch
     innovation_cov: int  # S of an iteration
 
 
 def window_places(shape: Shape, length: int) -> WindowPlaces:
-    """Places for a window of `length` steps."""
+    """Layout of a window of `length` steps."""
     n, m, rows = shape.n, shape.m, shape.n * (length + 1)
-    moved, first = n + rows, memory_places(n, m).extras
-    slopes, v = moved + rows, first + 1 + length * (shape.inputs + shape.constants)
-    return WindowPlaces(n, moved, slopes, slopes + m, slopes + 2 * m, first, first + 1, v + m + m * m, v, v + m)
+    iterate, first = n + rows, memory_places(n, m).extras
+    slopes, v = iterate + rows, first + 1 + length * (shape.inputs + shape.constants)
+    return WindowPlaces(n, iterate, slopes, slopes + m, slopes + 2 * m, first, first + 1, v + m + m * m, v, v + m)
 
 
 @cache
 def window_stages(length: int) -> Callable:
-    """Return `stages(page, memory, model)`: motion and moments of a page, the first look at z, and later ones."""
+    """Return `stages(page, memory, model)`: motion and moments of a page, the first iteration, and later ones."""
 
     def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
-        m, z, places = memory.shape.m, memory.z, window_places(memory.shape, length)
+        m, z, layout = memory.shape.m, memory.z, window_places(memory.shape, length)
         row = memory_places(memory.shape.n, m)
         Y, B = (
             input_matrix(Place("table", at), (m,), member=True, like=memory.x)
-            for at in (places.slopes, places.pull)
+            for at in (layout.slopes, layout.pull)
         )
-        v = memory.read("rows", places.innovation, m)
-        S = memory.read("rows", places.innovation_cov, m, m, symmetric=True)
+        v = memory.read("rows", layout.innovation, m)
+        S = memory.read("rows", layout.innovation_cov, m, m, symmetric=True)
         first, _, first_v, first_S, R, level = compare(model, memory.x, z)
-        later, later_v = seen_anew(model, expect(model, memory.x, z), z, Y, v, S, R)
+        later, later_v = linearised_again(model, expect(model, memory.x, z), z, Y, v, S, R)
         later_S = covariance(later, later) + R
-        told = row.innovation, row.innovation_cov, row.log_likelihood
+        outputs = row.innovation, row.innovation_cov, row.log_likelihood
         plain = stages_of(page, memory, model)
-        noise = input_matrix(Place("table", places.moved), (memory.shape.n,), member=True, like=memory.x)
+        noise = input_matrix(Place("table", layout.moved), (memory.shape.n,), member=True, like=memory.x)
         return {
             **{name: plain[name] for name in ("start", "advance", "summarise")},
             "draw": stored((model.Q_root @ memory.w,), (noise,)),
             "settle": stored((on_branch(memory.x + memory.w, model.state_angles),), (memory.x,)),
             "update": stored(
                 (first, pull(first, first_v, first_S, R), first_v, first_S, first_v, first_S, level),
-                (Y, B, v, S, *told),
+                (Y, B, v, S, *outputs),
             ),
             "again": stored((later, pull(later, later_v, later_S, R), later_v, later_S), (Y, B, v, S)),
         }
@@ -106,7 +104,7 @@ def window_stages(length: int) -> Callable:
 
 @inlined
 def copy_rows(table, source, target, count):
-    """Rows target ... become rows source ..., the first ones first."""
+    """Copy `count` rows from `source` to `target`, the first row first."""
     for i in range(count):
         for j in range(table.shape[1]):
             table[target + i, j] = table[source + i, j]
@@ -114,7 +112,7 @@ def copy_rows(table, source, target, count):
 
 @inlined
 def pull_row(table, source, target, slopes, pulls, count, size):
-    """Row target becomes row source + its covariance with `count` rows of slopes times rows of pulls."""
+    """Set row target to row source + its covariance with `count` rows of slopes times rows of pulls."""
     mean = 0.0
     for j in range(size):
         mean += table[source, j] / size
@@ -133,7 +131,8 @@ def pull_row(table, source, target, slopes, pulls, count, size):
 def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, iterations: int) -> Kernels:
     """Kernels of a window of `length` steps; the page's `model.own` has inflation and relaxation.
 
-    Both are of all that is estimated, (x_0, w_1 ... w_lag): each prediction stretches it, each update relaxes it.
+    Both act on the whole estimated state (x_0, w_1 ... w_length): inflation in each prediction, relaxation in each
+    update.
     """
     n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, length)
     works = works_of(page, functions, shape, window_stages(length), at.scratch)
@@ -142,9 +141,9 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     )
     row_places, substeps = memory_places(n, m), number_places(n, m).substeps
     step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
-    own = page.parameter_offsets(own_place(shape))
-    inflation, relaxation, rows = own["inflation"], own["relaxation"], n * (length + 1)
-    window, moved, slopes, pulls, _, steps, inputs, then_place, _, _ = at
+    offsets = page.parameter_offsets(own_place(shape))
+    inflation, relaxation, rows = offsets["inflation"], offsets["relaxation"], n * (length + 1)
+    window, iterate, slopes, pulls, _, steps, inputs, then_place, _, _ = at
     constants, constants_place = shape.constants, number_places(n, m).constants
     count, size_of_step = own_place(shape) + page.own_size, p + shape.constants
 
@@ -162,7 +161,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def move(memory, source, k, numbers, size):
-        """The members by step k of the window, whose start is in rows source ..., its noise behind."""
+        """Propagate the members by step k of the window that begins at row `source`: start, then noise."""
         row, table, draws = memory
         first, then, width = inputs + k * size_of_step, row[then_place : then_place + count], table.shape[1]
         u = row[first : first + p]
@@ -179,7 +178,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def run_window(memory, source, numbers, size):
-        """The members from the start of the window on."""
+        """Propagate the members from the start of the window to its end."""
         row, table, _ = memory
         copy_rows(table, source, 0, n)
         for k in range(int(row[steps])):
@@ -187,7 +186,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def drop(memory):
-        """Leave out the first step of the window."""
+        """Drop the first step of the window."""
         row, table, _ = memory
         copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
         for k in range((length - 1) * size_of_step):
@@ -196,7 +195,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def admit(memory, u, numbers, size):
-        """A step more, whose noise is in rows moved ...; then inflation."""
+        """Append a step, whose noise begins at row `iterate`; then inflate."""
         row, table, _ = memory
         k = int(row[steps])
         first = inputs + k * size_of_step
@@ -204,7 +203,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             row[first + i] = u[i]
         for i in range(constants):
             row[first + p + i] = numbers[constants_place + i]
-        copy_rows(table, moved, window + (k + 1) * n, n)
+        copy_rows(table, iterate, window + (k + 1) * n, n)
         row[steps] += 1.0
         if numbers[inflation] != 1.0:
             for i in range(window, window + rows):
@@ -223,7 +222,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         while k < row[steps]:
             move(memory, window, k, numbers, size)
             k += 1
-            if full:  # the window starts there from now on
+            if full:  # the window starts here from now on
                 full, k = False, 0
                 copy_rows(table, 0, window, n)
                 drop(memory)
@@ -234,20 +233,20 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     def update(memory, z, numbers, size):
         row, table, draws = memory
         look(row, z, numbers, table, draws, size)
-        seen = False
+        measured = False
         for k in range(m):
-            seen = seen or z[k] == z[k]
-        if seen:
+            measured = measured or z[k] == z[k]
+        if measured:
             for iteration in range(1, iterations + 1):
                 for i in range(rows):
-                    pull_row(table, window + i, moved + i, slopes, pulls, m, size)
+                    pull_row(table, window + i, iterate + i, slopes, pulls, m, size)
                     if iteration == iterations and numbers[relaxation] > 0.0:
                         _, before = row_moments(table, window + i, size)
-                        relax_row(table, moved + i, before, numbers[relaxation], size)
-                run_window(memory, moved, numbers, size)
+                        relax_row(table, iterate + i, before, numbers[relaxation], size)
+                run_window(memory, iterate, numbers, size)
                 if iteration < iterations:
                     again(row, z, numbers, table, draws, size)
-            copy_rows(table, moved, window, rows)
+            copy_rows(table, iterate, window, rows)
         moments_of(row, row, row, table, draws, size)
 
     @inlined
@@ -257,26 +256,23 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     used = max(at.scratch, *(work.rows for work in works.values()))
     scratch = m + m * m + count
-    sizes = 1 + length * size_of_step, rows, scratch  # of what is kept of the row and of the table, and scratch
+    sizes = 1 + length * size_of_step, rows, scratch  # extras of the row, kept rows of the table, scratch
     return Kernels(n, m, used, max(n, m), start, predict, update, summarise, *sizes)
 
 
-# The iterated ensemble Kalman filter: the measurement function linearised where the members come to lie.
-
-
-MOST_ITERATIONS = 20  # that are written out
+MOST_ITERATIONS = 20  # which programs repeat without a loop
 LONGEST_WINDOW = 1000  # steps
 
 
 def update(model, x, z, e):
-    """The measurement z; channels that are NaN are missing. Y are the slopes of h along the members' distances."""
+    """Update with the measurement z (NaN: missing); Y are the slopes of h along the members' deviations."""
     Y, C, v, S, R, level = compare(model, x, z)
-    told = v, S, level
+    outputs = v, S, level
     for _ in range(1, model.own.iterations):
         y = expect(model, x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), z)
-        Y, v = seen_anew(model, y, z, Y, v, S, R)
+        Y, v = linearised_again(model, y, z, Y, v, S, R)
         C, S = covariance(x, Y), covariance(Y, Y) + R
-    return x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), *told
+    return x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), *outputs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -290,26 +286,26 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
                  w = Y' S^-1 (z - mean(y) + Y w)/(N - 1),  T = (I + Y' R^-1 Y/(N - 1))^-1/2;
                  then x_j = mean + X w + X T e_j,  e_j the j-th unit vector
 
-    The slopes of h are thus those at the estimate, averaged over its uncertainty. One
-    iteration is the `EnsembleTransformFilter`; where h is linear, further ones change nothing. T and its inverse
-    are symmetric and N x N, and never formed. The innovation and its covariance are those of the first iteration.
+    So the slopes of h are those at the estimate, averaged over its uncertainty. One iteration is the
+    `EnsembleTransformFilter`; if h is linear, further ones change nothing. T and its inverse are symmetric and N x
+    N, and never formed. The innovation and its covariance are those of the first iteration.
 
-    Steps are not damped: where the measurement fits several states, iterations may jump between them. Where a
-    measurement is far more accurate than the forecast, T^-1 magnifies any nonlinearity of h along unobserved
+    Steps are not damped: if the measurement fits several states, iterations may jump between them. If a
+    measurement is far more accurate than the forecast, T^-1 amplifies any nonlinearity of h along unobserved
     directions, and iterations gain little.
 
-    With a `window` of L steps this is the iterative ensemble Kalman smoother (IEnKS) of lag L, each measurement
-    used once, the window shifted by one: mean and X are of x_0, L steps ago, and of the process noise w_1 ... w_L
-    since, and y_j = h(x_Lj) follows by x_kj = f(x_(k-1)j, u_k) + w_kj, run again in each iteration. So the slopes
-    are those of f, too. Where f and h are linear the estimates are those without a window.
+    With a `window` of L steps this is the iterative ensemble Kalman smoother (IEnKS) of lag L, which uses each
+    measurement once and shifts the window by one step: mean and X are those of x_0, L steps ago, and of the
+    process noise w_1 ... w_L since, and each iteration computes y_j = h(x_Lj) by x_kj = f(x_(k-1)j, u_k) + w_kj
+    again. So the slopes include those of f. If f and h are linear, the estimates are those without a window.
     `Belief.members` then is (n (L + 2), N): the members now, those at the window's start given all measurements
-    since, and w_1 ... w_L; `Belief.extras` holds how many steps the window has so far, with the input and the
+    since, and w_1 ... w_L; `Belief.extras` holds the number of steps in the window so far, with the input and the
     model's constants of each.
 
     Attributes:
         iterations: evaluations of h by all members in an update, 1 to 20; with a window, each with its steps of f.
-        window: steps L that an update estimates again, 0 to 1000; 0 leaves the motion as predicted. With a window
-            inflation and relaxation act on x_0 and the noise, and there is no adaptive_inflation.
+        window: number L of steps that an update estimates again, 0 to 1000; with 0 the motion stays as predicted.
+            With a window inflation and relaxation act on x_0 and the noise, and there is no adaptive_inflation.
             The others are those of `EnsembleFilter`.
 
     Raises:
@@ -340,7 +336,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
 
     @property
     def by_parts(self) -> bool:
-        """Whether an update runs the motion again, too, and is more than the page."""
+        """Whether an update also runs the motion again, which the page does not contain."""
         return bool(self.window)
 
     def kernels(self) -> Kernels:

@@ -18,14 +18,13 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import below, quantile
 
-# The rank histogram filter: each channel has the density of its sorted members, and no Gaussian is assumed.
-
 
 @inlined
 def tail_mass(edge, spread, tail, z):
-    """The posterior tail below an edge: its log mass but for the prior's scale, and its mean and deviation.
+    """The posterior tail below an edge: its log mass without the prior's scale, its mean and standard deviation.
 
-    The prior is normal with the members' deviation, of which a part normal(tail) lies below the edge.
+    The prior is normal with the members' standard deviation; its mass below the edge is the normal distribution
+    function of `tail`.
     """
     centre, total = edge - tail * spread, spread * spread + 1.0
     mean, deviation = (centre + z * spread * spread) / total, spread / total**0.5
@@ -36,7 +35,7 @@ def tail_mass(edge, spread, tail, z):
 
 @inlined
 def ranked_moves(y, v, tail, moves, size):
-    """How a channel's y (N,), of variance 1 in R, moves to a measurement v: to the quantiles of its posterior."""
+    """Moves of a channel's y (N,), with R = 1, for a measurement v: to the quantiles of its posterior."""
     order, squares = np.argsort(y), 0.0
     for j in range(size):
         squares += y[j] ** 2
@@ -78,18 +77,18 @@ def ranked_moves(y, v, tail, moves, size):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RankHistogramFilter(LocalisedByParts):
-    """Rank histogram filter (RHF): what a channel sees has any density, that of its members.
+    """Rank histogram filter (RHF): the predicted measurement may have any density, which its members determine.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
-        update:  channel by channel, with y_j = h(x_j): of the prior 1/(N + 1) lies between two neighbours, evenly,
-                 and below the least and above the largest y, as a part of a normal density with their deviation;
-                 times the likelihood, of which a bin has the mean of its ends, this is the posterior;
+        update:  channel by channel, with y_j = h(x_j): the prior has the mass 1/(N + 1) between two neighbours,
+                 uniformly, and below the least and above the largest y, as tails of a normal density with their
+                 standard deviation; the posterior is this times the likelihood, for a bin the mean at its ends;
                  the y of rank k moves to its quantile k/(N + 1), by d_j;  x_j += cov(x, y) d_j/var(y)
 
-    Two clouds of members stay two, where a Kalman gain moves all alike. The states follow what is measured by
-    linear regression. Channels with correlated noise are first made independent, by the lower triangular root of
-    R. The innovation, its covariance and the log-likelihood are Gaussian, as those of other ensembles. The update
-    is neither in C nor on tensors.
+    Two separate clouds of members stay separate, while a Kalman gain moves all members alike. States move by
+    linear regression on the channel. Channels with correlated noise are first made independent, by the lower
+    triangular root of R. The innovation, its covariance and the log-likelihood are Gaussian, as for other
+    ensembles. The update is neither in C nor on tensors.
 
     Attributes:
         radius: of Gaspari and Cohn's taper on the regression, in the unit of the model's `Positions`; 0 for no
@@ -133,16 +132,16 @@ def record_members(
 ) -> Members:
     """Run an ensemble filter over trajectories and keep its members.
 
-    They are those of `filters.run` with the same arguments. All ensembles of a long batch fill much memory,
-    8 B T n N bytes. For a rank histogram some tens of runs are enough, and so is a part of their steps.
+    The members are those of `filters.run` with the same arguments. All ensembles of a long batch take much memory,
+    8 B T n N bytes. For a rank histogram some tens of runs and a part of their steps are enough.
 
     Args:
         filter_: a filter with an ensemble.
         keys: (B, 2).
         inputs: (B, K, p).
         measurements: (B, K + 1, m), NaN where missing.
-        first: index of the first measurement after which members are kept, ...
-        every: ... and how many measurements later they are kept again.
+        first: index of the first measurement after which members are kept.
+        every: number of measurements from one set of members to the next.
 
     Raises:
         ValueError: if the filter has no ensemble, or a number is wrong.
@@ -153,16 +152,18 @@ def record_members(
     count, times = measurements.shape[:2]
     steps = np.arange(at_least("first", first, 0), times, at_least("every", every, 1))
     rows = n if isinstance(filter_, EnsembleFilter) else n + 1  # particles have weights
-    kept = np.empty((count, len(steps), rows, filter_.size))
+    members = np.empty((count, len(steps), rows, filter_.size))
     for b in range(count):
         session.start(keys[b], measurements[b, 0])
         for k in range(times):
             if k > 0:
                 session.step(inputs[b, k - 1], measurements[b, k])
-            place, off = divmod(k - first, every)
-            if place >= 0 and off == 0:
-                kept[b, place] = filter_.sample(session.belief())
+            index, off = divmod(k - first, every)
+            if index >= 0 and off == 0:
+                members[b, index] = filter_.sample(session.belief())
     if rows == n:
-        return Members(kept, None, steps)
-    weights = np.exp(kept[:, :, n] - kept[:, :, n].max(axis=-1, keepdims=True))  # row n holds their logarithms
-    return Members(kept[:, :, :n], weights / weights.sum(axis=-1, keepdims=True), steps)
+        return Members(members, None, steps)
+    weights = np.exp(
+        members[:, :, n] - members[:, :, n].max(axis=-1, keepdims=True)
+    )  # row n holds their logarithms
+    return Members(members[:, :, :n], weights / weights.sum(axis=-1, keepdims=True), steps)

@@ -20,11 +20,9 @@ from filters.ensembles.stochastic import DeterministicUpdateFilter
 from filters.pages.page import Page
 from thruster_env.core.checks import positive
 
-# The ensemble transform Kalman filter: members moved by the symmetric square root.
-
 
 def update_transform(model, x, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Update with the measurement z, by the symmetric square root; NaN marks missing channels."""
     d, C, v, S, R, level = compare(model, x, z)
     return x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ d), v, S, level
 
@@ -37,9 +35,9 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
         update:  y_j = h(x_j),  innovation = z - mean(y),  X (n, N) and Y (m, N) the distances from the means,
                  mean(x) += X T^2 Y' R^-1 innovation/(N - 1),  X = X T,  T = (I + Y' R^-1 Y/(N - 1))^-1/2
 
-    T is symmetric: the mean stays exactly, and the members move as little as they can. It is N x N and never
-    formed. With S = Y Y'/(N - 1) + R and the geometric mean R # S = R (R^-1 S)^1/2 of the two, which is the root
-    of R S for one channel, T = I - Y' (S + R # S)^-1 Y/(N - 1) and X T = X - cov(x, y) (S + R # S)^-1 Y.
+    T is symmetric, so that it keeps the mean exactly and moves the members as little as possible. It is N x N and
+    never formed. With S = Y Y'/(N - 1) + R and the geometric mean R # S = R (R^-1 S)^1/2 of the two, which is the
+    root of R S for one channel, T = I - Y' (S + R # S)^-1 Y/(N - 1) and X T = X - cov(x, y) (S + R # S)^-1 Y.
 
     The covariance after an update is exactly P - K S K', where the stochastic filter's is so on average only; the
     mean moves as the Kalman filter's. The update draws nothing: only the process noise of the members is random,
@@ -58,15 +56,15 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LocalEnsembleTransformFilter(LocalisedByParts, EnsembleTransformFilter):
-    """Local ensemble transform Kalman filter (LETKF): each state has an analysis of its own, with what lies near.
+    """Local ensemble transform Kalman filter (LETKF): each state has its own analysis, with the channels near it.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
         update:  state i is moved as by the `EnsembleTransformFilter` with R_kk/taper(distance of i and k) in
                  place of each R_kk (R-localisation), by Gaspari and Cohn's taper; tapers below 0.001 are zero
 
-    N members span N - 1 directions, which are enough for a field of any length if what lies far apart is not
-    correlated. The model says where its states and measurements lie (`Positions`); without a radius it is the
-    `EnsembleTransformFilter`. Innovation, its covariance and log-likelihood are those without tapers.
+    N members span N - 1 directions, which are enough for a field of any length if distant states are not
+    correlated. The model has the positions of its states and measurements (`Positions`); without a radius this is
+    the `EnsembleTransformFilter`. Innovation, its covariance and log-likelihood are those without tapers.
 
     Attributes:
         radius: at which a channel counts about 0.6 times, in the unit of the positions; 0 for no localisation. The
@@ -82,11 +80,8 @@ class LocalEnsembleTransformFilter(LocalisedByParts, EnsembleTransformFilter):
     name: ClassVar[str] = "letkf"
 
 
-# The serial ensemble square root filter: measurements taken in one channel after the other.
-
-
 def update_serial(model, x, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Update with the measurement z, as by one channel after the other; NaN marks missing channels."""
     d, C, v, S, R, level = compare(model, x, z)
     K, L, M = divide(C, S), root(S), root(R)
     return x + (K @ v - triangle_quotient(K @ L, L + M) @ d), v, S, level
@@ -98,21 +93,21 @@ class SerialSquareRootFilter(LocalisedByParts):
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
         update:  y_j = M^-1 h(x_j) and z = M^-1 z, M the lower triangular root of R: channels with independent
-                 noise of variance 1; then for one channel i after the other, in x and in the channels to come,
+                 noise of variance 1; then for one channel i after the other, in x and in the remaining channels,
                  s = var(y_i) + 1,  k = cov(x, y_i)/s,  mean += k (z_i - mean(y_i)),
                  x_j - mean(x) -= k (y_ij - mean(y_i))/(1 + s^-1/2);  sample covariances with divisor N - 1
 
-    For all channels together that is x_j += K innovation - K L (L + M)^-1 (h(x_j) - mean(h)), with L the lower
-    triangular root of S = cov(h, h) + R: Andrews' square root, for taking the channels in turn is the elimination
-    that makes L. So it is computed. The covariance after an update is exactly P - K S K', where the stochastic
-    filter's is so on average only; the mean moves as the Kalman filter's. The update draws nothing: only the
+    For all channels at once that is x_j += K innovation - K L (L + M)^-1 (h(x_j) - mean(h)), with L the lower
+    triangular root of S = cov(h, h) + R: Andrews' square root, because eliminating one channel after the other
+    yields L. The filter computes this. The covariance after an update is exactly P - K S K', which the stochastic
+    filter attains only on average; the mean moves as in the Kalman filter. The update draws nothing: only the
     process noise of the members is random, and the error of its sample mean and covariance enters the estimate.
 
-    With one channel it is the `EnsembleTransformFilter`. Close relatives go by the name of EnKF-SR in the
-    literature on ships.
+    With one channel it is the `EnsembleTransformFilter`. Close relatives are called EnKF-SR in the literature on
+    ships.
 
     With a radius the gain k of a state is tapered by its distance from the channel (P-localisation), and each
-    channel is predicted anew from the members that those before have moved.
+    channel is predicted again from the members after the update by earlier channels.
 
     Attributes:
         radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. The
@@ -135,30 +130,30 @@ class SerialSquareRootFilter(LocalisedByParts):
 
 
 ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
-FLATTEST = 0.25  # smallest slope that it divides by
+FLATTEST = 0.25  # smallest slope by which a round divides
 
 
-def variance_factor(own, A, R, v):
-    """The factor t on the covariance A of y for which J(t) is least."""
+def variance_factor(parameters, A, R, v):
+    """The factor t on the covariance A of y that minimises J(t)."""
     L = root(A)
     B = divide(L.T, R)
     G, g = sym(B @ L), B @ v
     unit = eye(G)
-    shift = exponential((trace(divide(G, unit + G)) / own.size - 1.0) * own.log_mode)
-    low, high = own.low * shift, own.high / shift
-    t, least = constant(1.0, own.size), low / high
+    shift = exponential((trace(divide(G, unit + G)) / parameters.size - 1.0) * parameters.log_mode)
+    low, high = parameters.low * shift, parameters.high / shift
+    t, least = constant(1.0, parameters.size), low / high
     for _ in range(ROUNDS):
         of = unit + G * t
         q = divide(g, of)  # t q'q is the square of the members' weights
-        rest = t - (low + t * t * dot(q, q) / own.degrees) / high
-        slope = 1.0 - t * 2.0 * dot(q, divide(q, of)) / (own.degrees * high)
+        rest = t - (low + t * t * dot(q, q) / parameters.degrees) / high
+        slope = 1.0 - t * 2.0 * dot(q, divide(q, of)) / (parameters.degrees * high)
         t = t - rest / at_least(slope, FLATTEST)
         t = choose(exceeds(t - least, 0.0), t, least)
     return t
 
 
 def update_finite_size(model, x, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Inflate, then update with the measurement z; NaN marks missing channels."""
     d, C, v, S, R, level = compare(model, x, z)
     t = variance_factor(model.own, S - R, R, v)
     t = choose(exceeds(count(present(z)), 0.0), t, constant(1.0, t))
@@ -169,7 +164,7 @@ def update_finite_size(model, x, z, e):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
-    """Finite-size ensemble Kalman filter (EnKF-N): the ensemble transform filter with an inflation of its own.
+    """Finite-size ensemble Kalman filter (EnKF-N): the ensemble transform filter with estimated inflation.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
         update:  y_j = h(x_j),  A = cov(y, y),  v = z - mean(y);  t > 0 where
@@ -178,17 +173,18 @@ class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
         with     a = certainty (1 + 1/N) c,  b = certainty N/((N - 1) c),  c = (1 - 1/N^2)^(-r/2),
                  r = 1 - trace(A (A + R)^-1)/N
 
-    N members know mean and covariance of the forecast but roughly. With Jeffreys' prior for both, the forecast is
-    not Gaussian; its mode is that of a Gaussian whose covariance is t times the sample's. So inflation need not be
-    tuned for the error of sampling; what the model does not know is still for Q. J is in the dual form; c makes t
-    = 1 where measurements say nothing. Eight rounds of Newton's method begin at t = 1: they end in a minimum but
-    for innovations beyond some four standard deviations, a few in a hundred of which end on the way.
+    N members determine mean and covariance of the forecast only roughly. With Jeffreys' prior for both, the
+    forecast is not Gaussian; its mode is that of a Gaussian with t times the sample covariance. So inflation need
+    not be tuned for the sampling error; Q still covers errors of the model. J is in the dual form; c makes t = 1
+    if measurements carry no information. Eight rounds of Newton's method start at t = 1; they converge except for
+    a few per cent of innovations beyond some four standard deviations.
 
-    The innovation, its covariance and the log-likelihood are those before the inflation, which knows z.
+    The innovation, its covariance and the log-likelihood are those before the inflation, because that depends on
+    z.
 
     Attributes:
-        certainty: of the ensemble's covariance: 1 for members that are like independent draws, as of a chaotic or
-            noisy plant, more for fewer surprises. The others are those of `DeterministicUpdateFilter`.
+        certainty: of the ensemble's covariance: 1 for members that are like independent draws, as for a chaotic or
+            noisy plant; with more, t varies less. The others are those of `DeterministicUpdateFilter`.
 
     Raises:
         ValueError: if a parameter is out of its range.
@@ -210,11 +206,11 @@ class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Those of all ensembles, and what J is made of."""
+        """Those of all ensembles, and the constants of J."""
         size = self.ensemble_size
-        given = super().parameters
+        parameters = super().parameters
         return {
-            **{name: value for name, value in given.items() if name != "certainty"},
+            **{name: value for name, value in parameters.items() if name != "certainty"},
             "size": size,
             "degrees": size - 1,
             "low": self.certainty * (size + 1) / size,

@@ -18,10 +18,10 @@ from thruster_env.core.checks import positive, switch
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_ROTATION, fill_normals
 
-# Localisation of ensembles: what lies far apart is not correlated, so that few members do for many states.
+# Localisation: distant states and channels count as uncorrelated, so few members are enough for many states.
 
 
-SUPPORT = (10.0 / 3.0) ** 0.5  # of a taper over its radius: half of what it reaches over
+SUPPORT = (10.0 / 3.0) ** 0.5  # half the range of a taper, over its radius
 
 
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
@@ -74,11 +74,8 @@ class LocalisedFilter(EnsembleFilter):
         return {**super().parameters, **self.tapers}
 
 
-# The stochastic ensemble Kalman filter: each member is drawn to a measurement with noise of its own.
-
-
 def update_stochastic(model, x, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Update each member with the measurement z and its own noise; NaN marks missing channels."""
     d, C, v, S, _, level = compare(model, x, z)
     e = centred(e) if model.own.centred_perturbations else e
     return x + divide(C, S) @ (v - d - model.R_root @ e), v, S, level
@@ -151,16 +148,17 @@ def reflect(table, rows, first, size, vector):
 def rotator(n: int, m: int) -> Callable:
     """Return `rotate(memory, size)`: X = X W for members X (n, N), W random and orthogonal with W 1 = 1.
 
-    In the basis whose first axis is (1, ..., 1)/N^1/2, to which one reflection leads and from which it leads back,
-    W is 1 on that axis, and on the other N - 1 a product of reflections in random directions of ever fewer of
-    them, with a random sign at the end: uniform among all rotations and reflections.
+    One reflection leads to a basis with the first axis (1, ..., 1)/N^1/2, and back. In this basis W is 1 on the
+    first axis; on the other N - 1 it is a product of reflections in random directions, each in one dimension less
+    than the
+    one before, with a random sign at the end: uniform among all rotations and reflections.
 
     Source: Stewart (1980), "The efficient generation of random orthogonal matrices with an application to
     condition estimators"; for ensembles: Sakov, Oke (2008), "Implications of the form of the ensemble
     transformation in the ensemble square root filters".
     """
-    places = memory_places(n, m)
-    step_place, key_0, key_1 = places.step, places.key_0, places.key_1
+    layout = memory_places(n, m)
+    step_place, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined
     def rotate(memory, size):
@@ -180,7 +178,7 @@ def rotator(n: int, m: int) -> Callable:
                     norm = 0.0
                     for j in range(first, size):
                         norm += draws[j] * draws[j]
-                    # The reflection that takes this random vector to its first axis is the one in v + |v| e.
+                    # The reflection in v + |v| e takes the random vector v to the first axis e.
                     draws[first] += norm**0.5 if draws[first] >= 0.0 else -(norm**0.5)
                     reflect(table, n, first, size, draws)
                 fill_normals(draws, size, row[step_place] * size, FILTER_ROTATION, row[key_0], row[key_1])
@@ -194,7 +192,7 @@ def rotator(n: int, m: int) -> Callable:
 
 @lru_cache(maxsize=64)
 def with_rotation(kernels: Kernels) -> Kernels:
-    """An ensemble's kernels with a random rotation after each update; mean and covariance stay."""
+    """An ensemble's kernels with a random rotation after each update, which keeps mean and covariance."""
     rotate, update_plainly = rotator(kernels.n, kernels.m), kernels.update
 
     @inlined
@@ -205,11 +203,11 @@ def with_rotation(kernels: Kernels) -> Kernels:
     return kernels._replace(update=update)
 
 
-# Ensemble filters without perturbed measurements, and the one with half the gain: the deterministic EnKF.
+# Ensemble filters without perturbed measurements, and the deterministic EnKF.
 
 
 def update_deterministic(model, x, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Update with the measurement z, with half the gain for deviations; NaN marks missing channels."""
     d, C, v, S, _, level = compare(model, x, z)
     return x + divide(C, S) @ (v - d * 0.5), v, S, level
 
@@ -219,8 +217,8 @@ class DeterministicUpdateFilter(EnsembleFilter):
     """Base of the ensemble filters whose update draws nothing.
 
     Attributes:
-        rotations: 1 for a random rotation of the members about their mean after each update, 0 for none. It keeps
-            them from growing outliers where little or no process noise mixes them.
+        rotations: 1 for a random rotation of the members about their mean after each update, 0 for none. It
+            prevents outliers among the members if there is little or no process noise.
     """
 
     rotations: int = 0
@@ -238,15 +236,15 @@ class DeterministicUpdateFilter(EnsembleFilter):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DeterministicEnsembleKalmanFilter(LocalisedFilter, DeterministicUpdateFilter):
-    """Deterministic ensemble Kalman filter: the mean moves by the gain, the members' distances by half of it.
+    """Deterministic ensemble Kalman filter: the gain updates the mean, half the gain the members' deviations.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
         update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
                  mean += K innovation,  x_j - mean(x) -= K (y_j - mean(y))/2;  sample covariances, divisor N - 1
 
-    With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
-    where measurements are poor. The update draws nothing: only the process noise of the members is random, and the
-    error of its sample mean and covariance enters the estimate.
+    With a linear h the covariance after the update is P - K H P + K H P H'K'/4, larger than the Kalman filter's P
+    - K H P; the difference is small for inaccurate measurements. The update draws nothing: only the process noise
+    of the members is random, and the error of its sample mean and covariance enters the estimate.
 
     Attributes:
         radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. With

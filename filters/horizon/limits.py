@@ -68,12 +68,12 @@ def force(rows, adjoint, n, at):
 
 
 @inlined
-def change_side(given, place, side, wrong, single):
+def change_side(step, index, side, wrong, single):
     """Let another bound hold, unless bounds change one by one and one has; returns how many were wrong."""
-    if given[place] == side:
+    if step[index] == side:
         return wrong
     if not (single and wrong > 0):
-        given[place] = side
+        step[index] = side
     return wrong + 1
 
 
@@ -87,77 +87,77 @@ def side_of(value, low, high, spread):
 @cache
 def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
     """What holds states within bounds, and disturbances if they are limited, for some sizes."""
-    n, kept, at = shape.n, kept_places(shape), scratch_places(shape)
+    n, step_layout, at = shape.n, kept_places(shape), scratch_places(shape)
     low, high = [-math.inf] * n, [math.inf] * n
-    for one in bounds:
-        low[one.place], high[one.place] = one.low, one.high
+    for bound in bounds:
+        low[bound.place], high[bound.place] = bound.low, bound.high
     lows, highs, bounded, size = tuple(low), tuple(high), bool(bounds), n + 2
     of_states, of_disturbances = at.holds, at.holds + n * size
-    held_states, held_disturbances = kept.held, kept.held + n
+    held_states, held_disturbances = step_layout.held, step_layout.held + n
 
     @inlined
-    def clip(row, place):
+    def clip(row, offset):
         if bounded:
             for i in range(n):
-                row[place + i] = min(max(row[place + i], lows[i]), highs[i])
+                row[offset + i] = min(max(row[offset + i], lows[i]), highs[i])
 
     @inlined
-    def hold_state(rows, given):
+    def hold_state(rows, step):
         if bounded:
             for i in range(n):
-                side = given[held_states + i]
+                side = step[held_states + i]
                 if side != 0.0:
-                    value = (lows[i] if side < 0.0 else highs[i]) - given[kept.x + i]
+                    value = (lows[i] if side < 0.0 else highs[i]) - step[step_layout.x + i]
                     hold(rows, at.updated_d, at.updated_cov, n, i, value, of_states + i * size)
 
     @inlined
-    def hold_disturbance(rows, given, sigma):
+    def hold_disturbance(rows, step, sigma):
         if limited:
             for i in range(n):
                 rows[at.spread + i] = rows[at.noise_cov + i * n + i] ** 0.5
             for i in range(n):
-                side = given[held_disturbances + i]
+                side = step[held_disturbances + i]
                 if side != 0.0:
                     value = side * sigma * rows[at.spread + i]
                     hold(rows, at.noise, at.noise_cov, n, i, value, of_disturbances + i * size)
 
     @inlined
-    def pushed(rows, given, holds, held, wrong, single):
+    def pushed(rows, step, holds, sides, wrong, single):
         """Add the forces of bounds that hold to the adjoint, and release those that pull."""
         for i in range(n - 1, -1, -1):
-            side = given[held + i]
+            side = step[sides + i]
             if side != 0.0:
                 s = rows[holds + i * size + n]
                 push = force(rows, at.after, n, holds + i * size)
                 rows[at.after + i] += push
                 if s > 0.0 and side * push * s**0.5 > ENOUGH:
-                    wrong = change_side(given, held + i, 0.0, wrong, single)
+                    wrong = change_side(step, sides + i, 0.0, wrong, single)
         return wrong
 
     @inlined
-    def update_state_set(rows, given, wrong, single):
+    def update_state_set(rows, step, wrong, single):
         if bounded:
             for i in range(n):
-                if given[held_states + i] == 0.0:
+                if step[held_states + i] == 0.0:
                     spread = rows[at.cov + i * n + i] ** 0.5
                     side = side_of(rows[at.found + i], lows[i], highs[i], spread)
-                    wrong = change_side(given, held_states + i, side, wrong, single)
+                    wrong = change_side(step, held_states + i, side, wrong, single)
         return wrong
 
     @inlined
-    def push_state(rows, given, wrong, single):
-        return pushed(rows, given, of_states, held_states, wrong, single) if bounded else wrong
+    def push_state(rows, step, wrong, single):
+        return pushed(rows, step, of_states, held_states, wrong, single) if bounded else wrong
 
     @inlined
-    def update_disturbance_set(rows, given, sigma, wrong, single):
+    def update_disturbance_set(rows, step, sigma, wrong, single):
         for i in range(n):
             rows[at.after + i] = rows[at.end + at.before + i]
-        wrong = pushed(rows, given, of_disturbances, held_disturbances, wrong, single)
+        wrong = pushed(rows, step, of_disturbances, held_disturbances, wrong, single)
         for i in range(n):
-            if given[held_disturbances + i] == 0.0:
+            if step[held_disturbances + i] == 0.0:
                 spread = rows[at.spread + i]
                 side = side_of(rows[at.disturbance + i], -sigma * spread, sigma * spread, spread)
-                wrong = change_side(given, held_disturbances + i, side, wrong, single)
+                wrong = change_side(step, held_disturbances + i, side, wrong, single)
         return wrong
 
     return Limits(clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set)

@@ -89,7 +89,7 @@ class MovingHorizonFilter(Filter):
 
     @property
     def _kernel_horizon(self) -> int:
-        return next(one for one in KERNEL_HORIZONS if one >= self.horizon)
+        return next(length for length in KERNEL_HORIZONS if length >= self.horizon)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
@@ -104,6 +104,6 @@ class MovingHorizonFilter(Filter):
 
     def window(self, belief: Belief) -> np.ndarray:
         """The states (at most L, n) of the window as they were last estimated, the oldest first."""
-        places, n = kept_places(self.kernel_model.shape), self.model.n
-        steps = belief.extras[1 + n + n * n :].reshape(self._kernel_horizon + 1, places.end)
-        return steps[: int(belief.extras[0]), places.x : places.x + n].copy()
+        layout, n = kept_places(self.kernel_model.shape), self.model.n
+        steps = belief.extras[1 + n + n * n :].reshape(self._kernel_horizon + 1, layout.end)
+        return steps[: int(belief.extras[0]), layout.x : layout.x + n].copy()

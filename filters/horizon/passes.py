@@ -40,12 +40,12 @@ def horizon_kernels(
     what is computed of each.
     """
     n, m, inputs = shape.n, shape.m, shape.inputs
-    places, kept, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
-    end, width, square = kept.end, at.end, n * n
-    arrival = places.extras + 1
+    layout, step_layout, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
+    end, width, square = step_layout.end, at.end, n * n
+    arrival = layout.extras + 1
     steps = arrival + n + square
     numbers_place = steps + (room + 1) * end
-    mean, cov, number = places.mean, places.cov, places.extras
+    mean, cov, number = layout.mean, layout.cov, layout.extras
     sigma_place, horizon_place, iterations_place = (own_place(shape) + k for k in (1, 2, 3))
     numbers_end, constants = iterations_place + 1, shape.constants
     scratch, at_numbers = numbers_place + numbers_end, number_places(n, m)
@@ -70,16 +70,16 @@ def horizon_kernels(
     def keep_sight(row, numbers, step):
         """Keep what a measurement depends on besides the state."""
         first = steps + step * end
-        copy(row, first + kept.R, numbers, r_place, m * m)
-        copy(row, first + kept.seen_by, numbers, constants_place, constants)
+        copy(row, first + step_layout.R, numbers, r_place, m * m)
+        copy(row, first + step_layout.seen_by, numbers, constants_place, constants)
 
     @inlined
     def keep_motion(row, numbers, step):
         """Keep what the motion to the next step depends on besides state and input."""
         first = steps + step * end
-        copy(row, first + kept.Q, numbers, q_place, square)
-        copy(row, first + kept.moved_by, numbers, constants_place, constants)
-        row[first + kept.substeps] = numbers[substeps]
+        copy(row, first + step_layout.Q, numbers, q_place, square)
+        copy(row, first + step_layout.moved_by, numbers, constants_place, constants)
+        row[first + step_layout.substeps] = numbers[substeps]
 
     @not_inlined
     def forwards(row, numbers, count, free):
@@ -94,25 +94,25 @@ def horizon_kernels(
         cost = row[scratch + at.seen_cost]
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
-            given = row[steps + j * end : steps + (j + 2) * end]
+            step = row[steps + j * end : steps + (j + 2) * end]
             for i in range(m):
-                rows[at.z + i] = given[kept.z + i] if given[kept.z + i] < math.inf else math.nan
-            copy(then, r_place, given, kept.R, m * m)
-            copy(then, constants_place, given, kept.seen_by, constants)
-            correct(rows, given, then)
+                rows[at.z + i] = step[step_layout.z + i] if step[step_layout.z + i] < math.inf else math.nan
+            copy(then, r_place, step, step_layout.R, m * m)
+            copy(then, constants_place, step, step_layout.seen_by, constants)
+            correct(rows, step, then)
             cost += rows[at.seen_cost]
             if not free:
-                hold_state(rows, given)
+                hold_state(rows, step)
             if j < count - 1:
-                copy(then, q_place, given, kept.Q, square)
-                copy(then, constants_place, given, kept.moved_by, constants)
-                linearise(rows, given, then)
-                for _ in range(int(given[kept.substeps])):
-                    substep(rows, given, then)
-                disturb(rows, given, then)
+                copy(then, q_place, step, step_layout.Q, square)
+                copy(then, constants_place, step, step_layout.moved_by, constants)
+                linearise(rows, step, then)
+                for _ in range(int(step[step_layout.substeps])):
+                    substep(rows, step, then)
+                disturb(rows, step, then)
                 if not free:
-                    hold_disturbance(rows, given, numbers[sigma_place])
-                move(rows, given, then)
+                    hold_disturbance(rows, step, numbers[sigma_place])
+                move(rows, step, then)
                 cost += rows[at.moved_cost]
         return cost
 
@@ -122,25 +122,25 @@ def horizon_kernels(
         wrong = 0
         for j in range(count - 1, -1, -1):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
-            given = row[steps + j * end : steps + (j + 2) * end]
+            step = row[steps + j * end : steps + (j + 2) * end]
             if j < count - 1:
                 if limited:
-                    find(rows, given, numbers)
-                    wrong = update_disturbance_set(rows, given, numbers[sigma_place], wrong, single)
-                descend(rows, given, numbers)
+                    find(rows, step, numbers)
+                    wrong = update_disturbance_set(rows, step, numbers[sigma_place], wrong, single)
+                descend(rows, step, numbers)
             else:
                 for i in range(n):
                     rows[at.after + i] = 0.0
-            wrong = push_state(rows, given, wrong, single)
-            estimate(rows, given, numbers)
-            wrong = update_state_set(rows, given, wrong, single)
+            wrong = push_state(rows, step, wrong, single)
+            estimate(rows, step, numbers)
+            wrong = update_state_set(rows, step, wrong, single)
             for i in range(n):
-                given[kept.x + i] = rows[at.found + i]
-                given[kept.adjoint + i] = rows[at.before + i]
-            given[kept.fresh] = 0.0
-            clip(given, kept.x)
+                step[step_layout.x + i] = rows[at.found + i]
+                step[step_layout.adjoint + i] = rows[at.before + i]
+            step[step_layout.fresh] = 0.0
+            clip(step, step_layout.x)
             for i in range(n):
-                rows[at.step + i] += given[kept.x + i] - rows[at.found + i]
+                rows[at.step + i] += step[step_layout.x + i] - rows[at.found + i]
         return wrong
 
     @not_inlined
@@ -148,10 +148,10 @@ def horizon_kernels(
         """Go half of the last step back."""
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
-            given = row[steps + j * end : steps + (j + 2) * end]
-            back_off(rows, given, numbers)
+            step = row[steps + j * end : steps + (j + 2) * end]
+            back_off(rows, step, numbers)
             for i in range(n):
-                given[kept.x + i] = rows[at.found + i]
+                step[step_layout.x + i] = rows[at.found + i]
 
     @inlined
     def begin_step(row, numbers, count):
@@ -161,10 +161,10 @@ def horizon_kernels(
         for i in range(end):
             row[first + i] = 0.0
         for i in range(n):
-            row[first + kept.x + i] = row[mean + i]
+            row[first + step_layout.x + i] = row[mean + i]
         for i in range(m):
-            row[first + kept.z + i] = math.inf
-        row[first + kept.fresh] = 1.0
+            row[first + step_layout.z + i] = math.inf
+        row[first + step_layout.fresh] = 1.0
         keep_sight(row, numbers, count)
         row[number] = count + 1.0
 
@@ -172,12 +172,12 @@ def horizon_kernels(
     def leave_first(row, numbers, count):
         """Leave out the first step: what it said of the second becomes the arrival cost of that."""
         forwards(row, numbers, 2, True)
-        second, found = scratch + width + at.cov, steps + end
+        second, second_step = scratch + width + at.cov, steps + end
         for i in range(n):
-            expected = row[found + kept.x + i]
+            expected = row[second_step + step_layout.x + i]
             for k in range(n):
                 row[arrival + n + i * n + k] = row[second + i * n + k]
-                expected -= row[second + i * n + k] * row[found + kept.adjoint + k]
+                expected -= row[second + i * n + k] * row[second_step + step_layout.adjoint + k]
             row[arrival + i] = expected
         for i in range(steps, steps + (count - 1) * end):
             row[i] = row[i + end]
@@ -196,8 +196,8 @@ def horizon_kernels(
         last = steps + (count - 1) * end
         keep_motion(row, numbers, count - 1)
         for i in range(square):
-            row[last + kept.Q + i] = 0.0
-        row[last + kept.substeps] = 0.0
+            row[last + step_layout.Q + i] = 0.0
+        row[last + step_layout.substeps] = 0.0
         add_step(row, numbers, count)
 
     @inlined
@@ -216,13 +216,13 @@ def horizon_kernels(
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         count = int(row[number])
-        copy(row, steps + (count - 1) * end + kept.u, u, 0, inputs)
+        copy(row, steps + (count - 1) * end + step_layout.u, u, 0, inputs)
         keep_motion(row, numbers, count - 1)
         predict_belief(memory, u, numbers, size)
         add_step(row, numbers, count)
 
     @inlined
-    def settle(row, numbers, count):
+    def iterate(row, numbers, count):
         """Pass over the window until all iterations are done and the right bounds hold, then once for P alone."""
         fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
         iterations = int(numbers[iterations_place])
@@ -246,23 +246,23 @@ def horizon_kernels(
         newest = steps + (int(row[number]) - 1) * end
         is_first, fits = True, True
         for i in range(m):
-            if row[newest + kept.z + i] < math.inf:
+            if row[newest + step_layout.z + i] < math.inf:
                 is_first = False
                 fits = fits and z[i] != z[i]
         if is_first:
             keep_sight(row, numbers, int(row[number]) - 1)
         else:
             for i in range(constants):
-                fits = fits and row[newest + kept.seen_by + i] == numbers[constants_place + i]
+                fits = fits and row[newest + step_layout.seen_by + i] == numbers[constants_place + i]
             if not fits:
                 repeat_step(row, numbers, int(row[number]))
                 newest = steps + (int(row[number]) - 1) * end
         for i in range(m):
             if z[i] == z[i]:
-                row[newest + kept.z + i] = z[i]
+                row[newest + step_layout.z + i] = z[i]
                 for j in range(m):
                     joint = numbers[r_place + i * m + j] if z[j] == z[j] else 0.0
-                    row[newest + kept.R + i * m + j] = row[newest + kept.R + j * m + i] = joint
+                    row[newest + step_layout.R + i * m + j] = row[newest + step_layout.R + j * m + i] = joint
 
     @inlined
     def update(memory, z, numbers, size):
@@ -273,9 +273,9 @@ def horizon_kernels(
         count = int(row[number])
         newest = steps + (count - 1) * end
         if has_bounds or anything_measured(z):
-            settle(row, numbers, count)
+            iterate(row, numbers, count)
             for i in range(n):
-                row[mean + i] = row[newest + kept.x + i]
+                row[mean + i] = row[newest + step_layout.x + i]
             for i in range(square):
                 row[cov + i] = row[scratch + (count - 1) * width + at.updated_cov + i]
 

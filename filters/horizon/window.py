@@ -133,38 +133,38 @@ def correct(model, x, d, P, z, fresh, loss):
 
     The weight follows from the residual at x; before there is an estimate, from the innovation.
     """
-    seen = present(z)
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    residual = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    measured = present(z)
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    residual = only(measured, wrap(z - model.h(x), model.measurement_angles))
     v, square, limit = (
         residual - H @ d,
         dot(residual, divide(residual, R)),
         model.own.threshold * model.own.threshold,
     )
-    cost = loss_of(square, seen, limit, loss)
+    cost = loss_of(square, measured, limit, loss)
     if loss != QUADRATIC:
         S = sym(H @ P @ H.T + R)
         square = choose(exceeds(fresh, 0.5), dot(v, divide(v, S)), square)
-        R = R / weight_of(square, seen, limit, loss)
+        R = R / weight_of(square, measured, limit, loss)
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
     return d + K @ v, joseph(P, K, H, R), eye(P) - K @ H, H.T @ divide(v, S), cost
 
 
-def loss_of(square, seen, limit, loss):
+def loss_of(square, measured, limit, loss):
     """The loss rho of v' R^-1 v, with the square of the threshold."""
     if loss == QUADRATIC:
         return square * 0.5
     far = square / limit
     if loss == STUDENT:
-        return (limit + count(seen)) * logarithm(shifted(far, 1.0)) * 0.5
+        return (limit + count(measured)) * logarithm(shifted(far, 1.0)) * 0.5
     return choose(exceeds(far, 1.0), limit * (far**0.5 - 0.5), square * 0.5)
 
 
-def weight_of(square, seen, limit, loss):
+def weight_of(square, measured, limit, loss):
     """What the precision of a measurement is multiplied by: rho'(r)/r."""
     if loss == STUDENT:
-        return (limit + count(seen)) / (limit + square)
+        return (limit + count(measured)) / (limit + square)
     far = square / limit
     return choose(exceeds(far, 1.0), far, constant(1.0, far)) ** -0.5
 
@@ -178,19 +178,19 @@ def cost_of(v, cov):
 def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
     """What is computed of the steps of a window, for a model's functions and sizes, and a loss."""
     n, m = shape.n, shape.m
-    kept, at, row = kept_places(shape), scratch_places(shape), memory_places(n, m)
-    told = row.innovation, row.innovation_cov, row.log_likelihood
+    step_layout, at, row = kept_places(shape), scratch_places(shape), memory_places(n, m)
+    outputs = row.innovation, row.innovation_cov, row.log_likelihood
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
         angles = model.state_angles
-        x, fresh = memory.read("given", kept.x, n), memory.read("given", kept.fresh)
-        next_x = memory.read("given", kept.end + kept.x, n)
+        x, fresh = memory.read("given", step_layout.x, n), memory.read("given", step_layout.fresh)
+        next_x = memory.read("given", step_layout.end + step_layout.x, n)
 
-        def vector(place):
-            return memory.read("rows", place, n)
+        def vector(offset):
+            return memory.read("rows", offset, n)
 
-        def square(place, *, symmetric=False):
-            return memory.read("rows", place, n, n, symmetric=symmetric)
+        def square(offset, *, symmetric=False):
+            return memory.read("rows", offset, n, n, symmetric=symmetric)
 
         d, P = vector(at.d), square(at.cov, symmetric=True)
         updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
@@ -200,10 +200,10 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         mean, F, without = vector(at.mean), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
-        found, step, moved = vector(at.found), vector(at.step), d + P @ adjoint
+        estimate, step, shift = vector(at.found), vector(at.step), d + P @ adjoint
         half, jump, centred = step * 0.5, wrap(mean - next_x, angles), wrap(d - x, angles)
         return [
-            stored(tell(model, memory.x, memory.P, memory.z), told),
+            stored(tell(model, memory.x, memory.P, memory.z), outputs),
             stored((centred, cost_of(centred, P)), (d, at.seen_cost)),
             stored(represent_jacobian(model, x, P), (mean, F)),
             stored(propagate_jacobian(model, mean, F, memory.u), (mean, F)),
@@ -220,8 +220,8 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
                 correct(model, x, d, P, z, fresh, loss),
                 (updated_d, updated_P, without, vector(at.pull), at.seen_cost),
             ),
-            stored((adjoint, wrap(x + moved, angles), moved), (before, found, step)),
-            stored((wrap(x - half, angles), half), (found, step)),
+            stored((adjoint, wrap(x + shift, angles), shift), (before, estimate, step)),
+            stored((wrap(x - half, angles), half), (estimate, step)),
             stored((F.T @ next_before,), (after,)),
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
         ]

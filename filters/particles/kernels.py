@@ -29,38 +29,35 @@ from thruster_env.core.streams import (
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_places
 
-# Where a page of a particle filter finds everything, and what it stores.
-
-
 LOWEST = -1e300  # of logarithms of weights
 
 
 class Layout:
-    """Where everything lies.
+    """The layout of a particle filter's memory.
 
     Attributes:
-        x, logarithm, weight: rows of the table, of which the weights are scratch, and lie behind what is kept.
-        kept: what is kept besides, in the table or the row.
+        x, logarithm, weight: rows of the table: particles, log weights, and weights, which are scratch.
+        kept: the page's extras by name, in the table or the row.
         size: the place of the ESS.
         rows, extras: how many rows of the table and numbers of the row belong to the belief.
     """
 
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
-        """Give each its place."""
+        """Lay out the page's matrices in the memory, and set the model's extras."""
         n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.kept = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
         self.start = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
-        for name, one in self.start[-1].items():
+        for name, value in self.start[-1].items():
             if name in page.per_particle:
-                place = Place("table", rows)
+                position = Place("table", rows)
                 self.kept[name] = input_matrix(
-                    place, one.shape, symmetric=one.symmetric, member=True, like=memory.x
+                    position, value.shape, symmetric=value.symmetric, member=True, like=memory.x
                 )
-                rows += prod(one.shape)
+                rows += prod(value.shape)
             else:
-                self.kept[name] = memory.another(one, symmetric=one.symmetric)
+                self.kept[name] = memory.another(value, symmetric=value.symmetric)
         self.rows, self.extras, self.weight = rows, memory.end - first, Place("table", rows)
         model.extras = self.kept
 
@@ -72,9 +69,9 @@ class Layout:
 
 
 def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
-    """What a page of a particle filter stores; see `filters.particles.kernels`."""
+    """Stages of a particle filter's page, by name."""
     at = Layout(page, memory, model)
-    x, log_w, kept = at.x, at.logarithm, at.kept
+    x, log_w, extras = at.x, at.logarithm, at.kept
     innovation, cov, likelihood = memory.told
     of_each = {
         "start": (on_branch(at.start[0], model.state_angles), *at.start[1:]),
@@ -83,13 +80,13 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     }
     if page.rejuvenate:
         of_each["renew"] = page.rejuvenate(model, x, memory.mean, memory.P, memory.w)
-    stages = {name: stored(found, (x,), kept) for name, found in of_each.items()}
+    stages = {name: stored(results, (x,), extras) for name, results in of_each.items()}
     stages["choose"] = stored((weights(log_w),), (at.weight,))
-    stages["summarise"] = stored(at.moments(model, x, weights(log_w), kept.get("P")), (x, *memory.belief))
+    stages["summarise"] = stored(at.moments(model, x, weights(log_w), extras.get("P")), (x, *memory.belief))
     if page.lookahead:
         mu, level, v, S = page.lookahead(model, x, log_w, memory.z)
         w, first = normalised(log_w + level)
-        found: dict[Matrix | Place, Matrix] = {
+        targets_and_values: dict[Matrix | Place, Matrix] = {
             x: mu,
             log_w: -level,
             innovation: v,
@@ -98,23 +95,23 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
             likelihood: first,
         }
         if page.rejuvenate:
-            found |= dict(zip(memory.belief, at.moments(model, mu, w, None)[1:], strict=True))
-        stages["foresee"] = stored(tuple(found.values()), tuple(found))
+            targets_and_values |= dict(zip(memory.belief, at.moments(model, mu, w, None)[1:], strict=True))
+        stages["foresee"] = stored(tuple(targets_and_values.values()), tuple(targets_and_values))
         log_w = log_w + memory.read("rows", likelihood.at)
-    x, log_w, *told, changed = with_extras(page.update(model, x, log_w, memory.z, memory.e))
+    x, log_w, *outputs, changed = with_extras(page.update(model, x, log_w, memory.z, memory.e))
     w, level = normalised(log_w)
     x, *moments = at.moments(model, x, w, changed.get("P"))
-    log_w = at_least(log_w - level, LOWEST)  # a particle that expects no number has hardly any weight
-    results = x, log_w, level, effective_size(w), *moments, *told, changed
-    places: tuple[Matrix | Place, ...] = (
+    log_w = at_least(log_w - level, LOWEST)  # a particle whose prediction is NaN gets nearly no weight
+    results = x, log_w, level, effective_size(w), *moments, *outputs, changed
+    targets: tuple[Matrix | Place, ...] = (
         at.x,
         at.logarithm,
         likelihood,
         at.size,
         *memory.belief,
-        *(innovation, cov)[: len(told)],
+        *(innovation, cov)[: len(outputs)],
     )
-    return {**stages, "update": stored(results, places, kept)}
+    return {**stages, "update": stored(results, targets, extras)}
 
 
 # Systematic resampling of columns of a table, by weights in one of its rows.
@@ -127,9 +124,9 @@ SCRATCH_ROWS = 3
 def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
     """Return `resample(table, size, u)`: rows 0 ... rows - 1 of N columns drawn by weight, for u in (0, 1).
 
-    New column j is the old column i in whose weight (u + j)/N of the sum of weights lies: i is drawn N w_i times
-    rounded up or down, and N w_i times on average. `SCRATCH_ROWS` rows from `scratch` on are written over; what
-    pads the table becomes a copy of the first column.
+    New column j is the old column i whose part of the cumulated weights contains (u + j)/N of their sum: i is
+    drawn N w_i times on average, rounded up or down. The function overwrites `SCRATCH_ROWS` rows from `scratch`
+    on, and fills the padding of the table with copies of the first column.
 
     Source: Kitagawa (1996), "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models",
     J. Computational and Graphical Statistics 5(1), appendix.
@@ -145,8 +142,8 @@ def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
             table[parents, i] = 0.0
         if not total > 0.0:
             return
-        # Where old column i starts among the new ones. One that is not drawn starts where the next one does,
-        # which writes over it: without a branch on chance this takes a third of the time.
+        # The first new column of old column i. One that is not drawn starts at the same column as the next one,
+        # which overwrites it: without a random branch this takes a third of the time.
         parts = size / total
         for i in range(1, size):
             first = int(table[sums, i - 1] * parts - u + 1.0)
@@ -167,22 +164,25 @@ def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
     return resample
 
 
-# A page of a particle filter as kernels of the engine: what it says of a particle is done for each of them.
-
-
 @lru_cache(maxsize=64)
 def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: bool = True) -> Kernels:
     """Kernels of a particle filter's page for a model's functions and shape.
 
-    If they do not resample, a page's `renew` draws all particles anew. What sums over particles is not inlined, so
-    that single steps and batches, which would round otherwise, agree to the last bit.
+    If they do not resample, a page's `rejuvenate` draws all particles again. Functions that sum over particles are
+    not
+    inlined: otherwise single steps and batches would round differently.
     """
     n, m, memory = shape.n, shape.m, MembersMemory(shape, page)
     layout = Layout(page, memory, PagedModel(memory))
     works = works_of(page, functions, shape, stages_of, layout.rows + 1)
-    places, source, scratch = memory_places(n, m), number_places(n, m), layout.rows + 1
-    step, key_0, key_1, likelihood = places.step, places.key_0, places.key_1, places.log_likelihood
-    innovation, cov, r_place, mean_place = places.innovation, places.innovation_cov, source.r, places.mean
+    row_layout, source, scratch = memory_places(n, m), number_places(n, m), layout.rows + 1
+    step, key_0, key_1, likelihood = row_layout.step, row_layout.key_0, row_layout.key_1, row_layout.log_likelihood
+    innovation, cov, r_place, mean_place = (
+        row_layout.innovation,
+        row_layout.innovation_cov,
+        source.r,
+        row_layout.mean,
+    )
     logarithm, size_place = n, layout.size.at
     threshold = page.parameter_offsets(own_place(shape)).get("resampling_threshold", 0)
     move = systematic_resampler(n + 1 if page.lookahead else layout.rows, layout.weight.at, scratch)
@@ -211,8 +211,8 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     @inlined
     def resampled(memory, numbers, size):
         row, table, _ = memory
-        place, _, _, _ = uniform_block(0, row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
-        move(table, size, place)
+        offset, _, _, _ = uniform_block(0, row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
+        move(table, size, offset)
 
     @inlined
     def chosen(memory, numbers, size):
@@ -279,7 +279,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         if row[likelihood] != row[likelihood]:
             row[mean_place] = math.nan  # no particle explains z: the belief is lost
 
-    rows = max(scratch + SCRATCH_ROWS, *(one.rows for one in works.values()))
+    rows = max(scratch + SCRATCH_ROWS, *(work.rows for work in works.values()))
     return Kernels(
         *(n, m, rows, max(n, m), start, predict if page.lookahead else predict_chosen, update, summarise),
         extras=layout.extras,
@@ -289,9 +289,9 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
 
 @inlined
 def nothing(memory, numbers, size):
-    """In the place of resampling."""
+    """Do nothing, in place of resampling."""
 
 
 @inlined
 def nothing_foreseen(memory, z, numbers, size):
-    """In the place of what pages foresee."""
+    """Do nothing, in place of a page's lookahead."""

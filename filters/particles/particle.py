@@ -34,36 +34,36 @@ from thruster_env.core.checks import one_of
 from thruster_env.core.streams import FILTER_PROPOSAL, GROUP, fill_normals
 from thruster_env.model.shape import padded
 
-# The auxiliary particle filter: particles are chosen by how well their prediction fits the measurement.
+# The auxiliary particle filter: it resamples by how well noise-free predictions fit the measurement.
 
 
 def initial_auxiliary(model, w):
-    """A particle of the prior, without noise."""
+    """Draw a particle from the prior; its noise is zero."""
     return weighted.initial_weighted(model, w), {"noise": zeros(model.Q, len(w))}
 
 
 def add_process_noise_auxiliary(model, x, w):
-    """The end of a step, of which the noise is kept."""
+    """Add process noise at the end of a step, and keep it as an extra."""
     noise = model.Q_root @ w
     return on_branch(x + noise, model.state_angles), {"noise": noise}
 
 
 def lookahead(model, x, log_w, z):
-    """A particle without its noise, log N(z; h(mu), R + V), and innovation and S of all with noise."""
-    seen, mu = present(z), x - model.extras["noise"]
+    """A particle without its noise, mu, then log N(z; h(mu), R + V), and innovation and S of all with noise."""
+    measured, mu = present(z), x - model.extras["noise"]
     y, v, S = expect(model, x, log_w, z)
-    without = only(seen, model.h(mu))
+    without = only(measured, model.h(mu))
     V = weighted_square(wrap(y - without, model.measurement_angles), weights(log_w))
-    rest = only(seen, wrap(z - without, model.measurement_angles))
-    return mu, log_density(rest, V + uncorrelated(seen, model.R), seen), v, S
+    rest = only(measured, wrap(z - without, model.measurement_angles))
+    return mu, log_density(rest, V + uncorrelated(measured, model.R), measured), v, S
 
 
 def update_auxiliary(model, x, log_w, z, e):
-    """The measurement z: particles mu that were chosen, with the noise of the places to which they went.
+    """Update resampled particles mu with the measurement z, after adding the noise of their new index.
 
     `log_w` is the logarithm of the mean of all lambda, over N(z; h(mu), R + V).
     """
-    x = x + model.extras["noise"]  # which was not resampled
+    x = x + model.extras["noise"]  # the noise is not resampled
     return x, log_w + fit(model, only(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
 
 
@@ -84,8 +84,8 @@ class AuxiliaryParticleFilter(WeightedFilter):
     the draw, as the method requires. Before an update a belief equals the bootstrap filter's. Directly after the
     prior or another update there is no noise, and parents are drawn by exact weights.
 
-    V, the covariance that the noise causes in the measurement, keeps the weights w_j bounded where the noise is
-    large: with V = 0, the textbook choice, a few particles that mu had ruled out would take all the weight.
+    V, the covariance that the noise causes in the measurement, bounds the weights w_j if the noise is large: with
+    V = 0, the textbook choice, a few particles whose mu fitted badly would take all the weight.
 
     The log-likelihood is log L; innovation, S and restarts are the bootstrap filter's. `Belief.members` is
     (2 n + 1, N): particles, log weights, noise. `Belief.extras` holds the effective sample size.
@@ -109,39 +109,39 @@ class AuxiliaryParticleFilter(WeightedFilter):
     )
 
 
-# The optimal proposal: particles are drawn by what is measured, and weighted by how well it was predicted.
+# The optimal proposal: particles are drawn given the measurement, and weighted by its predicted density.
 
 
 def initial_optimal(model, w):
-    """A particle of the prior, without noise."""
-    x, kept = initial_auxiliary(model, w)
-    return x, {"noise_cov": sym(zeros(model.Q, len(w), len(w))), **kept}
+    """Draw a particle from the prior; its noise and the covariance of that are zero."""
+    x, extras = initial_auxiliary(model, w)
+    return x, {"noise_cov": sym(zeros(model.Q, len(w), len(w))), **extras}
 
 
 def add_process_noise_optimal(model, x, w):
-    """The end of a step, of which the noise and its Q are kept: a later update may meet another Q."""
-    x, kept = add_process_noise_auxiliary(model, x, w)
-    return x, {"noise_cov": model.Q, **kept}
+    """Add process noise at the end of a step, and keep it and its Q: Q may differ in a later update."""
+    x, extras = add_process_noise_auxiliary(model, x, w)
+    return x, {"noise_cov": model.Q, **extras}
 
 
 def propose(model, x, d, Q, z, e):
-    """Particles x = mu + d and their noise d ~ N(0, Q), moved by the measurement z; logarithms of their weights.
+    """Particles x = mu + d and their noise d ~ N(0, Q), drawn again given z; logarithms of their weights.
 
-    Conditioning d on z in the manner of an ensemble filter, with a perturbation of z for each particle, makes of a
-    sample of the prior one of the proposal. Without noise, and with Q = 0, nothing moves.
+    Each d is conditioned on z as in a stochastic ensemble filter, with a perturbation of z for each particle: this
+    turns a sample of the prior into one of the proposal. With Q = 0 nothing moves.
     """
-    seen, mu = present(z), x - d
-    H, R = only(seen, model.H(mu)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(mu), model.measurement_angles))
+    measured, mu = present(z), x - d
+    H, R = only(measured, model.H(mu)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(mu), model.measurement_angles))
     S = sym(H @ Q @ H.T + R)
-    d = d + divide(Q @ H.T, S) @ (v - H @ d - only(seen, model.R_root @ e))
+    d = d + divide(Q @ H.T, S) @ (v - H @ d - only(measured, model.R_root @ e))
     x = mu + d
-    rest = only(seen, wrap(z - model.h(x), model.measurement_angles))
-    return x, d, log_density(v, S, seen) + log_density(rest, R, seen) - log_density(v - H @ d, R, seen)
+    rest = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    return x, d, log_density(v, S, measured) + log_density(rest, R, measured) - log_density(v - H @ d, R, measured)
 
 
 def update_optimal(model, x, log_w, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Draw particles given the measurement z, and weigh them; NaN marks missing channels."""
     _, v, S = expect(model, x, log_w, z)
     x, d, level = propose(model, x, model.extras["noise"], model.extras["noise_cov"], z, e)
     return (
@@ -158,14 +158,11 @@ OPTIMAL = Page(
 )
 
 
-# The bootstrap particle filter: a weighted sample of states, whose distribution may have any shape.
-
-
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
 
 def update(model, x, log_w, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Weigh a particle by the measurement z; NaN marks missing channels."""
     y, v, S = expect(model, x, log_w, z)
     return x, log_w + fit(model, y, z), v, S
 
@@ -181,39 +178,40 @@ class ParticleFilter(ResampledFilter):
                  ESS = 1/(sum of w_j^2)
         belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
-    That is the bootstrap filter. With the optimal proposal an update draws each particle again, given z:
+    This is the bootstrap filter. With the optimal proposal an update draws each particle again, given z:
 
         v_j = z - h(mu_j),  S_j = H_j Q H_j' + R,  K_j = Q H_j' S_j^-1,  H_j = dh/dx at mu_j
         noise_j += K_j (v_j - H_j noise_j - r_j),  r_j ~ N(0, R),  x_j = mu_j + noise_j
         w_j = w_j N(v_j; 0, S_j) N(z; h(x_j), R)/N(v_j; H_j noise_j, R), divided by their sum L
 
-    Where h is linear x is drawn from p(x | x_before, z), and the weight is p(z | x_before), which does not depend
-    on the draw: fewer particles are lost where sensors are accurate beside Q. Elsewhere the proposal is that of an
-    extended filter per particle, and the weight corrects what the tangent neglects. It needs the noise of the
-    prediction: directly after the prior or another update, an update is the bootstrap filter's.
+    If h is linear, x is drawn from p(x | x_before, z) with the weight p(z | x_before), which does not depend on
+    the draw: fewer particles lose their weight if sensors are accurate compared with Q. Otherwise the proposal is
+    that of an extended filter per particle, and the weight corrects the error of its tangent. It needs the noise
+    of the prediction: directly after the prior or another update, an update is the bootstrap filter's.
 
-    If `resampling` is "gaussian", particles are drawn again from N(mean, cov), where others are resampled: the
-    Gaussian particle filter, if the threshold is 1.
+    With `resampling` "gaussian" the filter draws particles from N(mean, cov) instead of resampling: with a
+    threshold of 1 it is the Gaussian particle filter.
 
-    If states are `smoothed`, the kernel spreads these alone, and draws them together, so that their covariance
-    stays: x_j = m + a (x_j - m) + b e_j,  b = c h for as many states,  a = (1 - b^2)^(1/2). For constants that are
-    states, of `augmented_model` without a walk: resampling alone would soon leave one value of them.
+    If states are `smoothed`, the kernel spreads only these, and shrinks them towards their mean so that their
+    covariance stays: x_j = m + a (x_j - m) + b e_j,  b = c h for as many states,  a = (1 - b^2)^(1/2). Use it for
+    constants that are states of an `augmented_model` without a walk: resampling alone would soon leave only one of
+    their values.
 
-    The log-likelihood is log L. The innovation is z less the weighted mean of h(x_j), and its covariance S the
+    The log-likelihood is log L. The innovation is z minus the weighted mean of h(x_j), and its covariance S the
     weighted covariance of h(x_j) plus R. Resampling waits for the next prediction, so that a belief has the
-    moments of the weighted particles, without the noise of a draw. Where two or three particles have all the
-    weight, the covariance is nearly singular and the NEES (normalised estimation error squared) far too large: a
-    sign of too few particles. If no particle has any weight, because the measurement is impossible under the
-    model, the belief restarts from the prior, which `divergences` counts.
+    moments of the weighted particles, without the noise of a draw. If two or three particles have all the weight,
+    the covariance is nearly singular and the NEES (normalised estimation error squared) far too large: use more
+    particles. If no particle has any weight, because the measurement is impossible under the model, the belief
+    restarts from the prior, and `divergences` counts the restart.
 
     `Belief.members` is (n + 1, N), its last row the log weights; with the optimal proposal n rows of noise follow.
     `Belief.extras` holds the ESS, and then the Q of that noise.
 
     Attributes:
-        proposal: "prior", or "optimal" to draw particles again where z is.
+        proposal: "prior", or "optimal" to draw particles again, given z.
         resampling: "systematic", or "gaussian" to draw particles from N(mean, cov) instead.
-        smoothed: indices of states that are constants, which the kernel alone spreads; -1 is the last. They need a
-            regularisation, of some 1.
+        smoothed: indices of states that are constants, which only the kernel moves; -1 is the last. They need a
+            regularisation of about 1.
 
     The other attributes are those of `ResampledFilter`, c its regularisation.
 
@@ -250,13 +248,13 @@ class ParticleFilter(ResampledFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the page and resampling read; of smoothed states the `width` is b, and `drawn` is 1 - a."""
-        given = super().parameters
+        """The parameters of the page and of resampling; for smoothed states `width` is b, and `drawn` is 1 - a."""
+        parameters = super().parameters
         if not self.smoothed:
-            return given
-        width = min(given["width"], 1.0)
+            return parameters
+        width = min(parameters["width"], 1.0)
         flags = [float(i in self.smoothed) for i in range(self.model.n)]
-        return {**given, "width": width, "drawn": 1.0 - (1.0 - width**2) ** 0.5, "smoothed": flags}
+        return {**parameters, "width": width, "drawn": 1.0 - (1.0 - width**2) ** 0.5, "smoothed": flags}
 
     @property
     def written_page(self) -> Page:
@@ -278,46 +276,47 @@ class ParticleFilter(ResampledFilter):
 
 
 def sample(x, P, e, sampled):
-    """Draw the sampled states of N(x, P); mean and covariance of all, if these are known.
+    """Draw the sampled states from N(x, P); return mean and covariance of all states given these.
 
-    With the sampled states first, P = [A 0; B C] [A 0; B C]', and [x_s; x_l] = mean + [A; B] e leaves C C'.
+    With the sampled states first, P = [A 0; B C] [A 0; B C]'; given x_s the mean is x + [A; B] e and the
+    covariance of the others C C'.
     """
     n, count = len(x), len(sampled)
     order = (*sampled, *(i for i in range(n) if i not in sampled))
-    back, places = tuple(map(order.index, range(n))), tuple(range(n))
+    back, indices = tuple(map(order.index, range(n))), tuple(range(n))
     L = root(pick(P, order, order))
-    AB, C = pick(L, back, places[:count]), pick(L, back, places[count:])
+    AB, C = pick(L, back, indices[:count]), pick(L, back, indices[count:])
     if count == n:
         return x + AB @ e, {"P": P * 0.0}
-    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}  # of e the first ones count
+    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}  # only the first entries of e are used
 
 
 def initial_rao_blackwell(model, w):
-    """A particle of the prior."""
+    """Draw a particle from the prior."""
     return sample(model.prior_mean, square(model.prior_root), w, model.own.sampled)
 
 
 def propagate_rao_blackwell(model, x, u):
-    """One of the model's substeps."""
+    """Propagate a particle's mean and covariance by one substep."""
     x, P = extended.propagate(model, x, model.extras["P"], u)
     return x, {"P": P}
 
 
 def add_process_noise_rao_blackwell(model, x, w):
-    """The end of a step."""
+    """Add Q at the end of a step, and draw the sampled states."""
     x, P = extended.add_process_noise(model, x, model.extras["P"])
-    x, kept = sample(x, P, w, model.own.sampled)
-    return on_branch(x, model.state_angles), kept
+    x, extras = sample(x, P, w, model.own.sampled)
+    return on_branch(x, model.state_angles), extras
 
 
 def spread_rao_blackwell(model, x, mean, P, e):
-    """Copies of a particle, whose sampled states get a kernel's covariance, of which the next step draws."""
+    """Add a kernel's covariance to the sampled states of a resampled particle; the next step draws from it."""
     flags = model.own.flags
     return x, {"P": model.extras["P"] + sym(P * outer(flags, flags)) * model.own.kernel}
 
 
 def update_rao_blackwell(model, x, log_w, z, e):
-    """The measurement z; channels that are NaN are missing."""
+    """Update each particle by the extended filter with the measurement z; NaN marks missing channels."""
     x, P, v, S, level = extended.update(model, x, model.extras["P"], z)
     w = weights(log_w)
     v = on_branch(v, model.measurement_angles, w)
@@ -341,9 +340,9 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
         belief:  mean = sum of w_j x_j,
                  cov = sum of w_j P_j + sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
-    The Kalman filters are exact where, with the sampled states given, f and h are affine in the others, whatever
-    Q: the joint P_j holds what the step of the sampled states tells of the others. There particles have to cover
-    few states, and it takes fewer of them than `pf` does. Elsewhere each particle linearises by itself. If all
+    The Kalman filters are exact if f and h are affine in the other states, given the sampled ones, for any Q: the
+    joint P_j contains the information that a step of the sampled states has on the others. Then particles have to
+    cover only few states, and fewer are enough than for `pf`. Otherwise each particle linearises by itself. If all
     states are sampled, this is `pf`.
 
     The log-likelihood is log L; innovation and S are those of the mixture before the measurement. `Belief.members`
@@ -379,10 +378,10 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
-        places = places_of("sampled", self.sampled, self.model.n)
-        if not places:
+        indices = places_of("sampled", self.sampled, self.model.n)
+        if not indices:
             raise ValueError("sampled must be a list of indices, at least one, but got none")
-        object.__setattr__(self, "sampled", places)
+        object.__setattr__(self, "sampled", indices)
 
     @property
     def spread_states(self) -> int:
@@ -391,9 +390,13 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the page and resampling read: of the kernel its share of the covariance of sampled states."""
-        given = super().parameters
-        return {**given, "kernel": given["width"] ** 2, "flags": [i in self.sampled for i in range(self.model.n)]}
+        """Parameters of the page and of resampling; `kernel` is the squared width of the kernel."""
+        parameters = super().parameters
+        return {
+            **parameters,
+            "kernel": parameters["width"] ** 2,
+            "flags": [i in self.sampled for i in range(self.model.n)],
+        }
 
     def sample(self, belief: Belief) -> np.ndarray:
         """A state (n, N) drawn from each particle's N(x_j, P_j), and the row of log weights."""

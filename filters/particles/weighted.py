@@ -23,18 +23,18 @@ from filters.pages.page_filter import FilterWithPage
 from filters.particles.kernels import particle_kernels
 from thruster_env.core.checks import at_least, finite, positive
 
-# What is done with resampled particles, copies of one another, of a sample with some mean and covariance P.
+# Rejuvenation: functions that separate resampled particles, from mean and covariance P of the sample.
 
 
 def spread(model, x, mean, P, e):
-    """Particles that are copies of one, spread by a kernel with a part of the covariance of all."""
+    """Add noise of a kernel, whose covariance is a part of P, to a particle."""
     return x + root(P) @ e * model.own.width
 
 
 def kernel_width(count: int, size: int) -> float:
     """The width h = (4/(d + 2))^(1/(d + 4)) N^(-1/(d + 4)) of a kernel for N particles in d dimensions.
 
-    It makes the mean integrated square error of the density least where that is Gaussian.
+    It minimises the mean integrated square error of a Gaussian density.
 
     Source: Silverman (1986), Density Estimation for Statistics and Data Analysis, section 4.3.2.
     """
@@ -42,38 +42,35 @@ def kernel_width(count: int, size: int) -> float:
 
 
 def draw(model, x, mean, P, e):
-    """Particles of a Gaussian, in the place of others."""
+    """Draw a particle from N(mean, P), in place of x."""
     return mean + root(P) @ e
 
 
 def smooth(model, x, mean, P, e):
-    """The states that are `smoothed` drawn together by a, and spread so that their covariance stays."""
-    own = model.own
-    L = root(P * outer(own.smoothed, own.smoothed))
-    return x - own.smoothed * (x - mean_of(x)) * own.drawn + L @ e * own.width
-
-
-# What particle filters share: what a weighted sample expects to be measured, and its size.
+    """Shrink the `smoothed` states towards their mean, and add noise so that their covariance stays."""
+    parameters = model.own
+    L = root(P * outer(parameters.smoothed, parameters.smoothed))
+    return x - parameters.smoothed * (x - mean_of(x)) * parameters.drawn + L @ e * parameters.width
 
 
 def initial_weighted(model, w):
-    """A particle of the prior."""
+    """Draw a particle from the prior."""
     return model.prior_mean + model.prior_root @ w
 
 
 def expect(model, x, log_w, z):
-    """What a particle expects to be measured, zero in channels that are NaN in z; innovation and S of all."""
-    seen, w = present(z), weights(log_w)
-    y = on_branch(only(seen, model.h(x)), model.measurement_angles, w)
-    v = only(seen, wrap(z - weighted_mean(y, w), model.measurement_angles))
-    return y, v, weighted_covariance(y, w) + uncorrelated(seen, model.R)
+    """The predicted measurement of a particle, zero in channels that are NaN in z; innovation and S of all."""
+    measured, w = present(z), weights(log_w)
+    y = on_branch(only(measured, model.h(x)), model.measurement_angles, w)
+    v = only(measured, wrap(z - weighted_mean(y, w), model.measurement_angles))
+    return y, v, weighted_covariance(y, w) + uncorrelated(measured, model.R)
 
 
 def fit(model, y, z):
-    """The logarithm of p(z | x) of a particle that expects y."""
-    seen = present(z)
-    rest = only(seen, wrap(z - y, model.measurement_angles))
-    return log_density(rest, uncorrelated(seen, model.R), seen)
+    """The logarithm of p(z | x) of a particle with the predicted measurement y."""
+    measured = present(z)
+    rest = only(measured, wrap(z - y, model.measurement_angles))
+    return log_density(rest, uncorrelated(measured, model.R), measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,17 +101,17 @@ class WeightedFilter(FilterWithPage):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the page reads: the width of the kernel, over the deviations of all particles."""
+        """The parameters of the page: the width of the kernel, over the standard deviations of all particles."""
         return {"width": self.regularisation * kernel_width(self.spread_states, self.ensemble_size)}
 
     @property
     def spread_states(self) -> int:
-        """How many states the kernel spreads."""
+        """Number of states that the kernel spreads."""
         return self.model.n
 
     @property
     def written_page(self) -> Page:
-        """The page, with the kernel where that does something."""
+        """The page, with the kernel if its width is not zero."""
         page = super().written_page
         return page if self.regularisation else page._replace(rejuvenate=None)
 
@@ -154,5 +151,5 @@ class ResampledFilter(WeightedFilter):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the page and resampling read."""
+        """The parameters of the page and of resampling."""
         return {**super().parameters, "resampling_threshold": self.resampling_threshold}

@@ -31,15 +31,15 @@ def smooth_ensembles(
     """Means (B, K + 1, n) and covariances of an ensemble given `lag` later measurements, and restarts (B,).
 
     The analysis of measurement k is repeated for each pair (x_k, x_l) of the members now and at an earlier step l
-    >= k - lag, for a state of twice the size whose first half is measured. The members of step l so get the
-    analysis that they would get as part of one long state: with perturbed measurements x_lj += cov(x_l, y) S^-1 (z
-    - v_j - y_j). Relaxation is for the members of now only, and steps before a restart from the prior are left as
-    they are.
+    >= k - lag, with a state of twice the size whose first half is measured. So the members of step l get the
+    analysis
+    that they would get as part of one long state: with perturbed measurements x_lj += cov(x_l, y) S^-1 (z - v_j -
+    y_j). Relaxation acts only on the members now, and steps before a restart from the prior are not changed.
 
-    Noise is that of `filters.engine.batch.noise_rows`.
+    `noise` is the result of `filters.engine.batch.noise_rows`.
 
-    Raises ValueError for a filter with rotations, which would part the members of different steps, with a radius,
-    as localisation moves each state by other weights, or with a window of its own.
+    Raises ValueError for a filter with rotations, which would mix the members of one step only, with a radius,
+    because localisation moves each state with other weights, or with a window.
     """
     rotations = getattr(filter_, "rotations", 0)
     if rotations:
@@ -95,10 +95,10 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
 def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
     n, m = kernels.n, kernels.m
     start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
-    places, pair_places = memory_places(n, m), memory_places(2 * n, m)
-    key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
+    layout, pair_places = memory_places(n, m), memory_places(2 * n, m)
+    key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
     pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
-    mean, cov, summarise = places.mean, places.cov, kernels.summarise
+    mean, cov, summarise = layout.mean, layout.cov, kernels.summarise
     q_place, r_place, pair_r_place = number_places(n, m).q, number_places(n, m).r, number_places(2 * n, m).r
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 

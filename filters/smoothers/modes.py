@@ -7,9 +7,9 @@ Backwards from the last step, of the filters' means x_i, covariances P_i and pro
            the probability of mode i at k, if that at k + 1 is j
     smoothed mu_i = sum over j of w_ij (smoothed mu_j);  x_i, P_i those of the mixture of all x_ij
 
-What parts the modes i that lead to j is in the smoothed P_j, and again between the x_ij: P is on the safe side.
-Of states that mode j lacks its smoothed x_j tells nothing: their place takes what the prediction from x_i says of
-them, given the others. After each step a mode has them from those that know them (`filters.gaussian.absent`).
+The differences between modes i that lead to j count in the smoothed P_j, and again between the x_ij, so P is
+rather too large. The smoothed x_j has no states that mode j lacks: their prediction from x_i, given the other
+states, replaces them. After each step a mode gets them from modes that have them (`filters.gaussian.absent`).
 
 Source: Kim (1994), "Dynamic linear models with Markov-switching", and for the density Koch (2000), "Fixed-interval
 retrodiction approach to Bayesian IMM-MHT for maneuvering multiple targets".
@@ -30,58 +30,55 @@ from filters.smoothers.rts import passes
 from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
 
-# What the smoother of filters for several models does in a step: what later states tell, weights, mixtures.
-
-
 ROUNDING = 1e-12  # of a covariance in standard deviations
 
 
-def told(
-    filter_: PageFilter, own: list[int], x, p, inputs, later, later_cov
+def condition_on_later(
+    filter_: PageFilter, states: list[int], x, p, inputs, later, later_cov
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the later states (B, n) of a mode, of which some are its own, tell of x (B, n) and P.
+    """Compare a mode's later states (B, n) with its filter's prediction from x (B, n) and P, and complete them.
 
     Returns:
-        The log densities (B,) of its own states by what its filter predicts, but for a constant.
-        Means and covariances of all later states, of which the others follow from these by the prediction.
+        The log densities (B,) of the mode's `states` in the prediction, without a constant.
+        Means and covariances of all later states; those that the mode lacks are predicted, given the others.
     """
     levels, means, covs, begun = np.empty(len(x)), later.copy(), later_cov.copy(), filter_.init()
-    rest = [i for i in range(x.shape[1]) if i not in own]
+    rest = [i for i in range(x.shape[1]) if i not in states]
     for b in range(len(x)):
         predicted = filter_.predict(begun._replace(mean=x[b], cov=p[b]), inputs[b])
         scale = np.sqrt(np.diag(predicted.cov))
         scale = np.where(scale > 0.0, scale, 1.0)
         cov = predicted.cov / np.outer(scale, scale)
-        off = (difference(later[b], predicted.mean, filter_.model.shape.state_angles) / scale)[own]
-        near = cov[np.ix_(own, own)] + ROUNDING * np.eye(len(own))  # which may be singular
-        levels[b] = -np.log(scale[own]).sum() - 0.5 * (
+        off = (difference(later[b], predicted.mean, filter_.model.shape.state_angles) / scale)[states]
+        near = cov[np.ix_(states, states)] + ROUNDING * np.eye(len(states))  # which may be singular
+        levels[b] = -np.log(scale[states]).sum() - 0.5 * (
             np.linalg.slogdet(near)[1] + off @ np.linalg.solve(near, off)
         )
         if rest:
-            slopes = np.linalg.solve(near, cov[np.ix_(own, rest)])
-            known = (later_cov[b] / np.outer(scale, scale))[np.ix_(own, own)]
+            slopes = np.linalg.solve(near, cov[np.ix_(states, rest)])
+            known = (later_cov[b] / np.outer(scale, scale))[np.ix_(states, states)]
             means[b, rest] = predicted.mean[rest] + scale[rest] * (off @ slopes)
             joint = np.empty_like(cov)
-            joint[np.ix_(own, own)], joint[np.ix_(own, rest)] = known, known @ slopes
-            joint[np.ix_(rest, own)] = joint[np.ix_(own, rest)].T
+            joint[np.ix_(states, states)], joint[np.ix_(states, rest)] = known, known @ slopes
+            joint[np.ix_(rest, states)] = joint[np.ix_(states, rest)].T
             joint[np.ix_(rest, rest)] = cov[np.ix_(rest, rest)] + slopes.T @ (known - near) @ slopes
             covs[b] = joint * np.outer(scale, scale)
     return levels, means, covs
 
 
 def complete(filter_: MultipleModelFilter, mu, means, covs) -> None:
-    """Give the modes, of probabilities (B, M), what they lack: in means (B, M, n) and covariances."""
+    """Fill in states that modes lack, in means (B, M, n) and covariances, with mode probabilities mu (B, M)."""
     angles = filter_.model.shape.state_angles
-    for one in filter_.absent_states:
-        s, square = list(one.states), np.ix_(one.states, one.states)
-        have = [k for k in range(mu.shape[1]) if k not in one.modes]
+    for group in filter_.absent_states:
+        s, square = list(group.states), np.ix_(group.states, group.states)
+        have = [k for k in range(mu.shape[1]) if k not in group.modes]
         total = mu[:, have].sum(axis=1)
-        for b in np.flatnonzero((total > 0.0) | one.given):
-            if not one.given:
+        for b in np.flatnonzero((total > 0.0) | group.given):
+            if not group.given:
                 w = mu[b : b + 1, have] / total[b]
                 mean, cov = (it[0] for it in merged(w, means[b : b + 1, have], covs[b : b + 1, have], angles))
-            for k in one.modes:
-                if one.given:
+            for k in group.modes:
+                if group.given:
                     mean, cov = filter_.mode_filters[k].model.prior_mean, filter_.mode_filters[k].model.prior_cov
                 means[b, k, s] = mean[s]
                 covs[b, k, s] = covs[b, k][:, s] = 0.0
@@ -89,7 +86,7 @@ def complete(filter_: MultipleModelFilter, mu, means, covs) -> None:
 
 
 def weights_of(prior: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """The w (B, i, j) of log prior weights and densities; where none is possible each mode follows from itself."""
+    """The w (B, i, j) from log prior weights and densities; w_jj = 1 if no mode can lead to j."""
     levels = np.where(np.isfinite(prior) & np.isfinite(levels), prior + levels, -np.inf)
     top = levels.max(axis=1, keepdims=True)
     raw = np.exp(levels - np.where(np.isfinite(top), top, 0.0))
@@ -108,10 +105,10 @@ def merged(weights, means, covs, angles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray, ...]:
-    """Means (B, K + 1, M, n), covariances, log probabilities of the modes, restarts of all, and their number.
+    """Means (B, K + 1, M, n), covariances, log probabilities of the modes, full restarts, and numbers of restarts.
 
-    A step in which all modes begin anew is such a restart, (B, K + 1) bool; the number (B,) is that of the filter,
-    which counts a mode that begins anew alone, too.
+    A full restart, (B, K + 1) bool, is a step in which all modes restart; the number (B,) is that of the filter,
+    which also counts restarts of single modes.
     """
     (count, times, _), n, modes = z.shape, filter_.model.n, len(filter_.mode_filters)
     means, covs = np.empty((count, times, modes, n)), np.empty((count, times, modes, n, n))
@@ -154,16 +151,16 @@ def smooth_modes(
 
     Args:
         filter_: "imm" or "mmae", whose modes have filters that `filters.smooth` takes.
-        keys: those of `filters.smooth`, and so are the others.
+        keys: as for `filters.smooth`, like the other arguments.
         inputs: u, (B, K, p).
         measurements: z, (B, K + 1, m), NaN where missing.
 
     Raises:
         ValueError: as `filters.smooth`.
     """
-    found, divergences = smoothed_modes(filter_, keys, inputs, measurements)
+    estimates, divergences = smoothed_modes(filter_, keys, inputs, measurements)
     warn_of_restarts(filter_, divergences, keys, inputs, measurements)
-    return found
+    return estimates
 
 
 def smoothed_modes(
@@ -172,39 +169,43 @@ def smoothed_modes(
     inputs: np.ndarray | None,
     measurements: np.ndarray | None,
 ) -> tuple[SmoothedModes, np.ndarray]:
-    """What `smooth_modes` gives, and the filter's restarts on the way forwards, (B,), without a warning."""
+    """The result of `smooth_modes`, and the filter's restarts (B,) in the forward pass, without a warning."""
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
-    relations = [relation_of(one, "a mode of a smoother") for one in filter_.mode_filters]
-    kinds = [one for one in filter_.mode_filters if isinstance(one, PageFilter)]
-    steps = [passes(one, relation) for one, relation in zip(kinds, relations, strict=True)]
+    relations = [relation_of(filter_of_mode, "a mode of a smoother") for filter_of_mode in filter_.mode_filters]
+    kinds = [filter_of_mode for filter_of_mode in filter_.mode_filters if isinstance(filter_of_mode, PageFilter)]
+    steps = [passes(filter_of_mode, relation) for filter_of_mode, relation in zip(kinds, relations, strict=True)]
     means, covs, logs, restarted, divergences = filtered(filter_, keys, inputs, measurements)
     mu, angles = np.exp(logs), filter_.model.shape.state_angles
     with np.errstate(divide="ignore"):
         log_transition = np.log(filter_.transition_matrix)
     count, times, modes, n = means.shape
-    absent = [{i for one in filter_.absent_states if j in one.modes for i in one.states} for j in range(modes)]
-    own = [[i for i in range(n) if i not in some] for some in absent]
-    found = SmoothedModes(np.empty((count, times, n)), np.empty((count, times, n, n)), mu.copy())
+    absent = [
+        {i for group in filter_.absent_states if j in group.modes for i in group.states} for j in range(modes)
+    ]
+    states_of_modes = [[i for i in range(n) if i not in lacking] for lacking in absent]
+    estimates = SmoothedModes(np.empty((count, times, n)), np.empty((count, times, n, n)), mu.copy())
     x, p = means[:, -1], covs[:, -1]
-    found.means[:, -1], found.covs[:, -1] = merged(mu[:, -1], x, p, angles)
+    estimates.means[:, -1], estimates.covs[:, -1] = merged(mu[:, -1], x, p, angles)
     for k in reversed(range(times - 1)):
         pair_x, pair_p = np.empty((count, modes, modes, n)), np.empty((count, modes, modes, n, n))
         levels = np.empty((count, modes, modes))
         anew = np.stack([np.zeros(count, bool), restarted[:, k + 1]], axis=1)
         for i, j in np.ndindex(modes, modes):
             begun = means[:, k, i], covs[:, k, i]
-            levels[:, i, j], later, later_cov = told(kinds[j], own[j], *begun, inputs[:, k], x[:, j], p[:, j])
+            levels[:, i, j], later, later_cov = condition_on_later(
+                kinds[j], states_of_modes[j], *begun, inputs[:, k], x[:, j], p[:, j]
+            )
             ends = np.stack([begun[0], later], axis=1), np.stack([begun[1], later_cov], axis=1), anew
             corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1)
             pair_x[:, i, j], pair_p[:, i, j] = corrected[:, 0], cov[:, 0]
         w = weights_of(log_transition + logs[:, k, :, None], levels)
-        joint = w * found.probabilities[:, k + 1, None, :]  # of modes i at k and j at k + 1
+        joint = w * estimates.probabilities[:, k + 1, None, :]  # of modes i at k and j at k + 1
         now = np.where(restarted[:, k + 1, None], mu[:, k], joint.sum(axis=2))
         of_i = joint.sum(axis=2, keepdims=True)
         shares = np.where(of_i > 0.0, joint / np.where(of_i > 0.0, of_i, 1.0), 1.0 / modes)
         of_modes = [merged(shares[:, i], pair_x[:, i], pair_p[:, i], angles) for i in range(modes)]
         x, p = (np.stack(part, axis=1) for part in zip(*of_modes, strict=True))
         complete(filter_, now, x, p)
-        found.probabilities[:, k] = now
-        found.means[:, k], found.covs[:, k] = merged(now, x, p, angles)
-    return found, divergences
+        estimates.probabilities[:, k] = now
+        estimates.means[:, k], estimates.covs[:, k] = merged(now, x, p, angles)
+    return estimates, divergences

@@ -19,8 +19,6 @@ from filters.gaussian.sigma_points import (
 )
 from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation
 
-# How the states of two successive steps are related by sigma points: pages of smoothers of such filters.
-
 
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
@@ -45,9 +43,7 @@ UNSCENTED = Relation(unscented.represent_unscented, propagate_points, link_unsce
 CUBATURE = Relation(cubature.represent_cubature, propagate_points, link_cubature)
 
 
-# Which filters have a smoother of Rauch, Tung and Striebel, and how their successive states are related.
-
-
+# Filters that have a smoother of Rauch, Tung and Striebel.
 RELATIONS: dict[type[Filter], Relation] = {
     KalmanFilter: LINEARISED,
     ExtendedKalmanFilter: LINEARISED,
@@ -57,8 +53,8 @@ RELATIONS: dict[type[Filter], Relation] = {
 }
 
 
-def relation_of(filter_: Filter, what: str, others: str = "") -> Relation:
-    """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
+def relation_of(filter_: Filter, what: str, alternatives: str = "") -> Relation:
+    """The relation of a filter for `smooth_backwards`; ValueError if it has no such smoother."""
     kind = type(filter_)
     if filter_.model.bounds:
         raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")
@@ -67,4 +63,4 @@ def relation_of(filter_: Filter, what: str, others: str = "") -> Relation:
     if kind in RELATIONS:
         return RELATIONS[kind]
     known = ", ".join(known.name for known in RELATIONS)
-    raise ValueError(f"{what} needs a filter of {known}{others}, but got {filter_.name!r}")
+    raise ValueError(f"{what} needs a filter of {known}{alternatives}, but got {filter_.name!r}")

@@ -4,8 +4,8 @@
     x_k += G_k (smoothed x_{k+1} - predicted x_{k+1})
     P_k = (P_k - G_k predicted P_{k+1} G_k') + G_k smoothed P_{k+1} G_k'
 
-The bracket is computed as a covariance, so that P_k is one. How two successive states are related is the filter's:
-its page of a smoother, a `Relation`.
+The bracket is computed as a covariance, so that P_k is one. A `Relation`, the page of a smoother, relates two
+successive states by the filter's own linearisation or sigma points.
 """
 
 from __future__ import annotations
@@ -34,21 +34,18 @@ from thruster_env.model.shape import Functions, Shape, number_places
 class Relation(NamedTuple):
     """A page of a smoother: from x and P at a step to the next one, and the link between the two."""
 
-    represent: Callable  # represent(model, x, P): what is predicted
+    represent: Callable  # represent(model, x, P): the representation of the belief that is propagated
     propagate: Callable  # propagate(model, *predicted, u), in each of the model's substeps
     link: Callable  # link(model, x, P, *predicted): predicted x, G and the bracket
 
 
-# The page of filters that linearise
-
-
 def represent_jacobian(model, x, P):
-    """The mean, and the Jacobian of no substep."""
+    """The mean, and the Jacobian of zero substeps, the identity."""
     return x, eye(P)
 
 
 def propagate_jacobian(model, x, F, u):
-    """One of the model's substeps."""
+    """Propagate the mean by one substep, and multiply its Jacobian."""
     return model.f(x, u), model.F(x, u) @ F
 
 
@@ -61,7 +58,7 @@ def link(model, x, P, mean, F):
 
 
 def propagate_scheduled_jacobian(model, x, F, u):
-    """One of the substeps of the affine model at an input."""
+    """`propagate_jacobian` of the affine model at an input."""
     return propagate_jacobian(model.at(constants_at(model, u)), x, F, u)
 
 
@@ -70,13 +67,10 @@ SCHEDULED = Relation(represent_jacobian, propagate_scheduled_jacobian, link)
 
 
 def back(model, x, P, linked, later):
-    """The estimate of a step, corrected by that of the next one."""
+    """Correct the estimate of a step by that of the next one, `later`."""
     (mean, G, C), (later_x, later_P) = linked, later
     x = wrap(x + G @ wrap(later_x - mean, model.state_angles), model.state_angles)
     return x, sym(C + sym(G @ later_P @ G.T))
-
-
-# Passes backwards over what a filter estimated, by its `Relation`: the smoother of Rauch, Tung and Striebel.
 
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
@@ -105,33 +99,33 @@ def smooth_backwards(
         process_noise: rows (Q, its root) of each step, of `filters.engine.batch.noise_rows`; none for the model's.
     """
     model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
-    # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
+    # A restarted belief is the prior; a belief may also be the prior without a restart.
     apart = np.abs(difference(estimates.means, model.prior_mean, angles))
     means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
-    given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
+    filtered = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     numbers = filter_.numbers[None]
     if len(process_noise):
         numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_places(model.n, model.m).q
         numbers[:, q : q + process_noise.shape[1]] = process_noise
-    return passes(filter_, relation)(given, inputs, lag, numbers)
+    return passes(filter_, relation)(filtered, inputs, lag, numbers)
 
 
 def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
     """Return the function that makes the smoother's passes.
 
-    It takes what a filter estimated, the inputs, the lag, and the numbers that the filter read: (1, count) of all
-    steps or (K, count) of each; those of the filter if None.
+    It takes a filter's estimates, the inputs, the lag, and the numbers that the filter used: (1, count) for all
+    steps or (K, count) for each; those of the filter if None.
     """
     functions, shape, of_filter = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers[None]
     run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
 
     def smoothed(
-        given: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
+        filtered: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         numbers = of_filter if numbers is None else numbers
-        means, covs = np.empty_like(given[0]), np.empty_like(given[1])
-        work = partial(run_part, given, inputs, numbers, lag, means, covs)
+        means, covs = np.empty_like(filtered[0]), np.empty_like(filtered[1])
+        work = partial(run_part, filtered, inputs, numbers, lag, means, covs)
         work(0, 1) if len(means) == 1 else spread(work, len(means))
         return means, covs
 
@@ -142,19 +136,19 @@ def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
 def _smoother(
     relation: Relation, page: Page, functions: Functions, shape: Shape, interpreting: bool
 ) -> CompiledOrPython:
-    """The pass over runs, of programs of a relation."""
+    """The compiled passes over runs, for a relation."""
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
         x, p = memory.x, memory.P
         begun = as_tuple(relation.represent(model, x, p))
-        flying = [memory.another(one) for one in begun]
-        linked = relation.link(model, x, p, *flying)
-        links = [memory.another(one, symmetric=one.symmetric) for one in linked]
+        predicted = [memory.another(matrix) for matrix in begun]
+        linked = relation.link(model, x, p, *predicted)
+        links = [memory.another(matrix, symmetric=matrix.symmetric) for matrix in linked]
         later = memory.another(x), memory.another(p, symmetric=True)
-        advanced = as_tuple(relation.propagate(model, *flying, memory.u))
+        advanced = as_tuple(relation.propagate(model, *predicted, memory.u))
         return [
-            stored(begun, flying),
-            stored(advanced, flying),
+            stored(begun, predicted),
+            stored(advanced, predicted),
             stored(linked, links),
             stored(back(model, x, p, links, later), (x, p)),
         ]
@@ -162,7 +156,7 @@ def _smoother(
     memory, works, _ = programs_of(page, functions, shape, stages)
     first_step, substep, connect, correct = works
     n, length, belief, mean_place = shape.n, memory.end, shape.n + shape.n**2, memory_places(shape.n, shape.m).mean
-    later_place, width = length - belief, belief + n * n  # behind the link, which is predicted mean, gain, bracket
+    later_place, width = length - belief, belief + n * n  # after the link: predicted mean, gain, bracket
     link_place, substeps = later_place - width, number_places(n, shape.m).substeps
     fingerprint = function_fingerprint(*works, within=__name__)
 
@@ -178,12 +172,12 @@ def _smoother(
         for i in range(count):
             target[at + i] = source[first + i]
 
-    def smooth(given, inputs, numbers, lag, means, out_covs, first, last):
+    def smooth(estimates, inputs, numbers, lag, means, out_covs, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
-        filtered, covs, restarted = given
+        filtered, covs, restarted = estimates
         steps = inputs.shape[1]
         u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)
-        now = np.zeros(numbers.shape[1])  # each thread its own: slices of arrays that threads share cost counts
+        now = np.zeros(numbers.shape[1])  # one per thread: slices of shared arrays cost reference counts
         for b in range(first, last):
             for k in range(steps):
                 if k < numbers.shape[0]:

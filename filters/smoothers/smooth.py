@@ -47,7 +47,7 @@ def smooth(
 
     - Kalman filters, also scheduled, extended or iterated extended, unscented and cubature Kalman filters: the
       recursion of Rauch, Tung and Striebel backwards, on the filter's own linearisation or sigma points.
-    - Filters of several models: `smooth_modes`, which also tells the probabilities of the modes; without a lag.
+    - Filters of several models: `smooth_modes`, which also returns the probabilities of the modes; without a lag.
     - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
       of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
 
@@ -56,11 +56,11 @@ def smooth(
         G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
         P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
 
-    Bounds of states hold for what is told of each step: the recursion knows of none, as the filter's does, and its
-    estimates are constrained at the end, by truncation or projection.
+    The recursion runs without bounds on states, like the filter's; its estimates are constrained at the end, by
+    truncation or projection.
 
-    With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates a step, so give
-    it a lag of as many steps as the system remembers.
+    With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates per step, so
+    give it a lag of the length of the system's memory.
 
     Args:
         filter_: a filter of one of these types.
@@ -82,9 +82,9 @@ def smooth(
     nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
     """
     covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
-    found, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
+    estimates, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
     warn_of_restarts(filter_, divergences, keys, inputs, measurements, **covs)
-    return found
+    return estimates
 
 
 def smoothed(
@@ -97,14 +97,14 @@ def smoothed(
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
 ) -> tuple[Smoothed, np.ndarray]:
-    """What `smooth` gives, and the filter's restarts on the way forwards, (B,), without a warning."""
+    """The result of `smooth`, and the filter's restarts (B,) in the forward pass, without a warning."""
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     steps = inputs.shape[1]
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
     noise = noise_rows(filter_, steps + 1, process_noise_covs, measurement_noise_covs)
     if isinstance(filter_, EnsembleFilter):
-        *found, divergences = smooth_ensembles(filter_, keys, inputs, measurements, lag, noise)
-        return Smoothed(*found), divergences
+        *smoothed_moments, divergences = smooth_ensembles(filter_, keys, inputs, measurements, lag, noise)
+        return Smoothed(*smoothed_moments), divergences
     if isinstance(filter_, MultipleModelFilter):
         if lag < steps:
             raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
