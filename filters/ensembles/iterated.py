@@ -50,7 +50,7 @@ class WindowPlaces(NamedTuple):
     """Layout of the window: rows of the table, then offsets in the belief's row."""
 
     window: int  # x_0, then the noise, n rows for each step
-    moved: int  # the window of an iteration, scratch
+    iterate: int  # the window of an iteration, scratch
     slopes: int  # Y, m rows
     pull: int  # m rows
     scratch: int  # of programs
@@ -87,7 +87,7 @@ def window_stages(length: int) -> Callable:
         later_S = covariance(later, later) + R
         outputs = row.innovation, row.innovation_cov, row.log_likelihood
         plain = stages_of(page, memory, model)
-        noise = input_matrix(Place("table", layout.moved), (memory.shape.n,), member=True, like=memory.x)
+        noise = input_matrix(Place("table", layout.iterate), (memory.shape.n,), member=True, like=memory.x)
         return {
             **{name: plain[name] for name in ("start", "advance", "summarise")},
             "draw": stored((model.Q_root @ memory.w,), (noise,)),

@@ -29,12 +29,12 @@ class Absent(NamedTuple):
     Attributes:
         states: their indices.
         modes: the modes that lack them.
-        given: whether they get the prior's moments of these modes' models, instead of moments of the other modes.
+        from_prior: whether they get the prior moments of these modes' models, not moments of the other modes.
     """
 
     states: tuple[int, ...]
     modes: tuple[int, ...]
-    given: bool
+    from_prior: bool
 
 
 def absent_states(
@@ -67,14 +67,16 @@ def completer(
     """
     complete = nothing
     for group in absent:
-        if group.given:
-            complete = _given(complete, group, parts, n, priors)
+        if group.from_prior:
+            complete = _from_prior(complete, group, parts, n, priors)
         else:
             complete = _of_others(complete, group, parts, n, blend, scratch)
     return complete
 
 
-def _given(before: Callable, absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]) -> Callable:
+def _from_prior(
+    before: Callable, absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]
+) -> Callable:
     """Fill in a state with the prior's moments of the modes' models."""
     (state,), (first, stride, _) = absent.states, parts
     offsets = tuple(

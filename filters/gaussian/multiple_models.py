@@ -285,7 +285,7 @@ class MultipleModelFilter(Filter):
         return filters
 
     @cached_property
-    def _given(self) -> list[StateSpaceModel]:
+    def _mode_models(self) -> list[StateSpaceModel]:
         """The models of the modes, with the states that each has."""
         model, modes = self.model, self.usual_modes if self.modes is None else self.modes
         if not isinstance(modes, Sequence) or not 2 <= len(modes) <= MOST_MODES:
@@ -302,7 +302,7 @@ class MultipleModelFilter(Filter):
     @cached_property
     def _places(self) -> list[tuple[int, ...]]:
         """Indices of each mode's states among the model's."""
-        return [places_within(mode.states, self.model.states) for mode in self._given]
+        return [places_within(mode.states, self.model.states) for mode in self._mode_models]
 
     @cached_property
     def _models(self) -> list[StateSpaceModel]:
@@ -310,7 +310,7 @@ class MultipleModelFilter(Filter):
         every, moments = tuple(range(self.model.n)), self._moments
         return [
             mode if indices == every else embedded_model(mode, self.model, moments)
-            for mode, indices in zip(self._given, self._places, strict=True)
+            for mode, indices in zip(self._mode_models, self._places, strict=True)
         ]
 
     @cached_property

@@ -1,1 +1,1 @@
-"""Moving-horizon estimation: the states of a window, estimated together at each step."""
+"""Moving-horizon estimation: all states of a window are estimated at each step."""

@@ -1,12 +1,12 @@
 """Bounds within a pass over a window: components that lie at a bound are conditioned on it, or released.
 
-A component i of a Gaussian d, P that is held at a value has, as any accurate measurement of it,
+Conditioning a Gaussian d, P on a value of component i is an accurate measurement of it:
 
     d += k v,  P -= k s k',  k = P e_i/s,  s = (1 + 1e-9) P_ii,  v = value - d_i
 
-and backwards the multiplier v/s - k' l, which is added to the adjoint l_i: the force with which the bound pushes.
-A component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
-change at once; where that does not settle, one by one, which does if the problem is linear.
+The backward pass adds the multiplier v/s - k' l to the adjoint l_i: the force with which the bound pushes. A
+component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
+components change at once; if that does not converge, they change one by one, which converges for a linear problem.
 
 Source: Judice, Pires (1994), "A block principal pivoting algorithm for large-scale strictly monotone linear
 complementarity problems", Computers & Operations Research 21(5).
@@ -24,24 +24,27 @@ from thruster_env.core.compiled import inlined
 from thruster_env.model.shape import Shape
 from thruster_env.model.state_bounds import Bound
 
-ENOUGH = 1e-9  # beyond a bound, and of a force, in standard deviations: rounding
-SLACK = 1e-9  # of a variance that a bound leaves, so that bounds which contradict each other show as forces
+ENOUGH = 1e-9  # rounding error of values beyond a bound, and of forces, in standard deviations
+SLACK = 1e-9  # fraction of a variance that a bound leaves, so that contradictory bounds appear as forces
 
 
 class Limits(NamedTuple):
-    """Functions of scratch and of what is kept of a step; sigma is the bound of disturbances, in deviations."""
+    """Functions of scratch and of a step of the belief; sigma bounds disturbances, in standard deviations.
 
-    clip: Callable  # clip(row, place): put the state that lies there within the bounds
-    hold_state: Callable  # hold_state(rows, given)
-    hold_disturbance: Callable  # hold_disturbance(rows, given, sigma)
-    push_state: Callable  # push_state(rows, given, wrong, single), of l after the update; how many are wrong
-    update_state_set: Callable  # update_state_set(rows, given, wrong, single), of the estimate
-    update_disturbance_set: Callable  # update_disturbance_set(rows, given, sigma, wrong, single), of the estimate
+    Functions with `wrong` return it plus the number of bounds that were wrong.
+    """
+
+    clip: Callable  # clip(row, offset): put the state at this offset within the bounds
+    hold_state: Callable  # hold_state(rows, step)
+    hold_disturbance: Callable  # hold_disturbance(rows, step, sigma)
+    push_state: Callable  # push_state(rows, step, wrong, single), of l after the update
+    update_state_set: Callable  # update_state_set(rows, step, wrong, single), by the estimate
+    update_disturbance_set: Callable  # update_disturbance_set(rows, step, sigma, wrong, single), by the estimate
 
 
 @inlined
 def hold(rows, mean, cov, n, i, value, at):
-    """Condition the Gaussian that lies at `mean` and `cov` on component i; k, s and v go to places from `at`."""
+    """Condition the Gaussian at offsets `mean` and `cov` on component i; store k, s and v from `at` on."""
     s = (1.0 + SLACK) * rows[cov + i * n + i]
     v = value - rows[mean + i]
     for k in range(n):
@@ -51,7 +54,7 @@ def hold(rows, mean, cov, n, i, value, at):
         rows[mean + k] += rows[at + k] * v
         for j in range(n):
             rows[cov + k * n + j] -= rows[at + k] * s * rows[at + j]
-    for k in range(n):  # what P_ii - P_ii^2/s and the like are, without cancellation
+    for k in range(n):  # P_ki - P_ki P_ii/s, without cancellation
         left = rows[at + k] * s * (SLACK / (1.0 + SLACK))
         rows[cov + k * n + i] = left
         rows[cov + i * n + k] = left
@@ -60,7 +63,7 @@ def hold(rows, mean, cov, n, i, value, at):
 
 @inlined
 def force(rows, adjoint, n, at):
-    """The multiplier of a component that `hold` held, before it is added to the adjoint."""
+    """The multiplier of a component after `hold`."""
     total = rows[at + n + 1] / rows[at + n] if rows[at + n] > 0.0 else 0.0
     for k in range(n):
         total -= rows[at + k] * rows[adjoint + k]
@@ -69,7 +72,7 @@ def force(rows, adjoint, n, at):
 
 @inlined
 def change_side(step, index, side, wrong, single):
-    """Let another bound hold, unless bounds change one by one and one has; returns how many were wrong."""
+    """Set the bound that holds to `side`, unless changes are `single` and one was made; count wrong bounds."""
     if step[index] == side:
         return wrong
     if not (single and wrong > 0):
@@ -79,21 +82,21 @@ def change_side(step, index, side, wrong, single):
 
 @inlined
 def side_of(value, low, high, spread):
-    """The bound at which a component that is free ought to be held: -1, 1, or 0 for none."""
+    """The bound at which a free component must be held: -1, 1, or 0 for none."""
     room = ENOUGH * spread
     return -1.0 if value < low - room else 1.0 if value > high + room else 0.0
 
 
 @cache
 def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
-    """What holds states within bounds, and disturbances if they are limited, for some sizes."""
+    """Functions that hold states within bounds, and disturbances if they are limited, for a model's sizes."""
     n, step_layout, at = shape.n, kept_places(shape), scratch_places(shape)
     low, high = [-math.inf] * n, [math.inf] * n
     for bound in bounds:
         low[bound.place], high[bound.place] = bound.low, bound.high
     lows, highs, bounded, size = tuple(low), tuple(high), bool(bounds), n + 2
     of_states, of_disturbances = at.holds, at.holds + n * size
-    held_states, held_disturbances = step_layout.held, step_layout.held + n
+    held_states, held_disturbances = step_layout.sides, step_layout.sides + n
 
     @inlined
     def clip(row, offset):
@@ -123,7 +126,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
 
     @inlined
     def pushed(rows, step, holds, sides, wrong, single):
-        """Add the forces of bounds that hold to the adjoint, and release those that pull."""
+        """Add the forces of the bounds that hold to the adjoint, and release components whose bounds pull."""
         for i in range(n - 1, -1, -1):
             side = step[sides + i]
             if side != 0.0:
@@ -140,7 +143,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
             for i in range(n):
                 if step[held_states + i] == 0.0:
                     spread = rows[at.cov + i * n + i] ** 0.5
-                    side = side_of(rows[at.found + i], lows[i], highs[i], spread)
+                    side = side_of(rows[at.estimate + i], lows[i], highs[i], spread)
                     wrong = change_side(step, held_states + i, side, wrong, single)
         return wrong
 

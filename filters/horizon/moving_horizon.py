@@ -15,7 +15,7 @@ from filters.horizon.window import HUBER, LOSSES, kept_places
 from thruster_env.core.checks import at_least, one_of, positive
 
 MOST_STEPS, MOST_ITERATIONS = 200, 50
-KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # that kernels are made for, so that studies compile few
+KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # only for these there are kernels, so that studies compile few
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,11 +26,11 @@ class MovingHorizonFilter(Filter):
                   w_j = x_{j+1} - f(x_j, u_j),  r_j^2 = v_j' R^-1 v_j,  v_j = z_j - h(x_j),
         so that   low <= x_j <= high,  |w_j| <= limit sqrt(diag Q)
 
-    over x_1 ... x_L, of which x_L is the estimate. An iteration is a pass of the extended filter forwards and of
-    its smoother backwards, both linearised along the states of the pass before; the first begins with the states
-    of the last update and the prediction. Where a step leaves the window, what it says of the next one becomes the
-    arrival cost of that: P = F P F' + Q by the extended filter along the estimate, and m so that the estimate
-    stays where it is. The losses are
+    over x_1 ... x_L; the estimate is x_L. An iteration is a forward pass of the extended filter and a backward
+    pass of its smoother, both linearised along the states of the pass before; the first starts from the states of
+    the last update and the prediction. When a step leaves the window, its prediction of the next one becomes the
+    arrival cost of that: P = F P F' + Q by the extended filter along the estimate, and m such that the estimate
+    does not change. The losses are
 
         quadratic  rho = r^2/2;  in a linear model without bounds the estimate is the Kalman filter's for any L
         huber      rho = r^2/2 up to the threshold k, from there on k r - k^2/2
@@ -40,19 +40,19 @@ class MovingHorizonFilter(Filter):
     `bounds`; its `bounded_by` has no meaning here. Components that are at a bound are found by an active set. If
     bounds of states and disturbances leave no room between them, the states keep theirs.
 
-    The covariance is that of x_L by the last linearisation and weights, of a problem without bounds: it does not
-    vanish where a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, under
-    R itself. A step that costs more than it gains is halved.
+    The covariance of x_L follows from the last linearisation and weights, for the problem without bounds: it does
+    not vanish if a bound holds. Innovation, S and log-likelihood are the extended filter's at the prediction, with
+    R itself. An iteration that increases the cost is halved.
 
-    Each step of the window keeps its dt, Q and R. Measurements of one time share a step; a second
-    reading of a channel is one more step, to which nothing moves, and counts among the L.
+    Each step of the window keeps its dt, Q and R. Measurements of one time share a step; a second reading of a
+    channel is a further step, to which the state does not move, and counts among the L.
 
     `Belief.extras` holds the number of steps, m, P, and of each step u, x, z, multipliers, Q, R and the model's
     constants; `window` reads x.
 
     Attributes:
         horizon: L, 1 to 200; with 1 it is an iterated extended filter.
-        iterations: passes in an update, 1 to 50; with bounds up to 100 more until the right ones hold.
+        iterations: passes in an update, 1 to 50; with bounds up to 100 more until the right bounds hold.
         loss: "huber", "student" or "quadratic"; Student's may have several minima in a linear model, too.
         threshold: k of the loss, in standard deviations.
         disturbance_limit: of each w in its standard deviations; infinite for none.
@@ -66,7 +66,7 @@ class MovingHorizonFilter(Filter):
     """
 
     name: ClassVar[str] = "mhe"
-    mixable: ClassVar[bool] = False  # its window would not know
+    mixable: ClassVar[bool] = False  # mixing would change the estimate, but not its window
     horizon: int = 10
     iterations: int = 3
     loss: str = HUBER
@@ -103,7 +103,7 @@ class MovingHorizonFilter(Filter):
         )
 
     def window(self, belief: Belief) -> np.ndarray:
-        """The states (at most L, n) of the window as they were last estimated, the oldest first."""
+        """The last estimates (at most L, n) of the states of the window, the oldest first."""
         layout, n = kept_places(self.kernel_model.shape), self.model.n
         steps = belief.extras[1 + n + n * n :].reshape(self._kernel_horizon + 1, layout.end)
         return steps[: int(belief.extras[0]), layout.x : layout.x + n].copy()

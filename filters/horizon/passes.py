@@ -1,7 +1,7 @@
-"""Kernels of moving-horizon estimation: passes of a smoother over a window, until its states settle.
+"""Kernels of moving-horizon estimation: passes of a smoother over a window, until its states converge.
 
-Each step of a window keeps the Q, R and constants that acted then. Measurements of one time share a step; a second
-reading of a channel has one of its own, to which nothing moves.
+Each step of a window keeps its Q, R and constants. Measurements of one time share a step; a second reading of a
+channel gets its own step, to which the state does not move.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.model.shape import Functions, Shape, number_places
 from thruster_env.model.state_bounds import Bound
 
-MOST_PASSES = 100  # beyond those that are asked for, until bounds settle
-HALVINGS = 6  # of a step that costs more, where bounds do not change
+MOST_PASSES = 100  # besides `iterations`, until the right bounds hold
+HALVINGS = 6  # of a step that increases the cost, if bounds do not change
 ROUNDING = 1e-9  # of a cost
-PATIENCE = 3  # passes without fewer wrong bounds, after which these change one by one
+PATIENCE = 3  # passes without fewer wrong bounds, after which bounds change one by one
 
 
 @lru_cache(maxsize=64)
@@ -34,10 +34,10 @@ def horizon_kernels(
     bounds: tuple[Bound, ...],
     limited: bool,
 ) -> Kernels:
-    """Kernels for model functions and sizes, with room for so many steps and one more.
+    """Kernels for model functions and sizes, with room for `room` + 1 steps.
 
-    Extras are the number of steps, arrival mean and P, and the steps. In scratch lie the numbers of a step, then
-    what is computed of each.
+    Extras are the number of steps, arrival mean and P, and the steps. Scratch has the numbers of a step, then the
+    results of each.
     """
     n, m, inputs = shape.n, shape.m, shape.inputs
     layout, step_layout, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
@@ -68,14 +68,14 @@ def horizon_kernels(
 
     @inlined
     def keep_sight(row, numbers, step):
-        """Keep what a measurement depends on besides the state."""
+        """Store R and the constants at a measurement."""
         first = steps + step * end
         copy(row, first + step_layout.R, numbers, r_place, m * m)
         copy(row, first + step_layout.seen_by, numbers, constants_place, constants)
 
     @inlined
     def keep_motion(row, numbers, step):
-        """Keep what the motion to the next step depends on besides state and input."""
+        """Store Q, constants and the number of substeps of the motion to the next step."""
         first = steps + step * end
         copy(row, first + step_layout.Q, numbers, q_place, square)
         copy(row, first + step_layout.moved_by, numbers, constants_place, constants)
@@ -83,7 +83,7 @@ def horizon_kernels(
 
     @not_inlined
     def forwards(row, numbers, count, free):
-        """The pass forwards over the first steps, components at bounds held or free; returns the cost of X."""
+        """The forward pass over the first `count` steps, without bounds if `free`; returns the cost of X."""
         then = row[numbers_place : numbers_place + numbers_end]
         copy(then, 0, numbers, 0, numbers_end)
         for i in range(n):
@@ -118,7 +118,7 @@ def horizon_kernels(
 
     @not_inlined
     def backwards(row, numbers, count, single):
-        """The pass backwards, which moves the window's states; returns how many bounds were not the right ones."""
+        """The backward pass, which moves the window's states; returns how many bounds were wrong."""
         wrong = 0
         for j in range(count - 1, -1, -1):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
@@ -135,27 +135,27 @@ def horizon_kernels(
             estimate(rows, step, numbers)
             wrong = update_state_set(rows, step, wrong, single)
             for i in range(n):
-                step[step_layout.x + i] = rows[at.found + i]
+                step[step_layout.x + i] = rows[at.estimate + i]
                 step[step_layout.adjoint + i] = rows[at.before + i]
             step[step_layout.fresh] = 0.0
             clip(step, step_layout.x)
             for i in range(n):
-                rows[at.step + i] += step[step_layout.x + i] - rows[at.found + i]
+                rows[at.step + i] += step[step_layout.x + i] - rows[at.estimate + i]
         return wrong
 
     @not_inlined
     def halve(row, numbers, count):
-        """Go half of the last step back."""
+        """Undo half of the last step."""
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
             step = row[steps + j * end : steps + (j + 2) * end]
             back_off(rows, step, numbers)
             for i in range(n):
-                step[step_layout.x + i] = rows[at.found + i]
+                step[step_layout.x + i] = rows[at.estimate + i]
 
     @inlined
     def begin_step(row, numbers, count):
-        """A step without a measurement, behind the others; its state is the belief's mean."""
+        """Append a step without a measurement; its state is the belief's mean."""
         clip(row, mean)
         first = steps + count * end
         for i in range(end):
@@ -170,7 +170,7 @@ def horizon_kernels(
 
     @inlined
     def leave_first(row, numbers, count):
-        """Leave out the first step: what it said of the second becomes the arrival cost of that."""
+        """Drop the first step: its prediction of the second becomes the arrival cost of that."""
         forwards(row, numbers, 2, True)
         second, second_step = scratch + width + at.cov, steps + end
         for i in range(n):
@@ -185,14 +185,14 @@ def horizon_kernels(
 
     @inlined
     def add_step(row, numbers, count):
-        """One step more, and as many as the horizon has at most."""
+        """Append a step, and drop the first if there are more than the horizon."""
         begin_step(row, numbers, count)
         if count == int(numbers[horizon_place]):
             leave_first(row, numbers, count + 1)
 
     @inlined
     def repeat_step(row, numbers, count):
-        """A step at the same time as the last one, for another measurement."""
+        """Append a step at the same time as the last one, for another measurement."""
         last = steps + (count - 1) * end
         keep_motion(row, numbers, count - 1)
         for i in range(square):
@@ -223,7 +223,7 @@ def horizon_kernels(
 
     @inlined
     def iterate(row, numbers, count):
-        """Pass over the window until all iterations are done and the right bounds hold, then once for P alone."""
+        """Make passes until all iterations are done and the right bounds hold, then one without bounds, for P."""
         fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
         iterations = int(numbers[iterations_place])
         for k in range(iterations + more + 1):
@@ -233,7 +233,7 @@ def horizon_kernels(
                     break
                 halve(row, numbers, count)
                 cost = forwards(row, numbers, count, settled)
-            least = cost if wrong == 0 else math.inf  # what passes a bound may cost less
+            least = cost if wrong == 0 else math.inf  # a state beyond a bound may cost less
             if settled:
                 break
             wrong = backwards(row, numbers, count, patience < 0)
@@ -242,7 +242,7 @@ def horizon_kernels(
 
     @inlined
     def take(row, z, numbers):
-        """Keep a measurement beside those of the same time, of which its errors are independent."""
+        """Store a measurement with those of the same time; their errors are independent."""
         newest = steps + (int(row[number]) - 1) * end
         is_first, fits = True, True
         for i in range(m):

@@ -1,6 +1,6 @@
-"""The window of a moving-horizon estimate in memory, and what is computed of each of its steps.
+"""The window of a moving-horizon estimate: its layout in memory, and the computations of each step.
 
-All is in deviations d_j = x_j - X_j from the estimate X of the window, about which the model is linear:
+They use deviations d_j = x_j - X_j from the estimate X of the window, about which the model is linearised:
 
     forwards:   d_{j+1} = F_j d_j + f(X_j) - X_{j+1},  P_{j+1} = F_j P_j F_j' + Q,  then the update with z_j
     backwards:  l = g + (I - K H)' l,  g = H' S^-1 (z_j - h(X_j) - H d_j),  x_j = X_j + d_j + P_j l,
@@ -46,24 +46,24 @@ OWN = tuple(
 
 
 class Kept(NamedTuple):
-    """Places of what a belief holds of a step."""
+    """Offsets of the numbers that a belief keeps of a step."""
 
-    u: int  # (p,), from this step to the next one; the first, as in `given` of other programs
+    u: int  # (p,), from this step to the next one; at 0, as in `given` of other programs
     x: int  # (n,), X
     z: int  # (m,), infinite where missing: a belief must not be NaN
     adjoint: int  # (n,), l before the update
-    fresh: int  # 1 until it was once a part of a pass
-    held: int  # (2 n,), which bounds hold the state and the disturbance after it: -1, 0 or 1
+    fresh: int  # 1 until the step was part of a pass
+    sides: int  # (2 n,), which bounds hold the state and the disturbance after it: -1, 0 or 1
     R: int  # (m, m), of z
     seen_by: int  # (c,), the model's constants at z
     Q: int  # (n, n), from this step to the next one
     moved_by: int  # (c,), constants of that motion
-    substeps: int  # of it; none to a second reading at the same time
+    substeps: int  # of it; zero before a second reading at the same time
     end: int
 
 
 class Scratch(NamedTuple):
-    """Places of what is computed of a step."""
+    """Offsets of the results of a step, in scratch."""
 
     d: int  # (n,), before the update
     cov: int  # (n, n)
@@ -76,21 +76,21 @@ class Scratch(NamedTuple):
     pull: int  # (n,), g
     after: int  # (n,), l after the update, then after the bounds
     before: int  # (n,), l before the update
-    found: int  # (n,), the new X
-    step: int  # (n,), from the X before
+    estimate: int  # (n,), the new X
+    step: int  # (n,), from the last X to the new one
     seen_cost: int  # of the measurement, and of the arrival in the first step
     moved_cost: int  # of the disturbance after this step
     noise: int  # (n,), mean of the disturbance after this step
     noise_cov: int  # (n, n), of it
     disturbance: int  # (n,), estimate of it
     spread: int  # (n,), its standard deviations
-    holds: int  # (2 n, n + 2), gain, variance and jump of each bound that holds
+    holds: int  # (2 n, n + 2), gain k, variance s and jump v of each bound that holds
     end: int
 
 
 @cache
 def kept_places(shape: Shape) -> Kept:
-    """Places of what a belief holds of a step, for some sizes."""
+    """Offsets of the numbers that a belief keeps of a step."""
     n = shape.n
     square, constants = n * n, shape.constants
     return Kept(*starts_of(shape.inputs, n, shape.m, n, 1, 2 * n, shape.m**2, constants, square, constants, 1))
@@ -98,7 +98,7 @@ def kept_places(shape: Shape) -> Kept:
 
 @cache
 def scratch_places(shape: Shape) -> Scratch:
-    """Places of what is computed of a step, for some sizes."""
+    """Offsets of the results of a step."""
     n, m, square = shape.n, shape.m, shape.n * shape.n
     return Scratch(
         *starts_of(
@@ -108,30 +108,30 @@ def scratch_places(shape: Shape) -> Scratch:
 
 
 class Works(NamedTuple):
-    """Functions (rows, given, numbers): `tell` of a filter's row and z, others of scratch and of what is kept."""
+    """Functions (rows, given, numbers): `tell` of a filter's row and z, others of scratch and a kept step."""
 
     tell: Callable  # innovation, its covariance and log-likelihood, of the prediction
-    centre: Callable  # d -= X, and what that costs
-    linearise: Callable  # X and the identity
-    substep: Callable
-    disturb: Callable  # zero and Q, the disturbance after this step
-    move: Callable  # from the updated d and P to those of the next step
-    correct: Callable
+    centre: Callable  # d -= X, and the arrival cost
+    linearise: Callable  # set f(X) and F to X and the identity
+    substep: Callable  # propagate f(X) and F by one substep
+    disturb: Callable  # set the disturbance after this step to zero and Q
+    move: Callable  # d and P of the next step, from the updated ones
+    correct: Callable  # update d and P with the measurement
     estimate: Callable  # l before the update, x, and the step to it
-    back_off: Callable  # half of the last step
+    back_off: Callable  # undo half of the last step
     descend: Callable  # l of this step, from that of the next one
-    find: Callable  # the disturbance after this step
+    find: Callable  # the estimate of the disturbance after this step
 
 
 def tell(model, x, P, z):
-    """Innovation, its covariance and log density, as the extended filter's; channels that are NaN are missing."""
+    """Innovation, its covariance and log density, by the extended filter; NaN marks missing channels."""
     return extended.update(model, x, P, z)[2:]
 
 
 def correct(model, x, d, P, z, fresh, loss):
     """The updated d and P, I - K H, g, and the loss at x.
 
-    The weight follows from the residual at x; before there is an estimate, from the innovation.
+    The weight follows from the residual at x; for a fresh step, without an estimate, from the innovation.
     """
     measured = present(z)
     H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
@@ -152,7 +152,7 @@ def correct(model, x, d, P, z, fresh, loss):
 
 
 def loss_of(square, measured, limit, loss):
-    """The loss rho of v' R^-1 v, with the square of the threshold."""
+    """The loss rho(r) of square = r^2 = v' R^-1 v; `limit` is the square of the threshold."""
     if loss == QUADRATIC:
         return square * 0.5
     far = square / limit
@@ -162,7 +162,7 @@ def loss_of(square, measured, limit, loss):
 
 
 def weight_of(square, measured, limit, loss):
-    """What the precision of a measurement is multiplied by: rho'(r)/r."""
+    """The factor rho'(r)/r on the precision of a measurement."""
     if loss == STUDENT:
         return (limit + count(measured)) / (limit + square)
     far = square / limit
@@ -170,13 +170,13 @@ def weight_of(square, measured, limit, loss):
 
 
 def cost_of(v, cov):
-    """The cost v' cov^-1 v/2; without components that a singular covariance leaves no room."""
+    """The cost v' cov^-1 v/2; components without variance do not count."""
     return dot(v, quotient(v, careful(cov))) * 0.5
 
 
 @lru_cache(maxsize=64)
 def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
-    """What is computed of the steps of a window, for a model's functions and sizes, and a loss."""
+    """The computations of the steps of a window, for a model's functions and sizes, and a loss."""
     n, m = shape.n, shape.m
     step_layout, at, row = kept_places(shape), scratch_places(shape), memory_places(n, m)
     outputs = row.innovation, row.innovation_cov, row.log_likelihood
@@ -200,7 +200,7 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         mean, F, without = vector(at.mean), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
-        estimate, step, shift = vector(at.found), vector(at.step), d + P @ adjoint
+        estimate, step, shift = vector(at.estimate), vector(at.step), d + P @ adjoint
         half, jump, centred = step * 0.5, wrap(mean - next_x, angles), wrap(d - x, angles)
         return [
             stored(tell(model, memory.x, memory.P, memory.z), outputs),

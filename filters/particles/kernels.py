@@ -169,8 +169,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     """Kernels of a particle filter's page for a model's functions and shape.
 
     If they do not resample, a page's `rejuvenate` draws all particles again. Functions that sum over particles are
-    not
-    inlined: otherwise single steps and batches would round differently.
+    not inlined: otherwise single steps and batches would round differently.
     """
     n, m, memory = shape.n, shape.m, MembersMemory(shape, page)
     layout = Layout(page, memory, PagedModel(memory))

@@ -32,9 +32,9 @@ def smooth_ensembles(
 
     The analysis of measurement k is repeated for each pair (x_k, x_l) of the members now and at an earlier step l
     >= k - lag, with a state of twice the size whose first half is measured. So the members of step l get the
-    analysis
-    that they would get as part of one long state: with perturbed measurements x_lj += cov(x_l, y) S^-1 (z - v_j -
-    y_j). Relaxation acts only on the members now, and steps before a restart from the prior are not changed.
+    analysis that they would get as part of one long state: with perturbed measurements
+    x_lj += cov(x_l, y) S^-1 (z - v_j - y_j). Relaxation acts only on the members now, and steps before a restart
+    from the prior are not changed.
 
     `noise` is the result of `filters.engine.batch.noise_rows`.
 

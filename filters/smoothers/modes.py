@@ -73,12 +73,12 @@ def complete(filter_: MultipleModelFilter, mu, means, covs) -> None:
         s, square = list(group.states), np.ix_(group.states, group.states)
         have = [k for k in range(mu.shape[1]) if k not in group.modes]
         total = mu[:, have].sum(axis=1)
-        for b in np.flatnonzero((total > 0.0) | group.given):
-            if not group.given:
+        for b in np.flatnonzero((total > 0.0) | group.from_prior):
+            if not group.from_prior:
                 w = mu[b : b + 1, have] / total[b]
                 mean, cov = (it[0] for it in merged(w, means[b : b + 1, have], covs[b : b + 1, have], angles))
             for k in group.modes:
-                if group.given:
+                if group.from_prior:
                     mean, cov = filter_.mode_filters[k].model.prior_mean, filter_.mode_filters[k].model.prior_cov
                 means[b, k, s] = mean[s]
                 covs[b, k, s] = covs[b, k][:, s] = 0.0

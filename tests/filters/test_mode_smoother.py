@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, make_filter, run, smooth, smooth_modes
-from filters.smoothers.modes import merged, told
+from filters.smoothers.modes import condition_on_later, merged
 from filters.smoothers.points import relation_of
 from filters.smoothers.rts import passes
 from tests.filters.test_multiple_models import merged as mixture
@@ -186,7 +186,7 @@ def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covar
     x, p, later, e = rng.normal(size=3), root @ root.T + np.eye(3), rng.normal(size=(2, 3)), 0.1 * less @ less.T
     step, found = passes(mode, relation_of(mode, "a test")), []
     for one in later:
-        level, mean, cov = told(mode, [0, 1], x[None], p[None], u, one[None], e[None])
+        level, mean, cov = condition_on_later(mode, [0, 1], x[None], p[None], u, one[None], e[None])
         ends = np.stack([x, mean[0]])[None], np.stack([p, cov[0]])[None], np.zeros((1, 2), bool)
         found.append((level[0], *(it[0, 0] for it in step(ends, u[:, None], 1))))
     a = small.matrices()[0]
