@@ -22,7 +22,7 @@ from filters.engine.belief import Kernels, memory_places, own_place
 from filters.ensembles.ensemble import compare, expect
 from filters.ensembles.stochastic import DeterministicUpdateFilter, LocalisedFilter, with_rotation
 from filters.pages.kernels import Stage, stored
-from filters.pages.members import MembersMemory, kept_size, members_kernels, works_of
+from filters.pages.members import MembersMemory, extras_size, members_kernels, works_of
 from filters.pages.page import Page
 from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place
@@ -131,7 +131,7 @@ def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage
 
 def scratch_place(page: Page, shape: Shape) -> int:
     """The offset of scratch in a filter's row, after the extras of a page."""
-    return memory_places(shape.n, shape.m).extras + kept_size(page, shape)
+    return memory_places(shape.n, shape.m).extras + extras_size(page, shape)
 
 
 @lru_cache(maxsize=64)

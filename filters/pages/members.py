@@ -177,7 +177,7 @@ def _correction(work: Works, shape: Shape) -> Callable:
     return update_with_noise if draws_noise else update
 
 
-def kept_size(page: Page, shape: Shape) -> int:
+def extras_size(page: Page, shape: Shape) -> int:
     """Count of a page's extras: numbers that it keeps besides the members."""
     return sum(prod(matrix.shape) for matrix in page.started(PagedModel(MembersMemory(shape, page))).values())
 
@@ -220,5 +220,5 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
 
     update, rows = _correction(works["update"], shape), max(work.rows for work in works.values())
     return Kernels(
-        n, m, rows, max(n, m), start, predictor(works, shape), update, summarise, extras=kept_size(page, shape)
+        n, m, rows, max(n, m), start, predictor(works, shape), update, summarise, extras=extras_size(page, shape)
     )
