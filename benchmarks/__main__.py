@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from benchmarks.rates import measure_again, rates
-from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
+from benchmarks.timing import COLUMNS, machine, machine_lines
 from thruster_env.core.checks import one_of
 from thruster_env.core.text_tables import table
 from thruster_env.core.threads import cores

@@ -15,16 +15,14 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Timing
-from benchmarks.workloads import step_by_size, times
+from benchmarks.rates import arithmetic_limit, step_by_size, times
+from benchmarks.timing import Row, Timing
 from filters.engine.batch import run
 from filters.filter import Filter
 from thruster_env.core.threads import cores
 from tuning.experiments.lorenz96 import STEPS, problem
-from tuning.problems import in_parts
-from tuning.search import filter_parameters
+from tuning.problems import data as in_parts
+from tuning.search import parameters as filter_parameters
 from tuning.search import plan as plans
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study

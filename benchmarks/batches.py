@@ -9,11 +9,8 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmarks.counting import operations_of
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, side_by_side
-from benchmarks.workloads import normals, step_of_filter, times
+from benchmarks.rates import arithmetic_limit, normals, operations_of, step_of_filter, times
+from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import run
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import column_reader, column_writer, vector_reader
@@ -24,7 +21,7 @@ from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import Choice, oracle_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 EVALUATE_GOAL, RUN_GOAL = 2.1, 1.8  # of the floor's time

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, side_by_side
+from benchmarks.timing import Measure, Row, side_by_side
 from filters import make_filter, thruster_model
 from filters.c.project import c_filter
 from thruster_env.model.state_space import StateSpaceModel

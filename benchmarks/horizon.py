@@ -10,9 +10,8 @@ from importlib.util import find_spec
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.rows import Row
 from benchmarks.steps import PEER_STEPS, episode, recorded_episode
-from benchmarks.timing import alone, seconds_a_call, side_by_side
+from benchmarks.timing import Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.single import EstimateState
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.model import thruster_model

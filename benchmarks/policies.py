@@ -2,20 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from itertools import pairwise
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.learning import by_hand, training
-from benchmarks.networks import network_limit
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, side_by_side
-from benchmarks.workloads import step_of_env, step_of_filtered
+from benchmarks.rates import arithmetic_limit, step_of_env, step_of_filtered
+from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
+from tuning.policies.setup import TrainingConfiguration
 from tuning.problems.seeds import training_seeds
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
+
+# A short training by PPO: as `thruster train` learns, and by Stable-Baselines3 as its documentation has it.
+
+
+if TYPE_CHECKING:
+    from tuning.policies.setup import TrainingConfiguration
+
+
+def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
+    """Seconds a step of a short training, as `thruster train` learns."""
+    from tuning.policies.environments import make_environments
+    from tuning.policies.model import new_model
+    from tuning.policies.torch_settings import learning
+
+    model = new_model(setup, make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=native))
+    return _steps_of(model, lambda: learning(model), rollouts)
+
+
+def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
+    """The same by Stable-Baselines3 as its documentation has it: single envs one by one, VecNormalize, PPO.
+
+    torch has one thread here, too.
+    """
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from thruster_env.core.threads import one_thread
+    from tuning.policies.environments import make_environments
+
+    numbers = dict(setup.hyperparameters)
+    envs = VecNormalize(
+        make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=False), gamma=numbers["gamma"]
+    )
+    return _steps_of(PPO("MlpPolicy", envs, seed=setup.seed, device="cpu", **numbers), one_thread, rollouts)
+
+
+def _steps_of(model, settings: Callable[[], AbstractContextManager], rollouts: int) -> Measure:
+    steps = rollouts * model.n_envs * model.n_steps
+
+    def measure() -> float:
+        with settings():
+            begin = perf_counter()
+            model.learn(steps)
+            return (perf_counter() - begin) / steps
+
+    return measure
+
+
+# What a step of learning needs of the processor at least: the products with the weights of its networks.
+
+
+NETWORKS = 2  # one of the action, one of the value, which is a single number, too
+PASSES = 3  # through them in a step of gradient descent: the output, then slopes over weights and over inputs
+
+
+def network_limit(setup: TrainingConfiguration) -> float:
+    """Seconds a step of PPO's products with its networks' weights, at torch's rate in one thread."""
+    from tuning.policies.environments import make_environments
+
+    envs, parameters = make_environments(setup, [0]), dict(setup.hyperparameters)
+    layers = [
+        envs.observation_space.shape[0],
+        *parameters["policy_kwargs"]["net_arch"],
+        envs.action_space.shape[0],
+    ]
+    weights = NETWORKS * sum(a * b for a, b in pairwise(layers))
+    rate = seconds_a_product(parameters["batch_size"], max(layers))
+    return weights * (1 + PASSES * parameters["n_epochs"]) * rate
+
+
+def seconds_a_product(rows: int, width: int) -> float:
+    """Seconds of one multiplication and addition in a product (rows, width) (width, width) of float32."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        multiply = seconds_a_call(torch.mm, 50 * [(torch.ones(rows, width), torch.ones(width, width))])
+        return alone(multiply, 100).ours / (rows * width * width)
+    finally:
+        torch.set_num_threads(threads)
+
 
 COPIES = 64
 GOAL = 0.60  # of the time that Stable-Baselines3 by itself takes

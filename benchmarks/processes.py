@@ -8,8 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, side_by_side
+from benchmarks.timing import Measure, Row, side_by_side
 
 FIRST_STEP = """
 env = gymnasium.make("BowThruster-v0")
@@ -18,7 +17,7 @@ env.step(env.action_space.high)
 """
 TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice
 """

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.rows import Row, machine_lines, machine_name
+from benchmarks.timing import Row, machine_lines, machine_name
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables

@@ -9,10 +9,8 @@ import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, seconds_a_call, side_by_side
-from benchmarks.workloads import step_of_env, step_of_filtered
+from benchmarks.rates import arithmetic_limit, step_of_env, step_of_filtered
+from benchmarks.timing import Measure, Row, seconds_a_call, side_by_side
 from filters.wrappers.single import EstimateState
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
 from thruster_env.thruster.plant import Plant

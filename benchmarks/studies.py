@@ -13,10 +13,8 @@ from unittest import mock
 import numpy as np
 
 from benchmarks.peers import EnsembleStep, python_model
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Timing
-from benchmarks.workloads import step_by_size, times
+from benchmarks.rates import arithmetic_limit, step_by_size, times
+from benchmarks.timing import Row, Timing
 from thruster_env.core.threads import cores
 from tuning.evaluation import sizes
 from tuning.likelihood import family
@@ -24,8 +22,8 @@ from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
-from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import find_scenario
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
@@ -39,7 +37,7 @@ FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study c
 WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 from tuning.search.study import open_study, quiet_optuna, run_study
 quiet_optuna()
 plan = Plan("enkf", (find_scenario("nominal"),), {seed})

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import gc
+import os
+import platform
 from collections.abc import Callable, Iterable
 from contextlib import contextmanager
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import NamedTuple
+
+from benchmarks.rates import vector_bits
 
 Measure = Callable[[], float]
 """Does one round of work and returns the seconds that a unit of it (a step, say) took."""
@@ -69,3 +76,141 @@ def seconds_a_call(function: Callable, arguments: Iterable[tuple], prepare: Call
         return (perf_counter() - begin) / len(arguments)
 
     return measure
+
+
+# What the benchmark prints: rows of measured times with their goals, and the machine they were taken on.
+
+
+COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
+PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "do_mpc", "stable_baselines3", "torch")
+
+
+class Row(NamedTuple):
+    """A timing, what it would be on the machine's arithmetic limit, and the most that it may be of something.
+
+    A goal is one of the ratio to the peer, of the multiple of the limit, or of the time, where that was asked for.
+    """
+
+    what: str
+    peer_name: str | None
+    timing: Timing
+    ratio_goal: float | None = None
+    limit: float | None = None  # [s]
+    limit_goal: float | None = None  # of `of_limit`
+    time_goal: float | None = None  # [s]
+
+    @property
+    def of_limit(self) -> float | None:
+        """Our time as a multiple of the limit."""
+        return None if self.limit is None else self.timing.ours / self.limit
+
+    @property
+    def limits(self) -> str:
+        """The multiple of the limit as text; a time below the limit is flagged, as the limit is then wrong."""
+        if self.of_limit is None:
+            return "-"
+        return rounded(self.of_limit, 2) + (" passed" if self.of_limit < 1 else "")
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the goal is met; None without a goal."""
+        for value, goal in (
+            (self.timing.ratio, self.ratio_goal),
+            (self.of_limit, self.limit_goal),
+            (self.timing.ours, self.time_goal),
+        ):
+            if goal is not None:
+                return value <= goal
+        return None
+
+    @property
+    def goal(self) -> str:
+        """The goal as text."""
+        if self.ratio_goal is not None:
+            return f"{self.ratio_goal:.2g}"
+        if self.limit_goal is not None:
+            return f"{self.limit_goal:g} x"
+        return "-" if self.time_goal is None else readable(self.time_goal)
+
+    def cells(self) -> list[str]:
+        """The row as text, by `COLUMNS`."""
+        return [
+            self.what if self.peer_name is None else f"{self.what}; {self.peer_name}",
+            readable(self.timing.ours),
+            "-" if self.timing.peer is None else readable(self.timing.peer),
+            "-" if self.timing.ratio is None else rounded(self.timing.ratio),
+            "-" if self.limit is None else readable(self.limit),
+            self.limits,
+            self.goal,
+            {True: "yes", False: "no", None: "-"}[self.met],
+        ]
+
+    def as_json(self) -> dict:
+        """The row with all times in seconds."""
+        return {
+            "what": self.what,
+            "peer": self.peer_name,
+            "ours_seconds": self.timing.ours,
+            "peer_seconds": self.timing.peer,
+            "ratio": self.timing.ratio,
+            "limit_seconds": self.limit,
+            "of_limit": self.of_limit,
+            "ratio_goal": self.ratio_goal,
+            "limit_goal": self.limit_goal,
+            "time_goal_seconds": self.time_goal,
+            "met": self.met,
+        }
+
+
+def rounded(number: float, figures: int = 3) -> str:
+    """A number with so many figures, or all those before the point."""
+    return f"{number:.0f}" if number >= 10**figures - 0.5 else f"{number:.{figures}g}"
+
+
+def readable(seconds: float) -> str:
+    """A time with three figures in the unit that suits it."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= size:
+            return f"{rounded(seconds / size)} {unit}"
+    return f"{rounded(seconds / 1e-9)} ns"
+
+
+def machine() -> dict[str, str | int | bool]:
+    """Processor, cores and versions, on which the times depend beside the code."""
+    from llvmlite import binding  # comes with numba
+
+    return {
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "system": f"{platform.system()} {platform.machine()}",
+        "architecture": binding.get_host_cpu_name(),
+        "avx512": binding.get_host_cpu_features().get("avx512f", False),
+        "vector_bits": vector_bits(),
+        "python": platform.python_version(),
+        **{package: version(package) for package in PACKAGES if find_spec(package)},
+    }
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # no Linux
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or "unknown processor"
+
+
+def machine_name(facts: dict) -> str:
+    """Processor and cores, which identify a machine."""
+    return f"{facts['cpu']}, {facts['cores']} cores"
+
+
+def machine_lines(facts: dict) -> list[str]:
+    """The machine in two lines of text."""
+    packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES if name in facts)
+    avx512 = " with AVX-512" if facts["avx512"] else ""
+    vectors = f"{facts['architecture']}{avx512}, compiled to vectors of {facts['vector_bits']} bits"
+    return [
+        f"Machine: {machine_name(facts)}, {facts['system']}; {vectors}.",
+        f"Python {facts['python']}, {packages}.",
+    ]

@@ -11,17 +11,15 @@ import numpy as np
 
 from benchmarks.batches import shared
 from benchmarks.jax_enkf import jax_filter
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import alone, side_by_side
-from benchmarks.workloads import step_of_filter, times
+from benchmarks.rates import arithmetic_limit, step_of_filter, times
+from benchmarks.timing import Row, alone, side_by_side
 from filters import run
 from filters.filter import Filter
 from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 TRAJECTORIES, ENSEMBLE_SIZE = 256, 100
 AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart

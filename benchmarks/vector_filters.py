@@ -6,11 +6,9 @@ from collections.abc import Iterator
 
 import gymnasium as gym
 
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import alone
+from benchmarks.rates import arithmetic_limit, step_of_filtered
+from benchmarks.timing import Row, alone
 from benchmarks.vectors import vector_steps
-from benchmarks.workloads import step_of_filtered
 from thruster_env.core.threads import cores
 
 COPIES, STEPS = 1024, 100

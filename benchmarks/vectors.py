@@ -10,11 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
-from benchmarks.counting import operations_of
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, side_by_side
-from benchmarks.workloads import step_of_env
+from benchmarks.rates import arithmetic_limit, operations_of, step_of_env
+from benchmarks.timing import Measure, Row, alone, side_by_side
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.memory import set_row
 from thruster_env.core.streams import ACTION_SPACE, derived_seed

@@ -11,12 +11,9 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.batches import shared
-from benchmarks.counting import operations_of
-from benchmarks.rates import arithmetic_limit
-from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.rates import arithmetic_limit, operations_of, step_of_filter, step_of_filtered, times
+from benchmarks.timing import Measure, Row, alone, side_by_side
 from benchmarks.vectors import vector_steps
-from benchmarks.workloads import step_of_filter, step_of_filtered, times
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
@@ -25,8 +22,8 @@ from thruster_env.auv.plant import make_plant
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import cores
-from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
+from tuning.auv.scenarios import find_scenario
 from tuning.problems.seeds import training_seeds
 
 MEMBERS, STEPS = 256, 200

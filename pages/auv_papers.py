@@ -18,14 +18,10 @@ from pages.page import make_page
 from thruster_env.core.text_tables import markdown_table
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS
-from tuning.experiments.vehicle.experiment import PathResult, run_tasks
+from tuning.experiments.vehicle.experiment import PathResult, Scores, position_ratio, run_tasks, tasks_of
 from tuning.experiments.vehicle.figure import path_runs, paths_figure
-from tuning.experiments.vehicle.findings import ENKF, FKF, findings
 from tuning.experiments.vehicle.printed import POSE, PrintedRow
-from tuning.experiments.vehicle.scores import Scores, position_ratio
-from tuning.experiments.vehicle.statements import statements
-from tuning.experiments.vehicle.tasks import tasks_of
-from tuning.experiments.vehicle.wording import digits, with_interval
+from tuning.experiments.vehicle.statements import ENKF, FKF, digits, findings, statements, with_interval
 
 RUNS = {"ngatini2019": 50, "ngatini2017": 10}
 

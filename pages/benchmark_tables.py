@@ -20,8 +20,8 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments import BENCHMARKS
 from tuning.experiments.benchmark import find_benchmark
 from tuning.experiments.lorenz63 import problem as lorenz63
+from tuning.experiments.lorenz96 import tune_inflation
 from tuning.experiments.pendulum import problem as pendulum
-from tuning.experiments.tuned_inflation import tune_inflation
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
 

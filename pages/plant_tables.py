@@ -50,7 +50,7 @@ SOURCES = {
     "open_bladed": "the same",
     "tunnel_physical": "`tunnel`, corrected",
     "open_bladed_corrected": "`open_bladed`, corrected",
-    "t200": "Blue Robotics' bollard table of 2019; `tuning/experiments/t200_identification.py`",
+    "t200": "Blue Robotics' bollard table of 2019; `tuning/experiments/bollard.py`",
 }
 INFERRED = {
     "tunnel": "nothing: K_h = 17.79, as printed",

@@ -29,8 +29,8 @@ from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import find_scenario
 
 TRIALS = 50
 TRAINED_ON = ("mismatch", "outliers")

@@ -27,9 +27,9 @@ from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, t
 from tuning.api.run import Tuning
 from tuning.cli.demo import FILTER, SCENARIO, before_and_after
 from tuning.cli.tune import tune
-from tuning.reporting.panels import axis_label
+from tuning.reporting.time_figures import axis_label
 from tuning.search.plan import Plan
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 SEED = 5
 FIRST, LAST, EVERY = 400, 1000, 8  # steps of the episode of 10 ms each: twelve pictures and a half a second

@@ -15,11 +15,9 @@ from pathlib import Path
 from pages.page import DOCS
 from thruster_env.core.files import as_toml, write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
-from tuning.experiments.recordings.comparison import estimates_of
-from tuning.experiments.recordings.identification import CHOSEN
+from tuning.experiments.recordings.identification import CHOSEN, Task, identify_all
+from tuning.experiments.recordings.measure import estimates_of, regimes
 from tuning.experiments.recordings.model import IDENTIFIED, model
-from tuning.experiments.recordings.regime import regimes
-from tuning.experiments.recordings.results import Task, identify_all
 from tuning.experiments.recordings.runs import read_recordings
 from tuning.experiments.recordings.tables import sentences
 from tuning.experiments.recordings.tables import tables_of as rows_of

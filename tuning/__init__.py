@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from tuning.api.explore import explore
     from tuning.api.identify import identify
     from tuning.api.report import report
+    from tuning.api.study import tune
     from tuning.api.train_estimator import train_estimator
-    from tuning.api.tune import tune
 
 warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's in notebooks: Optuna imports it, unused
 

@@ -2,7 +2,7 @@
 
 from filters.logs.figure import STYLES, TRUTH, colour_of, plot_style
 from filters.registry import FILTERS
-from tuning.reporting.svg import luminance, on_dark
+from tuning.reporting.page import luminance, on_dark
 
 
 def test_every_filter_has_a_look_of_its_own():

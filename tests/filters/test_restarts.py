@@ -25,8 +25,8 @@ from tuning.evaluation.summary import summarised, summary
 from tuning.problems.data import Data
 from tuning.problems.runs_problem import RunsProblem
 from tuning.reporting.page import html_page
-from tuning.reporting.parts import held_out_section
-from tuning.reporting.sketchbook import Sketchbook
+from tuning.reporting.search_figures import Sketchbook
+from tuning.reporting.sections import held_out_section
 
 
 class Clock(NamedTuple):

@@ -6,7 +6,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks import rates
-from benchmarks.counting import (
+from benchmarks.rates import (
     ADD,
     DIVIDE,
     INTEGER,
@@ -15,9 +15,14 @@ from benchmarks.counting import (
     RECIPROCAL_ROOT,
     ROOT,
     counting,
+    normals,
     operations_of,
+    step_by_size,
+    step_of_env,
+    step_of_filter,
+    step_of_members,
+    times,
 )
-from benchmarks.workloads import normals, step_by_size, step_of_env, step_of_filter, step_of_members, times
 from filters import make_filter, thruster_model
 from thruster_env.core import matrices as arrays
 from thruster_env.core.compiled import interpreted

@@ -9,9 +9,8 @@ import pytest
 import benchmarks.rates as rates_module
 from benchmarks.__main__ import PARTS, command
 from benchmarks.jax_enkf import NORMALS, array_filter
-from benchmarks.rows import Row
 from benchmarks.speed_page import HEADER, NO_BREAK, check_page, write_page
-from benchmarks.timing import Timing
+from benchmarks.timing import Row, Timing
 from filters import EnsembleKalmanFilter, thruster_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals

@@ -13,7 +13,7 @@ from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, short_repr, vector
 from thruster_env.thruster.parameters import TUNNEL
 from tuning.cli.simulate import command
-from tuning.experiments.comparison import compare
+from tuning.experiments.thruster_papers import compare
 from tuning.policies.setup import configuration_from_json
 from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds

@@ -11,7 +11,7 @@ from filters.consistency.verdicts import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
-from tuning.cli import consistency
+from tuning.cli import evaluate as consistency
 from tuning.cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
@@ -22,19 +22,18 @@ from tuning.evaluation.worth import worth
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
+from tuning.reporting.choice_words import gains
 from tuning.reporting.consistency_figures import consistency_figure
 from tuning.reporting.error_tables import comparison_table
-from tuning.reporting.figures import comparison_figure
-from tuning.reporting.gains import gains
-from tuning.reporting.panels import plotted_states
-from tuning.reporting.parts import advice, held_out_section
+from tuning.reporting.search_figures import comparison_figure
+from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table, numbers_table
-from tuning.reporting.time_figures import estimates_figure
+from tuning.reporting.time_figures import estimates_figure, plotted_states
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 SEEDS = range(8)
 

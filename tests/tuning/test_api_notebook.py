@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from tuning.api import progress
-from tuning.api.notebook import NotebookLine
+from tuning.api.progress import NotebookLine
 
 
 @pytest.fixture

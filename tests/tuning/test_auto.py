@@ -30,14 +30,14 @@ from tuning.search.among_types import (
     SMALLER,
     TRANSFERRED,
     UNTUNED,
+    filter_types_tried,
     next_in_race,
     race_of,
+    trials_of_type,
 )
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.enqueued import RESCALED
-from tuning.search.filter_types import filter_types_tried, trials_of_type
 from tuning.search.gradient_noise import noise_by_gradient
-from tuning.search.outcome import best_trial, is_over_budget, violation
 from tuning.search.plan import Plan
 from tuning.search.space import (
     AUTO_FILTER_TYPES,
@@ -48,7 +48,8 @@ from tuning.search.space import (
     untuned_choice,
 )
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.search.trials import best_trial, is_over_budget, violation
+from tuning.thruster.scenarios import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)
@@ -259,7 +260,7 @@ def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
 
 def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(monkeypatch, priced):
     plans = []
-    monkeypatch.setattr("tuning.api.tune.run_tuning", lambda plan, *others, **named: plans.append(plan))
+    monkeypatch.setattr("tuning.api.study.run_tuning", lambda plan, *others, **named: plans.append(plan))
     with pytest.warns(UserWarning, match="no budget .* may take 10 microseconds of one core, the default of 2 st"):
         tuning.tune(MISMATCH, "auto", progress=False)
     tuning.tune(MISMATCH, "auto", budget=3.0, progress=False)

@@ -39,9 +39,8 @@ from tuning.evaluation.worth import gain, warnings_of, worth
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.parameter import Parameter
-from tuning.reporting.gains import gains
-from tuning.reporting.residual_words import consistency_sentence
-from tuning.search.correlations import correlations_of, full_covariance
+from tuning.reporting.choice_words import consistency_sentence, gains
+from tuning.search.relations import correlations_of, full_covariance
 
 
 def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():

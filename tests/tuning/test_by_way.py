@@ -11,7 +11,7 @@ from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.ways.problems import linear
 from thruster_env.model.affine import affine_model
-from tuning.api import by_way
+from tuning.api import run as by_way
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
@@ -20,7 +20,7 @@ from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import reported, reported_name
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import given_choice, untuned_choice
-from tuning.ways.lagged import stationary, steady_gain
+from tuning.ways.correlations import stationary, steady_gain
 from tuning.ways.registry import WAYS, find_way
 from tuning.ways.task import Budget, Task
 

@@ -6,8 +6,7 @@ import numpy as np
 import optuna
 import pytest
 
-from tuning.search.cma_es import read_state
-from tuning.search.samplers import NEEDS, make_sampler
+from tuning.search.samplers import NEEDS, make_sampler, read_state
 
 
 class Attack:

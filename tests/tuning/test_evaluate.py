@@ -12,10 +12,10 @@ from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.runs import _means_over_steps
 from tuning.evaluation.summary import summary
-from tuning.problems import in_parts
+from tuning.problems import data as in_parts
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 
 @pytest.fixture(scope="module")

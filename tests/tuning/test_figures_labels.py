@@ -6,10 +6,8 @@ import pytest
 
 from filters import ExtendedKalmanFilter, StateSpaceModel
 from tuning.problems.model_problem import ModelProblem
-from tuning.reporting.panels import axis_label
 from tuning.reporting.search_figures import draw_slices
-from tuning.reporting.signal_figures import draw_gains, draw_innovations, draw_signal
-from tuning.reporting.time_figures import draw_estimates
+from tuning.reporting.time_figures import axis_label, draw_estimates, draw_gains, draw_innovations, draw_signal
 
 LONG = "temperature of the water in the outer cooling jacket"
 

@@ -13,14 +13,13 @@ from filters.tuned_file import read_tuned_file, sealed
 from tuning.cli.tables import choice_table
 from tuning.cli.tune import tune
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.evaluation.verify import verify
-from tuning.search.correlations import correlation_slopes, correlations_of, full_covariance
+from tuning.evaluation.tuned import read_tuned, verify, write_tuned
 from tuning.search.enqueued import RESCALED
 from tuning.search.plan import Plan
+from tuning.search.relations import correlation_slopes, correlations_of, full_covariance
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("ekf", (MISMATCH,), full_q=True)

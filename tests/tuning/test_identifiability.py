@@ -6,8 +6,7 @@ import pytest
 from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.cli.tune import tune
-from tuning.cli.tuning_report import as_json, report
+from tuning.cli.tune import as_json, report, tune
 from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
@@ -23,7 +22,7 @@ from tuning.likelihood.identifiability import (
 )
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
 TRUE = np.log([0.3, 0.2, 0.5])  # Q11, Q22, R

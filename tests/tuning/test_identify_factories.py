@@ -14,9 +14,8 @@ from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification import identify
 from tuning.identification.objective import Objective
-from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter
+from tuning.problems.parameter import Coordinates, Parameter
 
 DT = 0.1
 FREE = (

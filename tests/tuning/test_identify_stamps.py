@@ -23,8 +23,8 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.validation import validate
 from tuning.logs.identify import family_of
-from tuning.problems.coordinates import Coordinates
 from tuning.problems.log_problem import LogProblem
+from tuning.problems.parameter import Coordinates
 from tuning.search.space import untuned_choice
 
 DT = 0.1

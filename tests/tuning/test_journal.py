@@ -9,8 +9,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from tuning.search.journal import JournalFile
-from tuning.search.storage import open_storage
+from tuning.search.storage import JournalFile, open_storage
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from tuning.reporting.limits import limit_errors, limit_values
+from tuning.reporting.time_figures import limit_errors, limit_values
 
 START = 3
 

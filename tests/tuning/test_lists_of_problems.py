@@ -11,7 +11,7 @@ from tests.linear_problem import LinearProblem
 from tests.tuning.test_unequal_runs import MODEL, runs_of
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import ensemble_sizes, few_seeds_first
-from tuning.evaluation.verify import verify
+from tuning.evaluation.tuned import verify
 from tuning.problems.parameter import Parameter
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.plan import Plan

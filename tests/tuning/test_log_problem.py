@@ -27,11 +27,11 @@ from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.reporting.tables import errors_table, numbers_table
-from tuning.search.filter_parameters import size_ladder
+from tuning.search.parameters import size_ladder
 from tuning.search.plan import Plan
-from tuning.search.processes import orders_of, plan_of
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
+from tuning.search.workers import orders_of, plan_of
 
 Q, R = 0.04, 0.25
 MODEL = affine_model(

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from filters import make_filter, run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
-from tuning.evaluation.log_scores import log_scores_of
+from tuning.evaluation.runs import log_scores_of
 from tuning.search.objectives import LARGEST
 
 PROBLEM = LinearProblem()

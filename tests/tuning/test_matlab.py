@@ -12,8 +12,7 @@ import tuning.cli
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
-from tuning.reporting.matlab import function_name, matlab_function
-from tuning.reporting.traced import traced
+from tuning.reporting.matlab import function_name, matlab_function, traced
 from tuning.search.space import Choice, untuned_choice
 
 

@@ -8,12 +8,12 @@ from scipy.stats import chi2, multivariate_normal
 from filters import run
 from pages.tuning_objectives import pair
 from tests.linear_problem import LinearProblem
-from tuning.cli.tuning_report import _band_sentence
+from tuning.cli.tune import _band_sentence
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.runs import RunMetrics, variance_ratios
 from tuning.reporting.alternatives import of_front, of_history
-from tuning.reporting.figures import draw_history
-from tuning.search.filter_types import TypeResult
+from tuning.reporting.search_figures import draw_history
+from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
 from tuning.search.objectives import find_objective, nees_ratio, reported, reported_about, reported_name
 from tuning.search.plan import Plan

@@ -12,12 +12,11 @@ from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.sizes import SizeRow, sufficient_size
 from tuning.search.enqueued import BASELINE
 from tuning.search.objectives import NIS_BAND
-from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import BEST, open_study, run_study
-from tuning.search.trials import CONSISTENCY
-from tuning.thruster.find import find_scenario
+from tuning.search.trials import CONSISTENCY, best_trial, is_consistent
+from tuning.thruster.scenarios import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
 

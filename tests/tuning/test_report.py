@@ -14,16 +14,15 @@ from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.reporting.figures import early_trials
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
-from tuning.reporting.parts import advice
 from tuning.reporting.report import write_report
-from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, importances
+from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
+from tuning.reporting.sections import advice
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -11,10 +11,10 @@ from tests.tuning.ways.problems import drawn, linear
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.regression import log_densities
-from tuning.evaluation.stored import comparison_as_data
+from tuning.evaluation.summary import comparison_as_data
 from tuning.problems.find import find_problem
 from tuning.problems.runs_problem import RunsProblem
-from tuning.reporting.residual_words import (
+from tuning.reporting.choice_words import (
     MADE_UP,
     consistency_of,
     consistency_sentence,

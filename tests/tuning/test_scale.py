@@ -9,14 +9,12 @@ import pytest
 
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import write_tuned
-from tuning.evaluation.verify import verify
+from tuning.evaluation.tuned import verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
-from tuning.thruster.scale import computed_scale, is_stable
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.thruster.scenario import computed_scale, is_stable
+from tuning.thruster.scenarios import SCENARIOS, find_scenario
 
 
 @pytest.fixture

@@ -11,9 +11,8 @@ from filters.bounds import riccati_covariances
 from thruster_env.thruster.model import model_of_plant
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
-from tuning.thruster.find import find_scenario
-from tuning.thruster.scale import computed_scale
-from tuning.thruster.scenarios import SCENARIOS, main
+from tuning.thruster.scenario import computed_scale
+from tuning.thruster.scenarios import SCENARIOS, find_scenario, main
 
 
 def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_estimates():
@@ -191,7 +190,7 @@ def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
 
 
 def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
-    import tuning.problems.bound as module
+    import tuning.problems.check as module
 
     monkeypatch.setattr("thruster_env.core.number_cache._known", {})
     monkeypatch.setattr("thruster_env.core.compiled.CompiledOrPython.folder", None)  # nothing on the disk

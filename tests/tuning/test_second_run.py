@@ -46,7 +46,7 @@ problem = ModelProblem(model(2.092), model(2.0), inputs=[[290.0]] * 120, dt=0.02
 COUNTING = """
 import json, sys
 from numba.core import event
-import tuning.problems.bound as bound
+import tuning.problems.check as bound
 
 found = {"compiled": 0, "bounds": 0}
 class Count(event.Listener):
@@ -58,7 +58,7 @@ def posterior_variances(*given, **named):
     found["bounds"] += 1
     return computed(*given, **named)
 bound.posterior_variances = posterior_variances
-import tuning.reporting.sketchbook as sketchbook
+import tuning.reporting.search_figures as sketchbook
 from tuning.cli.main import main
 sketchbook.figure_svg = lambda *_: ("<svg></svg>", "")  # to draw takes most of a report's time
 for words in json.loads(sys.argv[1]):

@@ -9,7 +9,7 @@ from filters import posterior as bounds
 from filters.posterior import posterior_variances
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import check_consistency
-from tuning.problems.bound import average_bound
+from tuning.problems.check import average_bound
 from tuning.problems.data import Data, mask_of
 
 

@@ -13,12 +13,12 @@ from rich.console import Console
 
 from tuning.api.run import run_tuning
 from tuning.problems.find import find_problem
-from tuning.search import database
+from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage, retry_once
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

@@ -7,9 +7,8 @@ import pytest
 import sqlalchemy
 
 from tuning.reporting.subject import find_subject
-from tuning.search import database
-from tuning.search.storage import open_storage
-from tuning.search.storage_url import public_url, without_secrets
+from tuning.search import storage as database
+from tuning.search.storage import open_storage, public_url, without_secrets
 
 SHOWN = {
     "postgresql+psycopg2://tuner:secret@host:5432/studies": "postgresql+psycopg2://host:5432/studies",

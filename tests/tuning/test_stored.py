@@ -8,10 +8,10 @@ import pytest
 from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
-from tuning.evaluation import stored
+from tuning.evaluation import summary as stored
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.stored import sizes_as_data, stored_comparison, stored_sizes
+from tuning.evaluation.summary import sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, worth
 from tuning.reporting import report as reports
@@ -19,7 +19,7 @@ from tuning.reporting.report import write_report
 from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

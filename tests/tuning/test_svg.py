@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.plots import BLUE, MOST_POINTS, RUST, panels, thinned
-from tuning.reporting.page import Code, Pair, Picture, Section, Table, html_page
-from tuning.reporting.svg import figure_svg, on_dark, plain
+from tuning.reporting.page import Code, Pair, Picture, Section, Table, figure_svg, html_page, on_dark, plain
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,13 @@ from filters.learned.file import LEARNED, read
 from tests.models import plane_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
-from tuning.learning.loss import Loss
 from tuning.learning.settings import Settings
-from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings
+from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings, twice_as_long, with_larger_noise
 from tuning.learning.starting import new_estimator, scales_of, starting_filter
-from tuning.learning.training import train
-from tuning.learning.variants import twice_as_long, with_larger_noise
+from tuning.learning.training import Loss, train
 from tuning.problems.check import data_of
 from tuning.problems.model_problem import ModelProblem
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 MODEL = plane_model()
 

@@ -23,8 +23,7 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
-from tuning.evaluation.verify import verify
+from tuning.evaluation.tuned import read_choice, read_tuned, verify, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
@@ -32,7 +31,7 @@ from tuning.search.gradient_noise import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 NAME = "my_pendulum:of_one_number"
 

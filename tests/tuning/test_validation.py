@@ -16,7 +16,7 @@ from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
 from tests.tuning.test_log_problem import MODEL, logs_of
-from tuning.api.user_choice import user_choice
+from tuning.api.study import user_choice
 from tuning.evaluation.baselines import (
     FULL_Q,
     GIVEN,
@@ -39,11 +39,11 @@ from tuning.reporting.units import apart
 from tuning.search import validation
 from tuning.search.enqueued import BASELINE
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
-from tuning.search.local import is_local, near
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
 from tuning.search.ranges import at_ends, range_warning, range_words
+from tuning.search.samplers import is_local, near
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study
 from tuning.search.validation import (

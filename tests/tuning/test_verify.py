@@ -9,11 +9,10 @@ import pytest
 from filters.tuned_file import sealed
 from tuning.cli.main import main
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import write_tuned
-from tuning.evaluation.verify import Difference, verify
+from tuning.evaluation.tuned import Difference, verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 

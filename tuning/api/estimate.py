@@ -3,19 +3,145 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from filters.filter import Filter
+from filters.logs.estimate import LogEstimate
 from filters.logs.estimate import estimate as estimate_log
-from filters.logs.findings import findings
+from filters.logs.findings import LogAlarms, LogFindings, alarms_of, columns_of, findings, verdict
+from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.checks import short_repr
-from tuning.api.estimates import LogEstimates
+from thruster_env.logs.log import Log
+from thruster_env.logs.write import write_columns
+from tuning.api.showing import drawn, frame, html, number
 from tuning.logs.model_of_logs import model_of_logs
 from tuning.logs.problem import name_of
 from tuning.logs.read import as_tuned, read_named
+
+# `LogEstimates`: the estimates of a filter or a smoother on a recorded run, as a value.
+
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LogEstimates:
+    """Estimates and innovations of every row of a log, and the findings on filter and model.
+
+    Attributes:
+        found: the estimate itself.
+        findings: mean NIS with its 95 % band, whiteness, RMSE of predictions, errors against references.
+    """
+
+    found: LogEstimate
+    findings: LogFindings
+
+    @property
+    def log(self) -> Log:
+        """The log."""
+        return self.found.log
+
+    @property
+    def filter(self) -> Filter:
+        """The filter."""
+        return self.found.filter
+
+    @property
+    def means(self) -> np.ndarray:
+        """Estimates of the states, (K + 1, n); the smoother's if requested."""
+        return self.found.means
+
+    @property
+    def stds(self) -> np.ndarray:
+        """Their standard deviations, (K + 1, n)."""
+        return self.found.stds
+
+    @property
+    def innovations(self) -> np.ndarray:
+        """Measurement minus prediction, (K + 1, m), NaN if missing."""
+        return self.found.innovations
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the scored rows; NaN for a filter without a covariance."""
+        return self.findings.log_likelihood
+
+    def sentences(self) -> list[str]:
+        """Findings in the log, and what the innovations say about filter and model."""
+        return verdict(self.found, self.findings)
+
+    def alarms(self, monitor: Monitor | Mapping | float = 100_000.0, *, isolate: bool = False) -> LogAlarms:
+        """Tests of the sensors by the innovations (docs/monitoring.md).
+
+        Args:
+            monitor: a `filters.monitoring.Monitor`, a mapping of its attributes, or steps between false alarms.
+            isolate: whether to run the filter also without each channel, and name the faulty one.
+
+        Raises:
+            ValueError: for a wrong monitor, a filter without a covariance, or isolation of the only channel.
+        """
+        return alarms_of(self.found, monitor_of(monitor) or Monitor(), self.findings.first, isolate=isolate)
+
+    def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
+        """An output of the model, such as "T", at the estimates, (K + 1,), and its standard deviation."""
+        return self.found.output(symbol)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row for each time: inputs, measurements, references, estimates, standard deviations and innovations.
+
+        Raises:
+            ValueError: if pandas is not installed.
+        """
+        return frame(dict(columns_of(self.found)), "time_s")
+
+    def save(self, path: str | Path) -> Path:
+        """Write the same columns to a .csv, .parquet or .npz file; return the path.
+
+        Raises:
+            ValueError: for another ending, or if the file cannot be written.
+        """
+        write_columns(path, columns_of(self.found), again=True)
+        return Path(path)
+
+    def plot_states(self) -> Figure:
+        """Estimates of states and outputs over time beside the references, and the innovations below."""
+        from filters.logs.figure import draw_log
+
+        smoothed = ", smoothed," if self.found.smoothed else ""
+        return drawn(draw_log(self.found, f"{self.filter.name}{smoothed} on {Path(self.log.name).name}"))
+
+    def plot_innovations(self) -> Figure:
+        """Innovations of each channel over time, in the 95 % band that the filter expects."""
+        from filters.logs.figure import draw_log
+
+        return drawn(draw_log(self.found, f"{self.filter.name} on {Path(self.log.name).name}", states=False))
+
+    def __repr__(self) -> str:
+        what = f"{self.filter.name}{', smoothed,' if self.found.smoothed else ''} on {self.log.name}"
+        rows, told = self.log.steps + 1, self.findings
+        if isnan(told.mean_nis):
+            return f"LogEstimates({what}: {rows} rows)"
+        low, high = told.nis_band
+        nis = f"mean NIS over channels {told.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
+        return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(told.log_likelihood)})"
+
+    def _repr_html_(self) -> str:
+        told, rows = self.findings, []
+        for what, some in (("prediction less measurement", told.predictions), ("less reference", told.references)):
+            for one in some:
+                rows.append([what, one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", one.rows])
+        return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows, " ".join(self.sentences()))
+
 
 if TYPE_CHECKING:
     from tuning.api.study import Study

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from tuning.api.held_out import HeldOut, on_held_out
 from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for
-from tuning.api.study import Study
-from tuning.api.user_choice import is_own, user_choice
+from tuning.api.study import Study, is_own, user_choice
 from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.augmented import constants_in, suited

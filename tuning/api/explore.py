@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from thruster_env.core.checks import at_least
 from tuning.api.evaluate import subject_of
 from tuning.api.problems import problem_of
-from tuning.api.study import Study
-from tuning.api.user_choice import is_own
+from tuning.api.study import Study, is_own
 from tuning.exploring.bench import Bench
 
 if TYPE_CHECKING:

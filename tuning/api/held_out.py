@@ -22,9 +22,8 @@ from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem
+from tuning.reporting.choice_words import gains, model_doubts, residual_sentences
 from tuning.reporting.error_tables import comparison_table
-from tuning.reporting.gains import gains
-from tuning.reporting.residual_words import model_doubts, residual_sentences
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -144,7 +143,7 @@ class HeldOut:
         Raises:
             ValueError: without truth, since there is no RMSE.
         """
-        from tuning.reporting.figures import draw_comparison
+        from tuning.reporting.search_figures import draw_comparison
 
         name = self.choice.name
         return drawn(draw_comparison(self.comparison, f"{label_of(name)} on {self.problem.name}", name))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import io
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -21,9 +23,47 @@ from rich.text import Text
 from filters.estimators.find import label_of
 from thruster_env.core.checks import short_repr
 from thruster_env.core.progress import listening
-from tuning.api.notebook import NotebookLine
 from tuning.evaluation.knowledge import TUNING
 from tuning.search.interruption import STOPPING
+
+# A line of progress in a notebook without ipywidgets, which rich needs there: one output, redrawn.
+
+
+CONTROLS = re.compile(r"\x1b\[[^@-~]*[@-~]")  # cursor, colours and the like
+ERASED = "\x1b[2K"
+
+
+class NotebookLine(io.StringIO):
+    """A file for a console of rich: the terminal's last line becomes a notebook's output."""
+
+    def __init__(self) -> None:
+        """Begin without an output; the first text makes one."""
+        super().__init__()
+        self._handle: Any = None
+        self._line = ""
+
+    def write(self, text: str) -> int:
+        """Show the last line of a text, or nothing where lines were erased."""
+        lines = [line.rstrip() for line in re.split(r"[\r\n]+", CONTROLS.sub("", text)) if line.strip()]
+        if lines or ERASED in text:
+            self._show(lines[-1] if lines else "")
+        return len(text)
+
+    def isatty(self) -> bool:
+        """True: lines are redrawn."""
+        return True
+
+    def _show(self, line: str) -> None:
+        from IPython.display import display
+
+        if line == self._line:
+            return
+        self._line, content = line, {"text/plain": line}
+        if self._handle is None:
+            self._handle = display(content, raw=True, display_id=True)
+        else:
+            self._handle.update(content, raw=True)
+
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -77,7 +117,7 @@ def trial_bar(
         before: number of trials already finished.
         console: where it is shown.
     """
-    from tuning.search.filter_types import filter_types_running
+    from tuning.search.among_types import filter_types_running
 
     title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
@@ -115,7 +155,7 @@ def trial_bar(
 def _best(trials: Sequence[FrozenTrial], plan: Plan) -> str:
     """The first objective of the best trial, of a likelihood log L itself; a dash before there is one."""
     from tuning.search.objectives import PROPER, reported, reported_name
-    from tuning.search.outcome import best_trial
+    from tuning.search.trials import best_trial
 
     best = best_trial(trials)
     if best is None:

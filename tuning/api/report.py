@@ -15,13 +15,12 @@ from thruster_env.core.files import check_target, write_whole
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.study import Study
-from tuning.evaluation.stored import sizes_as_data
+from tuning.evaluation.summary import sizes_as_data
 from tuning.problems.problem import Problem
-from tuning.reporting.report import write_report
+from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file
-from tuning.reporting.two_studies import Source, write_two_studies
+from tuning.search.enqueued import SIZES
 from tuning.search.quiet import quiet_optuna
-from tuning.search.sizing import SIZES
 from tuning.search.storage import open_storage, storage_text
 
 STUDIES = "out/studies.journal"  # where studies are unless it is told

@@ -14,6 +14,7 @@ from filters.wrapped import wrapped_variances
 from thruster_env.auv.channels import MAX_CHANNELS, STATES
 from thruster_env.auv.engine.simulation import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
+from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import (
     DEFAULT_DT,
     DEFAULT_PROCESS_NOISE,
@@ -23,14 +24,50 @@ from thruster_env.auv.plant import (
     make_plant,
     plant_data,
 )
-from thruster_env.core.checks import one_of, positive, short_repr, vector
+from thruster_env.core.checks import at_least, one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.effects.effects import set_field
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.auv.excitation import commands_of
 from tuning.problems.data import Data
-from tuning.problems.plain import plain
+from tuning.problems.excitation import EXCITATIONS, Excitation
 from tuning.problems.problem import GIVEN, PATH_BOUND
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import BaseScenario, plain
+
+# Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers.
+
+
+TORQUE = 1  # index of K_prop among the inputs of a manoeuvre
+
+
+@EXCITATIONS.register("manoeuvre")
+@dataclass(frozen=True)
+class OfManoeuvre(Excitation):
+    """Thrust and planes of one of the vehicle's manoeuvres, the same for every seed; the last values are held."""
+
+    path: str = "IV"
+
+    def __post_init__(self):
+        """Check the arguments."""
+        set_field(self, "path", one_of("path", self.path, tuple(MANOEUVRES)))
+
+    def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
+        """Inputs (B, steps, count): with the propeller's torque if there are four of them, without if three."""
+        if count not in (3, 4):
+            raise ValueError(
+                f"the excitation 'manoeuvre' must be a vehicle's, with 3 or 4 inputs, but got {count}"
+            )
+        manoeuvre = MANOEUVRES[self.path]
+        times = np.minimum((np.arange(steps) + 0.5) * dt, manoeuvre.duration)
+        each = np.array([manoeuvre.inputs(time) for time in times.tolist()])
+        each = each if count == 4 else np.delete(each, TORQUE, axis=1)
+        return np.broadcast_to(each, (len(keys), *each.shape)).copy()
+
+
+def commands_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
+    """Thrust, the torque where it is an input, and planes (B, steps, p), clipped to the limits of the env."""
+    low, high = plant.input_limits
+    return np.clip(excitation.inputs(keys, steps, plant.dt, len(plant.inputs)), low, high)
+
 
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
@@ -187,3 +224,21 @@ class Scenario(BaseScenario):
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         measurements = np.where(found.valid, found.measurements, np.nan)  # NaN: missing
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
+
+
+# The scale of a vehicle's scenario: standard deviations by the Riccati equation along noise-free paths.
+
+
+SEQUENCES = 200  # input sequences for a stored scale
+
+
+def computed_scale(scenario: Scenario, sequences: int = SEQUENCES) -> np.ndarray:
+    """The scale (n,) of a scenario, its bound over the seeds 0, 1, 2, ...
+
+    Raises:
+        ValueError: if it is zero or not finite, as it is without any noise.
+    """
+    scale = scenario.bound(scenario.data(range(at_least("sequences", sequences, 1))))
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise ValueError(f"scale must be positive in every state, but the bound is {scale.tolist()}")
+    return scale

@@ -12,10 +12,9 @@ import sys
 from typing import Any
 
 from thruster_env.auv.plant import make_plant
-from tuning.auv.excitation import OfManoeuvre
-from tuning.auv.scale import computed_scale
-from tuning.auv.scenario import Scenario
+from tuning.auv.scenario import OfManoeuvre, Scenario, computed_scale
 from tuning.problems.excitation import Levels
+from tuning.problems.files import find_in
 
 PLANE = math.radians(6.0)
 SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=60, longest=160)
@@ -222,3 +221,16 @@ def main(names: list[str]) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1:])
+
+
+# The vehicle's scenarios by name or file, for `tuning.problems.find`.
+
+
+__all__ = ["NAMES", "NOMINAL", "Scenario", "computed_scale", "find_scenario"]
+NAMES = tuple(SCENARIOS)
+NOMINAL = "auv:motion"
+
+
+def find_scenario(name: str) -> Scenario:
+    """A scenario by its name, or from a file that ends in .toml; ValueError for another."""
+    return find_in(SCENARIOS, Scenario, "the vehicle's", name)

@@ -12,12 +12,11 @@ import typer
 from filters.estimators.find import is_trained
 from filters.registry import FILTERS, filter_type
 from thruster_env.core.checks import at_least
-from tuning.api.compare import run_comparison
-from tuning.api.comparison import INTERRUPTED, left_out_lines
+from tuning.api.compare import INTERRUPTED, left_out_lines, run_comparison
 from tuning.cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.cli.problems import PROBLEMS
-from tuning.evaluation.fitting import DEFAULT_FILTERS, MOST_STATES
+from tuning.evaluation.compare import DEFAULT_FILTERS, MOST_STATES
 from tuning.evaluation.knowledge import KNOWS
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.augmented import unknown_in

@@ -18,18 +18,17 @@ from thruster_env.core.text_tables import table
 from tuning.api.run import Tuning
 from tuning.cli.options import JsonOption, SeedOption
 from tuning.cli.output import emit, working
-from tuning.cli.tune import tune
-from tuning.cli.tuning_report import as_json
+from tuning.cli.tune import as_json, tune
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label
 from tuning.reporting.error_tables import above_bound, consistency_cells
-from tuning.reporting.figures import comparison_figure, history_figure
 from tuning.reporting.report import Report, write_report
+from tuning.reporting.search_figures import comparison_figure, history_figure
 from tuning.reporting.time_figures import estimates_figure
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import AUTO
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs/tuning.md
 BUDGET = 1.0  # us/step of the filters among which the second study chooses

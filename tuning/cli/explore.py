@@ -17,8 +17,7 @@ import typer
 
 from tuning.api.evaluate import subject_of
 from tuning.api.explore import NEEDS
-from tuning.cli.log_options import BlockOptions, GridOptions, with_groups
-from tuning.cli.log_problems import problems_of
+from tuning.cli.log_options import BlockOptions, GridOptions, problems_of, with_groups
 from tuning.cli.options import (
     FILTER_HELP,
     INPUT,

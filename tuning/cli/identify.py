@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import json as json_module
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
+from rich.console import RenderableType
 from rich.text import Text
 
-from thruster_env.thruster.preset_file import is_file
+from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.plots import save_figure
+from thruster_env.core.text_tables import table
+from thruster_env.logs.log import Log
+from thruster_env.thruster.logged import Recorder
+from thruster_env.thruster.parameters import ThrusterParameters, preset_parameters
+from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.preset_file import PresetFile, is_file, write_preset
 from tuning.api.identify import identified
-from tuning.cli.identified import as_json, report, write_files
 from tuning.cli.log_options import GridOptions, with_groups
 from tuning.cli.options import (
     A_LOG,
@@ -26,11 +36,147 @@ from tuning.cli.options import (
     filter_option,
 )
 from tuning.cli.output import announce_compilation, check_picture, check_targets, emit, progress_console
-from tuning.cli.to_identify import names_of, numbers_of, ranges_of
+from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.identification.identify import STARTS
-from tuning.identification.profiles import profiles
-from tuning.logs.identify import family_of, split_runs
-from tuning.logs.read import pairs
+from tuning.identification.identify import identify as identify_logs
+from tuning.identification.profiles import Profile, profile_figure, profiles
+from tuning.identification.result import Identification
+from tuning.identification.validation import Validation, fall_sentence
+from tuning.logs.identify import family_of, remarks, split_runs, write_found
+from tuning.logs.read import pairs, read_named
+from tuning.problems.parameter import Parameter
+from tuning.search.parameters import index_pairs
+from tuning.thruster.identification import ThrusterFamily
+
+# What `thruster identify` prints and writes.
+
+
+def report(
+    found: Identification,
+    checked: Mapping[str, Validation],
+    runs: Sequence[Log],
+    proving: Sequence[Log],
+    files: Sequence[str],
+) -> list[RenderableType]:
+    """Tables and sentences for the terminal."""
+    units = {one.name: one.unit for one in found.objective.coordinates.free}
+    rows = []
+    for name in found.names:
+        known = "yes" if found.determined[name] else "at the end" if found.at_end[name] else "no"
+        numbers = found.start[name], found.values[name], found.standard_errors[name]
+        test = found.null_tests.get(name)
+        without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
+        label = index_pairs(name) + (f" [{units[name]}]" if units[name] else "")
+        rows.append([label, *(f"{v:.5g}" for v in numbers), known, *without])
+    count, steps = len(runs), sum(log.steps for log in runs)
+    title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
+    shown = [table(title, ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"], rows)]
+    where = (
+        f"Validation on {'; '.join(log.name for log in proving)}"
+        if proving
+        else "On the runs used for identification"
+    )
+    rows = []
+    for symbol in checked["start"].one_step:
+        for what, part in (("one step", "one_step"), ("simulation", "simulation")):
+            rows.append(
+                [f"RMSE, {what}, {symbol}", *(f"{getattr(v, part)[symbol]:.4g}" for v in checked.values())]
+            )
+        rows.append([f"fit of the simulation, {symbol} [%]", *(f"{v.fit[symbol]:.1f}" for v in checked.values())])
+    rows.append(["mean NIS over channels", *(f"{v.nis:.3g}" for v in checked.values())])
+    rows.append(["log-likelihood", *(f"{v.log_likelihood:.6g}" for v in checked.values())])
+    shown.append(table(where, ["", *checked], rows))
+    return [
+        *shown,
+        *found.sentences(),
+        *(fall_sentence(checked) if proving else []),
+        *remarks(runs, proving, found),
+        *(f"wrote {path}" for path in files),
+    ]
+
+
+def write_files(
+    found: Identification,
+    family,
+    made: Sequence[Profile],
+    out: Path | None,
+    plot: Path | None,
+    logs: Sequence[str],
+) -> list[str]:
+    """Write the preset file of a thruster or the values of a model, and the profiles; return the paths."""
+    files = []
+    if out is not None:
+        write_found(out, found, family, logs)
+        files.append(str(out))
+    if plot is not None and made:
+        save_figure(profile_figure(found, made), plot)
+        files.append(str(plot))
+    return files
+
+
+def as_json(
+    found: Identification,
+    checked: Mapping[str, Validation],
+    made: Sequence[Profile],
+    runs: Sequence[Log],
+    proving: Sequence[Log],
+    files: Sequence[str],
+) -> dict:
+    """The result as plain data."""
+    return {
+        "logs": [log.name for log in runs],
+        "held_out": [log.name for log in proving],
+        "values": found.values,
+        "start": found.start,
+        "standard_errors": found.standard_errors,
+        "determined": found.determined,
+        "at_end": found.at_end,
+        "left_out": {name: one._asdict() for name, one in found.null_tests.items()},
+        "begun_elsewhere": [runs[place].name for place in found.begun_elsewhere],
+        "correlations": {"names": found.names, "matrix": found.correlations},
+        "trade_off": found.traded,
+        "least_known_direction": found.least_determined,
+        "log_likelihood": found.log_likelihood,
+        "log_likelihood_at_start": found.start_log_likelihood,
+        "optima": [one._asdict() for one in found.optima],
+        "starts_that_agree": found.agreement,
+        "evaluations": found.evaluations,
+        "samples_left_out": found.left_out,
+        "interrupted": found.interrupted,
+        "validation": {name: one._asdict() for name, one in checked.items()},
+        "profiles": [{**one._asdict(), "interval": one.interval} for one in made],
+        "sentences": [
+            *found.sentences(),
+            *(fall_sentence(checked) if proving else []),
+            *remarks(runs, proving, found),
+        ],
+        "files": list(files),
+    }
+
+
+# Options of an identification from the command line: ranges, starts and names.
+
+
+def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+    """Ranges from texts LOW:HIGH; ValueError for another form."""
+    found = {}
+    for name, text in given.items():
+        low, colon, high = text.partition(":")
+        if not colon:
+            raise ValueError(f"--range must have the form NAME=LOW:HIGH, but got {short_repr(f'{name}={text}')}")
+        found[name] = finite(f"low of {name}", low), finite(f"high of {name}", high)
+    return found
+
+
+def numbers_of(option: str, given: Mapping[str, str]) -> dict[str, float]:
+    """Numbers by name."""
+    return {name: finite(f"{option} {name}", text) for name, text in given.items()}
+
+
+def names_of(text: str | None) -> list[str]:
+    """Names from a text separated by commas."""
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
+
 
 INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
@@ -150,8 +296,6 @@ def command(
     if plot is not None:
         check_picture(plot, "--plot")
     if bollard is not None:
-        from tuning.cli.bollard import check_of_table, identify_bollard
-
         for_logs: dict[str, Any] = {
             "--free": free,
             "--model": reading.model,
@@ -190,3 +334,136 @@ def command(
     emit(report(found, checked, runs, proving, files), data, json)
     if found.interrupted:
         sys.exit(INTERRUPTED)
+
+
+# `thruster identify --bollard TABLE.csv`: a thruster from a static table, and its time constants from a step.
+
+
+INFERRED = "t200"  # whose other parameters are taken where no preset is given
+MOTOR = ("motor_damping", "voltage_gain", "load_gain")  # whose ratios a table fixes
+RATE = Parameter("motor_rate", 0.05, 20.0, default=1.0)  # the factor on all three
+
+
+def identify_bollard(
+    path: Path,
+    step: Path | None,
+    logs: Sequence[Path] | None,
+    preset: str | None,
+    out: Path,
+    json: str | None,
+    **options,
+) -> None:
+    """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
+
+    The table gives thrust, torque and speed in steady state; an optional step response how fast motor and flow
+    follow. Everything else is taken from a preset.
+
+    Args:
+        path: the table, with the columns pwm_us, rpm, current_A, voltage_V, force_kgf.
+        step: a log of voltage and motor speed.
+        logs: must be none.
+        preset: whose other parameters are taken.
+        out: the preset file.
+        json: file for the result as JSON.
+        **options: how the step response is read, as `read_named` takes them.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if logs:
+        raise ValueError(f"give either logs or --bollard TABLE.csv, but got both, {logs[0]} and {path}")
+    if not is_file(out):
+        raise ValueError(f"a preset file must end in .toml, but got {str(out)!r}")
+    check_targets((out,), json, read=(path, step, preset))
+    read = read_table(path)
+    supplies = np.unique(read.supply).tolist()
+    held_out = supplies[2:-1:2] or supplies[1:2]  # between others, so that nothing is extrapolated
+    found = identify(read, held_out, preset_parameters(preset or INFERRED))
+    errors, parameters, timed = relative_errors(found, read, held_out), found.thruster, None
+    if step is not None:
+        announce_compilation()
+        timed, parameters = from_step(step, parameters, preset or INFERRED, **options)
+    identified = {
+        "table": path.name,
+        "held_out_supplies": held_out,
+        **{name: float(value) for name, value in found.pulse_widths._asdict().items()},
+    }
+    write_preset(out, PresetFile(parameters, identified=identified), "A thruster from its bollard table.")
+    data = {
+        "thruster": parameters._asdict(),
+        "pulse_widths": found.pulse_widths._asdict(),
+        "held_out_supplies": held_out,
+        "errors": errors,
+        "step": timed and {"values": timed.values, "standard_errors": timed.standard_errors},
+        "files": [str(out)],
+    }
+    emit(_report(found, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
+
+
+def check_of_table(for_logs: Mapping[str, Any]) -> None:
+    """Raise ValueError for an option of logs if a table is given in their place.
+
+    Args:
+        for_logs: values of such options by name, empty or false where they are not given.
+    """
+    for name, value in for_logs.items():
+        if value:
+            got = "" if value is True else f" {', '.join(map(str, value)) if isinstance(value, list) else value}"
+            raise ValueError(f"{name} must come with logs, because --bollard fits a table, but got {name}{got}")
+
+
+def from_step(
+    path: Path, parameters: ThrusterParameters, preset: str, **options
+) -> tuple[Identification, ThrusterParameters]:
+    """The motor's rate and the mass of the water from a step response, by maximum likelihood.
+
+    Args:
+        path: a log of the voltage and the motor's speed.
+        parameters: from the table.
+        preset: a thruster with the same quantities.
+        **options: columns, clock offsets and the like, as `read_named` takes them.
+
+    Raises:
+        ValueError: if the log cannot be read, or the voltage does not change in it.
+    """
+    log, _ = read_named(path, preset, sensors=["speed"], **options)
+    if not np.ptp(log.inputs):
+        raise ValueError(f"a step response must have a step of the voltage, but {path} has none")
+    largest = float(np.abs(log.inputs).max())
+    plant = make_plant(parameters, log.dt, max_voltage=max(largest, 1.0), sensors=["speed"])
+    family = ThrusterFamily([log], plant, Recorder(), (*MOTOR, "added_mass"))
+
+    def values_of(motor_rate: float, **values: float) -> dict[str, float]:
+        return {**{name: motor_rate * getattr(parameters, name) for name in MOTOR}, **values}
+
+    def model(**values: float):
+        return family.model(**values_of(**values))
+
+    free = [RATE, *(one for one in family.free if one.name not in MOTOR)]
+    found = identify_logs(family.data, model, free)
+    return found, family.parameters(values_of(**found.values))
+
+
+def _report(
+    found: Identified, errors: dict, held_out, timed: Identification | None, out: Path
+) -> list[RenderableType]:
+    rows = [[name, f"{getattr(found.thruster, name):.5g}"] for name in FITTED]
+    rows += [[name, f"{value:.5g}"] for name, value in found.pulse_widths._asdict().items()]
+    part: list[RenderableType] = [table("Fitted to the table", ["", "value"], rows)]
+    rows = [
+        [quantity, *(f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values())]
+        for quantity, groups in errors.items()
+    ]
+    columns = ["", "fitted\nahead", "fitted\nastern", "held out\nahead", "held out\nastern"]
+    supplies = ", ".join(f"{supply:g}" for supply in held_out)
+    title = f"Relative errors, median (90th percentile); held out: {supplies} V"
+    part.append(table(title, columns, rows))
+    if timed is not None:
+        rows = [[name, f"{timed.values[name]:.5g}", f"{timed.standard_errors[name]:.3g}"] for name in timed.names]
+        part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
+    else:
+        part.append(
+            "A static table does not determine time constants: those of the preset are kept. --step LOG "
+            "finds them from a log of voltage and motor speed."
+        )
+    return [*part, f"wrote {out}"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, signature
@@ -12,6 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from filters.starts import STARTS
+from thruster_env.core.checks import short_repr
 from thruster_env.logs.recorders.one_clock import STAMPS
 from tuning.cli.options import (
     A_LOG,
@@ -22,6 +23,10 @@ from tuning.cli.options import (
     SensorOption,
     spelt,
 )
+from tuning.logs.problem import log_problem
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
+from tuning.thruster.logs import of_preset
 
 
 def with_groups(command: Callable) -> Callable:
@@ -177,3 +182,27 @@ class BlockOptions:
         """Other arguments of `tuning.logs.problem.log_problem`; None where an option is not given."""
         cuts = {"held_out": self.held_out, "blocks": self.blocks, "lead": self.lead, "start": self.start}
         return {**cuts, "hold_gaps": self.hold_gaps or None}
+
+
+# Recorded logs as the problem of a study: from the options of a command, or as a tuned file names them.
+
+
+def problems_of(
+    names: Sequence[str] | None, logs: BlockOptions, reading: GridOptions, default: str
+) -> tuple[Problem, ...]:
+    """The problems of a study: logs with their options, or problems by name."""
+    options = {**reading.named(), **logs.named()}
+    given = {name: value for name, value in options.items() if value is not None}
+    if logs.log:
+        if names:
+            raise ValueError(
+                f"a study must be of --log or of --problem, but got both, {logs.log[0]} and {names[0]}"
+            )
+        return (log_problem(logs.log, **given),)
+    preset = given.pop("preset", None)
+    if given:
+        first = next(iter(given))
+        option = {"sensors": "sensor", "columns": "column", "grid": "no-grid"}.get(first, first).replace("_", "-")
+        value = "" if first == "grid" else f" {short_repr(given[first])}"
+        raise ValueError(f"--{option} must come with --log, but got --{option}{value} without one")
+    return tuple(of_preset(find_problem(name), preset) for name in names or [default])

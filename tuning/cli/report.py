@@ -12,9 +12,8 @@ from tuning.cli.output import announce_compilation, emit, working
 from tuning.cli.tune import DEFAULT_STORAGE
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
-from tuning.reporting.report import write_report
+from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file
-from tuning.reporting.two_studies import Source, write_two_studies
 from tuning.search.study import quiet_optuna
 
 

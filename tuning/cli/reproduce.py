@@ -20,9 +20,17 @@ from tuning.cli.output import announce_compilation, check_picture, emit, progres
 from tuning.cli.vehicle import reproduce_vehicle
 from tuning.experiments import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from tuning.experiments.benchmark import RUNS as BENCHMARK_RUNS
-from tuning.experiments.comparison import MEMBERS, MOST_RUNS, RUNS, compare_all
-from tuning.experiments.findings import findings, general_statements, study_statements
-from tuning.experiments.series import all_series, series_figure
+from tuning.experiments.thruster_papers import (
+    MEMBERS,
+    MOST_RUNS,
+    RUNS,
+    all_series,
+    compare_all,
+    findings,
+    general_statements,
+    series_figure,
+    study_statements,
+)
 from tuning.experiments.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
 from tuning.experiments.vehicle.printed import RUNS as VEHICLE_RUNS
 

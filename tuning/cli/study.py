@@ -95,11 +95,10 @@ def policies(
     from tuning.policies.extras import check_installed
 
     check_installed()
-    from tuning.policies.comparison.answers import answers
     from tuning.policies.comparison.plan import QUICK, Comparison
     from tuning.policies.comparison.report import PAGE, check_page, write_report
     from tuning.policies.comparison.runs import run_comparison
-    from tuning.policies.comparison.tables import HEADER, rows_of, summary_rows
+    from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
     given: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}

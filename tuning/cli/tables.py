@@ -11,7 +11,7 @@ from thruster_env.core.text_tables import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
-from tuning.search.filter_types import TypeResult
+from tuning.search.among_types import TypeResult
 from tuning.search.objectives import LIKELIHOOD, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs
 from tuning.search.plan import Plan

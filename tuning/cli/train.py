@@ -25,7 +25,7 @@ from tuning.policies.extras import check_installed
 from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.plants.find import PLANTS, TASKS, plant_of
 from tuning.policies.setup import TrainingConfiguration, make_configuration
-from tuning.problems.plain import plain
+from tuning.problems.scenario import plain
 from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from thruster_env.core.text_tables import table
 from tuning.cli.options import CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from tuning.cli.output import announce_compilation, emit, working
-from tuning.evaluation.verify import TOLERANCE, Verification, verify
+from tuning.evaluation.tuned import TOLERANCE, Verification, verify
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 

@@ -65,11 +65,9 @@ def command(
     """
     from thruster_env.core.files import write_whole
     from thruster_env.core.text_tables import with_tables
-    from tuning.experiments.ways.figure import figure
-    from tuning.experiments.ways.predictions import PREDICTIONS
-    from tuning.experiments.ways.protocol import FAST, Protocol
+    from tuning.experiments.ways.problems import FAST, PREDICTIONS, Protocol
     from tuning.experiments.ways.runs import run_protocol
-    from tuning.experiments.ways.tables import tables
+    from tuning.experiments.ways.tables import figure, tables
 
     protocol = FAST if quick else Protocol()
     given: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}

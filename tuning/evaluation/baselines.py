@@ -17,10 +17,10 @@ from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
-from tuning.problems.coordinates import Coordinates
+from tuning.problems.parameter import Coordinates
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.objectives import LARGEST, nis_ratio
+from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import Choice, given_choice, oracle_choice, untuned_choice
 

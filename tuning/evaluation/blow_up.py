@@ -5,8 +5,7 @@ from __future__ import annotations
 from filters.consistency.nees import blow_up_sentence
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from tuning.problems.data import Data
-from tuning.problems.in_parts import estimates_in_parts
+from tuning.problems.data import Data, estimates_in_parts
 
 RUNS = 20  # that tell
 

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
 from filters.consistency.intervals import Interval, rmse_ratios, slightly
 from filters.engine.batch import run
+from filters.estimators.find import label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
-from filters.registry import filter_type, make_filter
+from filters.registry import FILTERS, filter_type, make_filter
 from thruster_env.core.checks import one_of
+from tuning.evaluation.baselines import rule_of_thumb
 from tuning.evaluation.evaluate import (
     Evaluation,
     compute_metrics,
@@ -30,12 +32,11 @@ from tuning.evaluation.knowledge import KNOWLEDGE, STUDY_TRIALS, Known, known
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
 from tuning.problems.augmented import beliefs_of
 from tuning.problems.check import data_of
-from tuning.problems.data import Data
-from tuning.problems.in_parts import estimates_in_parts
+from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.forgetting import time_constants_on
 from tuning.search.interruption import stop_on_interrupt
+from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.space import Choice
 
 VERDICTS = {  # in sentences
@@ -293,3 +294,44 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
         found.append(metrics_by_run(filter_, estimates, some, scale=scale))
         started = time.perf_counter()
     return joined(found), seconds
+
+
+# Which filters can run on all problems of a comparison, which do so by default, and why others do not.
+
+
+DEFAULT_FILTERS = ("ekf", "enkf", "pf")
+PARTICLES = "pf"
+MOST_STATES = 6  # to which a thousand particles are spread by default: the number needed grows exponentially
+
+
+def default_filters(problems: Sequence[Problem]) -> tuple[list[str], dict[str, str]]:
+    """The filters of a comparison in which none is named, and by label why one is not among them."""
+    n, problem = max(((len(one.quantities.states), one.name) for one in problems), default=(0, ""))
+    if n <= MOST_STATES:
+        return list(DEFAULT_FILTERS), {}
+    why = f"by default particles are for up to {MOST_STATES} states, but {problem} has {n} (--filter {PARTICLES})"
+    return [name for name in DEFAULT_FILTERS if name != PARTICLES], {PARTICLES: why}
+
+
+def fitting(names: Iterable[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
+    """The filters that accept the models of all problems, and by label why the others do not.
+
+    Args:
+        names: of filters, or estimators.
+        problems: the problems of the comparison.
+
+    Raises:
+        ValueError: for an estimator that does not accept a model, or cannot be read: only filters are left out.
+    """
+    kept: list[Any] = []
+    left_out: dict[str, str] = {}
+    for name in names:
+        try:
+            for problem in problems:
+                rule_of_thumb(name, problem).filter(problem)
+            kept.append(name)
+        except ValueError as error:
+            if not isinstance(name, str) or name not in FILTERS:
+                raise
+            left_out[label_of(name)] = str(error)
+    return kept, left_out

@@ -28,8 +28,7 @@ from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
-from tuning.problems.data import Data
-from tuning.problems.in_parts import estimates_in_parts
+from tuning.problems.data import Data, estimates_in_parts
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)

@@ -22,14 +22,14 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.residuals import model_error
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.measures import measured
 from tuning.search.objectives import LIKELIHOOD, SCORE
-from tuning.search.outcome import best_trial
+from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.plan import Plan
 from tuning.search.quiet import quiet_optuna
 from tuning.search.space import Choice, has_search_space
 from tuning.search.study import open_study, run_trials
+from tuning.search.trials import best_trial
 
 OF_FILE, OF_FILTER, STUDY = "tuned", "own", "study"
 STUDY_TRIALS = 20  # of a comparison's study, if no number is given

@@ -14,11 +14,10 @@ from filters.consistency.intervals import Interval
 from filters.posterior import ALL_UP_TO
 from thruster_env.core.progress import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
-from tuning.problems.data import Data
-from tuning.problems.in_parts import estimates_in_parts
+from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import size_ladder
 from tuning.search.objectives import MOST_PRICE, nis_violation
+from tuning.search.parameters import size_ladder
 from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import Choice
 

@@ -4,8 +4,8 @@ Papers are in `authorYEAR.py` each; those on the underwater vehicle are done aga
 are modules with a `BENCHMARK`, and a `problem` for `thruster tune --problem tuning.experiments.NAME:problem`.
 """
 
-from tuning.experiments.kiki2020 import TABLE as KIKI_2020
-from tuning.experiments.nurhadi2022 import TABLE as NURHADI_2022
+from tuning.experiments.thruster_papers import KIKI2020 as KIKI_2020
+from tuning.experiments.thruster_papers import NURHADI2022 as NURHADI_2022
 
 STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
 BENCHMARKS = {

@@ -7,16 +7,33 @@ N(0, 2^2) along the path and uniform within +-15 across it. Only positions count
 
 Source: the example of I. Greenberg, N. Yannay, S. Mannor (2023), "Optimization or architecture: how to hack Kalman
 filtering", NeurIPS, arXiv 2310.00675, in their package Optimized-Kalman-Filter; written anew.
+
+    python -m tuning.experiments.lidar [docs/ways.md]  # the page, whose table "okf" is written anew
+
+The package is `Optimized-Kalman-Filter` (PyPI), in the extra `peers`; without it the rest is computed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import io
+import sys
+import time
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from filters import affine_model
+from filters.consistency.intervals import Interval
+from thruster_env.core.text_tables import markdown_table, print_or_write
+from tuning.evaluation.baselines import with_covariances
+from tuning.evaluation.evaluate import Evaluation, evaluate, mse
 from tuning.problems.runs_problem import RunsProblem
+from tuning.search.space import Choice, untuned_choice
+from tuning.ways.registry import find_way
+from tuning.ways.task import Task
 
 RANGE, BEARING = 2.0, np.deg2rad(1.5)  # deviations [m, rad]
 FIELD, SPEEDS = 600.0, (30.0, 90.0)  # [m], [m/s]
@@ -91,3 +108,140 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
         name="lidar",
         about="turning targets seen by a lidar; noise in range and bearing, R in Cartesian axes",
     )
+
+
+# OKF's lidar: our ways of tuning beside the package that the example is from, in its own filter, on equal data.
+
+
+LEARN, TEST = 700, 300  # runs of a draw
+DRAWS = 3
+FULL = {"full_q": True, "full_r": True}
+OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
+IN_A_FIFTH = "the same in a fifth of OKF's time"
+WAYS: Mapping[str, tuple[str, Mapping[str, bool]]] = {  # names of rows, with the way and its options
+    NOISE: ("noise-estimation", FULL),
+    "ours, the way okf": ("okf", FULL),
+    GRADIENT: ("mse", FULL),
+    "-log p(z) by its gradient": ("likelihood", FULL),
+    "EM": ("em", FULL),
+    "log score by its gradient": ("log-score", FULL),
+    "MSE by its gradient, diagonal": ("mse", {}),
+    "log score by its gradient, diagonal": ("log-score", {}),
+}
+RESAMPLES = 2000
+
+
+class Row(NamedTuple):
+    """A way on the runs that are held out, of D draws with B runs each."""
+
+    name: str
+    choices: tuple[Choice, ...]  # of each draw
+    seconds: float  # of processor time for a draw, without compilation
+    squares: np.ndarray  # (D, B) sum over the steps of a run of squared errors of the position
+    steps: np.ndarray  # (D, B)
+    nis: float  # over the number of channels
+    nees: float  # over the number of states
+    log_likelihood: float  # of a held-out run
+
+    @property
+    def mse(self) -> float:
+        """Mean square error of the position over all steps [m^2]."""
+        return float(self.squares.sum() / self.steps.sum())
+
+    def over(self, other: Row) -> Interval:
+        """The ratio of mean square errors, with a 95 % interval by bootstrap over draws, and over runs of each."""
+        generator, (draws, runs) = np.random.default_rng(0), self.steps.shape
+        of_draws = generator.integers(draws, size=(RESAMPLES, draws))[..., None]
+        of_runs = generator.integers(runs, size=(RESAMPLES, draws, runs))
+        ours, theirs = (one.squares[of_draws, of_runs].sum(axis=(1, 2)) for one in (self, other))
+        return Interval(self.mse / other.mse, *np.quantile(ours / theirs, (0.025, 0.975)).tolist())
+
+    @classmethod
+    def pooled(cls, rows: Sequence[Row]) -> Row:
+        """One way on all draws: means of what is not of a run."""
+        columns = zip(*rows, strict=True)
+        names, choices, seconds, squares, steps, *means = (list(column) for column in columns)
+        together = np.concatenate(squares), np.concatenate(steps)
+        nis, nees, likelihood = (float(np.mean(one)) for one in means)
+        return cls(names[0], sum(choices, ()), float(np.mean(seconds)), *together, nis, nees, likelihood)
+
+
+def compared(
+    learn: int = LEARN,
+    test: int = TEST,
+    draws: int = DRAWS,
+    ways: Mapping[str, tuple[str, Mapping[str, bool]]] = WAYS,
+) -> list[Row]:
+    """All ways, and OKF itself where it is installed, on the same runs of some draws."""
+    found = [of_draw(learn, test, seed, ways) for seed in range(draws)]
+    return [Row.pooled(rows) for rows in zip(*found, strict=True)]
+
+
+def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapping[str, bool]]]) -> list[Row]:
+    """All ways on the runs of one seed."""
+    runs = drawn(learn + test, seed)
+    problem, rows = lidar_problem(runs, test), []
+    data, held_out = problem.data(range(learn)), problem.data(range(learn, learn + test))
+    if is_installed():
+        okf_itself(runs[:20], seed)  # packages are loaded
+        begin = time.process_time()
+        q, r = okf_itself(runs[:learn], seed)
+        choice = with_covariances(untuned_choice("kf", problem), q, r)
+        rows.append(row_of(OKF, choice, time.process_time() - begin, problem, held_out))
+    for name, (way, options) in ways.items():
+        task = Task("kf", problem, data, options=options)
+        find_way(way).run(way, task, guarded=False)
+        rows.append(row_of(name, task.best, task.seconds, problem, held_out))
+        if name == GRADIENT and rows[0].name == OKF:
+            fifth = rows[0].seconds / 5.0
+            rows.append(row_of(IN_A_FIFTH, task.best_within(seconds=fifth), fifth, problem, held_out))
+    return rows
+
+
+def row_of(name: str, choice: Choice, seconds: float, problem: RunsProblem, held_out) -> Row:
+    """A choice on held-out runs."""
+    found: Evaluation = evaluate(choice.filter(problem), held_out, problem.scale)
+    steps = held_out.scored_counts
+    squares = steps * np.array([mse(one[None], found.scale) for one in found.mean_squares])
+    nis, nees = found.nis.value / found.expected_nis, found.nees.value / len(found.rmse)
+    return Row(name, (choice,), seconds, squares[None], steps[None], nis, nees, found.log_likelihood)
+
+
+def is_installed() -> bool:
+    """Whether OKF's package is there, with what it imports and does not declare."""
+    return all(importlib.util.find_spec(one) is not None for one in ("okf", "pandas", "seaborn", "torch"))
+
+
+def okf_itself(runs: list[Run], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Q and R of the package's own training, with its defaults: one epoch."""
+    from okf import OKF as OptimizedFilter
+    from okf import train
+    from okf.example.simple_lidar_model import model_args
+
+    np.random.seed(seed)  # its batches are drawn from NumPy's global generator
+    model = OptimizedFilter(**model_args(), optimize=True, model_name="OKF")
+    with contextlib.redirect_stdout(io.StringIO()):
+        train(model, [one.measurements for one in runs], [one.states for one in runs], to_save=False, verbose=0)
+    return model.get_Q(), model.get_R()
+
+
+def markdown(rows: list[Row]) -> str:
+    """The table, with ratios to OKF or, without it, to noise estimation."""
+    first = next((row for row in rows if row.name == OKF), rows[0])
+    heads = ["way", "seconds", "MSE [m^2]", f"over {first.name}", "NIS", "NEES", "log p(z) of a run"]
+    cells = []
+    for row in rows:
+        ratio = row.over(first)
+        said = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]" if row is not first else "1"
+        numbers = f"{row.seconds:.1f}", f"{row.mse:.1f}", said, f"{row.nis:.2f}", f"{row.nees:.2f}"
+        cells.append([row.name, *numbers, f"{row.log_likelihood:.3f}"])
+    return markdown_table(heads, cells)
+
+
+def main() -> None:
+    """Print the table, or write it on a page."""
+    print_or_write("okf", markdown(compared()), sys.argv[1:])
+
+
+if __name__ == "__main__":
+    main()

@@ -5,24 +5,58 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
+
+from optuna.trial import TrialState
 
 from filters.filter import Filter
 from filters.registry import FILTERS
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
-from tuning.exploring.disturbed import disturbed
-from tuning.exploring.exported import command_of, file_of, lines_of
-from tuning.exploring.knobs import Knob, checked_values, knobs_of, marks_of, start_of
-from tuning.exploring.maps import Map, map_of
+from tuning.exploring.exported import Map, command_of, file_of, lines_of, map_of
+from tuning.exploring.knobs import Knob, checked_values, disturbed, knobs_of, marks_of, start_of
 from tuning.exploring.page_data import PageData, page_data
-from tuning.exploring.trials import Trial, trials_of
 from tuning.exploring.view import View, view_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, everything_of, fits, has_search_space, neutral, parameters, untuned_choice
+from tuning.search.study import FINISHED, finished_trials, open_study, quiet_optuna, run_trials
+
+# A study of a bench's filter, trial by trial.
+
+
+class Trial(NamedTuple):
+    """What a trial of a study tried, and what came of it."""
+
+    values: Mapping[str, float]  # by knob
+    score: float  # the study's objective; of a pruned trial that of the seeds that it came to
+    pruned: bool = False
+
+
+def trials_of(plan: Plan, start: Choice, trials: int) -> Iterator[Trial]:
+    """Run a study in memory, and yield each trial as soon as it is finished; it ends where the iterator is closed.
+
+    Args:
+        plan: of the study.
+        start: the first trial.
+        trials: how many it shall have.
+    """
+    quiet_optuna()
+    study, data = open_study("explore", plan, None, start), plan.training_data()
+    finished: list[int] = []  # of the present round, which ends after one trial
+    while finished_trials(study) < trials:
+        finished.clear()
+        if run_trials(study, plan, data, trials, lambda _, count: finished.append(count), lambda: bool(finished)):
+            return
+        last = study.get_trials(deepcopy=False, states=FINISHED)[-1]
+        pruned = last.state == TrialState.PRUNED
+        seen = list(last.intermediate_values.values())
+        score = sum(seen) / len(seen) if pruned and seen else last.values[0]
+        yield Trial(dict(last.params), score, pruned)
+
 
 MOST_SEEDS = 64
 MOST_ACROSS = 128  # values of each number on a map

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from filters.filter import Filter
 from thruster_env.core.checks import short_repr
+from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.exploring.disturbed import AMPLIFIER, SENSORS
+from tuning.exploring.knobs import AMPLIFIER, SENSORS, Knob
+from tuning.problems.data import Data
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.plain import plain
 from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
+from tuning.problems.scenario import plain
+from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
@@ -85,3 +91,43 @@ def _differs(base: Problem, problem: Problem, name: str) -> bool:
 
 def _arguments(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in values.items())
+
+
+# A map: score and NIS of a filter over two of its numbers.
+
+
+class Map(NamedTuple):
+    """Score and NIS at each pair of values of two knobs."""
+
+    x: str  # name of the knob
+    y: str
+    xs: np.ndarray  # (size,), of a whole number its different values, which may be fewer
+    ys: np.ndarray  # (size,)
+    score: np.ndarray  # (y, x); negative log-likelihood of a run where there is no truth
+    nis: np.ndarray  # (y, x), the mean NIS over its expected value: 1 is right; NaN without a covariance
+
+
+def values_along(knob: Knob, size: int) -> np.ndarray:
+    """Values over the range of a knob, on its scale."""
+    found = (np.geomspace if knob.log else np.linspace)(knob.low, knob.high, size)
+    return np.unique(np.rint(found)) if knob.integer else np.clip(found, knob.low, knob.high)
+
+
+def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Filter, Data]], scale) -> Map:
+    """Run a filter at each point of the map.
+
+    Args:
+        x: the knob along the rows.
+        y: the other one.
+        size: number of values of each.
+        case: the filter at a value of each, and its data.
+        scale: of the score, (n,); None without truth.
+    """
+    xs, ys = values_along(x, size), values_along(y, size)
+    found = np.empty((2, len(ys), len(xs)))
+    objective = find_objective(LIKELIHOOD if scale is None else SCORE)
+
+    for row, column in np.ndindex(len(ys), len(xs)):
+        evaluation = values_of(*case(xs[column].item(), ys[row].item()), scale)
+        found[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
+    return Map(x.name, y.name, xs, ys, *found)

@@ -16,8 +16,7 @@ from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
 from tuning.exploring.page_data import PageData
-from tuning.problems.data import Data
-from tuning.problems.in_parts import estimates_on
+from tuning.problems.data import Data, estimates_on
 from tuning.problems.problem import Problem, score_label
 
 LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure

@@ -17,12 +17,11 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.null_tests import NullTest, from_nothing, null_tests
 from tuning.identification.objective import Objective
-from tuning.identification.outliers import ROUNDS, outliers_of, without_outliers
 from tuning.identification.result import Identification, Optimum, covariances_of, identification_of
+from tuning.identification.screening import ROUNDS, outliers_of, without_outliers
 from tuning.identification.starts import starts_of
-from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter
+from tuning.problems.parameter import Coordinates, Parameter
 from tuning.search.interruption import stop_on_interrupt
 
 STARTS = 4  # the given one, and others drawn about it

@@ -10,7 +10,7 @@ import numpy as np
 
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.objective import Objective
-from tuning.problems.coordinates import Coordinates
+from tuning.problems.parameter import Coordinates
 
 LEGS = 25  # iterations of the other parameters, at most
 ROUNDS = 4  # of going on from a better place that a test has found, at most

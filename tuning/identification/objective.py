@@ -18,11 +18,11 @@ from filters.starts import Starts
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.captured import CapturedConstants
+from tuning.identification.family import CapturedConstants
 from tuning.identification.gates import kept_variance
-from tuning.identification.runs import runs_of
-from tuning.problems.coordinates import Coordinates
+from tuning.identification.starts import runs_of
 from tuning.problems.data import Data
+from tuning.problems.parameter import Coordinates
 
 FILTERS = "kf", "ekf"
 STEP = 1e-4  # of differences of the model, in coordinates

@@ -12,7 +12,7 @@ from tuning.identification.gates import lost_information
 from tuning.identification.null_tests import NullTest
 from tuning.identification.objective import Objective
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
-from tuning.problems.coordinates import Coordinates
+from tuning.problems.parameter import Coordinates
 
 WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined parameter may take
 TRADED = 0.95  # correlation from which two parameters are reported to trade off

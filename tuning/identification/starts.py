@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,9 +14,13 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.sensitivity import sensitivity
 from filters.starts import Starts, as_the_prior_says, wide_cov
 from thruster_env.core.angles import difference
+from thruster_env.core.checks import short_repr
+from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import Log
+from thruster_env.logs.steps import in_steps
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems.data import Data
-from tuning.problems.log_parts import LEAD
+from tuning.problems.data import Data, mask_of, padded
+from tuning.problems.log_parts import LEAD, check_times
 
 PART = 4  # a lead-in is LEAD measured rows, at most the run's measured rows divided by this
 LEVEL = 1e-3  # of the test by which a run does not begin as the prior says
@@ -166,3 +171,46 @@ def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> 
     along = scaled @ axes
     distance = (along**2 / np.maximum(values, 1e-10)).sum()
     return bool(distance > chi2.isf(LEVEL, int(some.sum())))
+
+
+# Recorded runs as one batch: runs of different lengths are padded with steps in which nothing is measured.
+
+
+def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
+    """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
+
+    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.steps`).
+
+    Raises:
+        ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.
+    """
+    given = _listed(data)
+    if not given or not all(isinstance(one, Data | Log) for one in given):
+        raise ValueError(f"data must be some of Log or Data, but got {short_repr(data)}")
+    if len(given) == 1 and isinstance(given[0], Data):
+        return given[0].seen
+    check_times([one for one in given if isinstance(one, Log)])
+    inputs: list[np.ndarray] = []
+    measurements: list[np.ndarray] = []
+    for one in given:
+        if isinstance(one, Log):
+            u, z = (one.inputs, one.measurements) if one.stamps is None else in_steps(one)
+            inputs, measurements = [*inputs, u], [*measurements, z]
+            continue
+        for part in map(one.one, range(len(one.seeds))):
+            inputs += list(part.inputs)
+            measurements += list(part.measurements)
+    lengths = list(map(len, measurements))
+    widths = {(u.shape[1], z.shape[1]) for u, z in zip(inputs, measurements, strict=True)}
+    if len(widths) > 1:
+        raise ValueError(f"runs must have the same inputs and measurements, but got {sorted(widths)} of each")
+    rows, seeds = max(map(len, measurements)), tuple(range(len(inputs)))
+    all_inputs, all_measurements = padded(inputs, rows - 1, None), padded(measurements, rows)
+    return Data(seeds, all_inputs, all_measurements, filter_keys(seeds), 0, counted=mask_of(lengths, rows))
+
+
+def _listed(data: Any) -> list[Data | Log]:
+    """One or several runs as a list; empty for what is neither."""
+    if isinstance(data, Data | Log):
+        return [data]
+    return list(data) if isinstance(data, Sequence) else []

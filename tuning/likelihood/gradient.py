@@ -11,9 +11,8 @@ import numpy as np
 from tuning.likelihood.family import check_gradient
 from tuning.likelihood.goal import Goal
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter
+from tuning.problems.parameter import Coordinates, Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters

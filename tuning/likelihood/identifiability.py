@@ -11,8 +11,7 @@ from optuna.distributions import BaseDistribution
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from tuning.likelihood.family import known_information
-from tuning.problems.data import Data, where_true
-from tuning.problems.in_parts import estimates_in_parts
+from tuning.problems.data import Data, estimates_in_parts, where_true
 from tuning.problems.problem import Problem
 from tuning.search.parameters import index_pairs, places_in
 from tuning.search.space import Choice, choice_of, ends_of, parameters_of, untuned_choice

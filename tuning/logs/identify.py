@@ -19,7 +19,7 @@ from tuning.identification.result import Identification
 from tuning.identification.values import write_values
 from tuning.logs.problem import runs_by_name, without_rescaled
 from tuning.logs.read import read_named
-from tuning.problems.log_checks import check_apart, check_times
+from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.parameter import Parameter
 from tuning.problems.plant_packages import logs_package
 

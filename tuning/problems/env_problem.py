@@ -2,34 +2,186 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils.seeding import np_random
 
-from thruster_env.core.checks import as_floats, covariance, short_repr
+from thruster_env.core.checks import as_floats, covariance, covariance_root, short_repr
 from thruster_env.core.global_generators import GlobalGenerators
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import (
     ACTION_SPACE,
     ADDED_NOISE,
     GLOBAL_GENERATORS,
+    POLICY,
     RANDOM_ACTIONS,
+    derived_generator,
     derived_seed,
+    draw_key,
     episode_keys,
     filter_keys,
+    normal_block,
 )
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
-from tuning.problems.digest import digest_of
-from tuning.problems.env_digest import env_identity
-from tuning.problems.episodes import Episodes, measurement_noise
-from tuning.problems.excitation import Excitation
+from tuning.problems.digest import digest_of, env_identity
+from tuning.problems.excitation import Excitation, excitation_of
+from tuning.problems.model_problem import NamedArguments
 from tuning.problems.parameter import Parameter
-from tuning.problems.policies import RANDOM, Policy, checked_policy, chooser
+
+# `Episodes`: the env of an `EnvProblem`, which offers the problem's model and shows what its data hold.
+
+
+if TYPE_CHECKING:
+    pass
+
+
+class Episodes(gym.Wrapper):
+    """An env that offers filters a problem's model; the first episode of a seed has the measurements of its data.
+
+    `info` holds "measurement" (m,), with the noise that the problem adds, and where the problem knows it "state"
+    (n,). Observation, reward and all else are the env's. After a seeded reset the env has its own global
+    generators.
+
+    Args:
+        env: of the problem.
+        problem: its model, and how it measures.
+    """
+
+    def __init__(self, env: gym.Env, problem: EnvProblem):
+        """Take env and problem."""
+        super().__init__(env)
+        self.state_space_model = NamedArguments(problem)
+        self._problem, self._generator, self._key, self._step = problem, np_random()[0], np.zeros(2), 0
+        self._generators = GlobalGenerators()
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Reset the env, and draw the key of the episode's measurement noise."""
+        if seed is not None:
+            self._generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
+            self._generator = np_random(seed)[0]
+        with self._generators.used():
+            observation, info = self.env.reset(seed=seed, options=options)
+            self._key, self._step = draw_key(self._generator), 0
+            return observation, self._told(observation, info)
+
+    def step(self, action):
+        """Step the env."""
+        with self._generators.used():
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self._step += 1
+            return observation, reward, terminated, truncated, self._told(observation, info)
+
+    def _told(self, observation, info: dict) -> dict:
+        problem, info = self._problem, dict(info)
+        z = problem.measured(observation, info)
+        if problem.noise_cov is not None:
+            z = z + measurement_noise(self._key[None], np.array([self._step]), problem.noise_cov)[0, 0]
+        if problem.measure is not None:  # whose entries are no longer those that the env's flags are of
+            info.pop("measurement_valid", None)
+        info["measurement"] = z
+        if problem.has_truth and (problem.state_of is not None or "state" in info):
+            info["state"] = problem.state(self.env, info)
+        return info
+
+
+def measurement_noise(keys: np.ndarray, steps: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """Normal noise (B, K, m) with a covariance, a function of each episode's key and the step only.
+
+    Args:
+        keys: of the episodes, (B, 2).
+        steps: numbers of the steps, (K,).
+        cov: covariance (m, m).
+    """
+    size = len(cov)
+    blocks = [normal_block(b, steps[None], ADDED_NOISE, keys[:, :1], keys[:, 1:]) for b in range(-(-size // 4))]
+    draws = np.stack([one for block in blocks for one in block][:size], axis=-1)
+    return draws @ covariance_root(cov).T
+
+
+# Policies of an `EnvProblem`: functions of the observation that choose the same actions for the same seed.
+
+
+Policy = str | Mapping | Excitation | Callable
+RANDOM = "random"
+LARGEST = 1e3  # random action, where the action space has no limit
+
+
+def checked_policy(given: Policy) -> str | Excitation | Callable:
+    """A policy unchanged, an excitation for a mapping with its name; ValueError for anything else."""
+    if isinstance(given, Excitation | Mapping):
+        return excitation_of(given)
+    if given != RANDOM and not callable(given) and not hasattr(given, "predict"):
+        rule = "policy must be 'random', a function of the observation, an object with predict, or an excitation"
+        raise ValueError(f"{rule}, but got {short_repr(given)}")
+    return given
+
+
+def chooser(policy: Any, space: gym.spaces.Box, seed: int) -> Callable:
+    """The policy, or given actions (K, p), as a function of the observation, as the episode of a seed begins.
+
+    A policy with `reset` is reset, with its own seed if it takes `seed`. What has `predict` is asked for its
+    `deterministic` action, and gets its `state` and `episode_start` where it takes them, as the policies of
+    Stable-Baselines3 do.
+    """
+    if isinstance(policy, str):
+        generator = derived_generator(seed, RANDOM_ACTIONS)
+        low, high = (np.clip(end, -LARGEST, LARGEST) for end in (space.low, space.high))
+        return lambda observation: generator.uniform(low, high)
+    if isinstance(policy, np.ndarray):
+        rows = iter(policy)
+        return lambda observation: next(rows)
+    _begin(policy, seed)
+    return _predicted(policy) if hasattr(policy, "predict") else policy
+
+
+def _begin(policy: Any, seed: int) -> None:
+    """Reset what remembers something: the object, or that of a method."""
+    while isinstance(policy, partial):
+        policy = policy.func
+    owner = getattr(policy, "__self__", policy)
+    reset = getattr(owner, "reset", None)
+    if not callable(reset) or isinstance(owner, gym.Env | type):
+        return
+    own = {"seed": derived_seed(seed, POLICY)} if "seed" in _names(reset) else {}
+    try:
+        inspect.signature(reset).bind(**own)
+    except (TypeError, ValueError):  # it asks for more: it is no beginning of an episode
+        return
+    reset(**own)
+
+
+def _predicted(policy: Any) -> Callable:
+    known = _names(policy.predict)
+    fixed = {"deterministic": True} if "deterministic" in known else {}
+    remembers = {"state", "episode_start"} <= known
+    state, first = None, True
+
+    def choose(observation):
+        nonlocal state, first
+        if not remembers:
+            return policy.predict(observation, **fixed)[0]
+        start = np.array([first])
+        action, state = policy.predict(observation, state=state, episode_start=start, **fixed)
+        first = False
+        return action
+
+    return choose
+
+
+def _names(function: Callable) -> set[str]:
+    """Names of the arguments of a function; none where it does not tell them."""
+    try:
+        return set(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return set()
+
 
 SCALE_SEEDS = range(16)  # seeds whose true states' standard deviation is the scale, where none is given
 DIFFERENCE = 1e-6  # of two runs of a seed, as part of the largest number: threads leave less

@@ -21,8 +21,7 @@ from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.digest import digest_of
-from tuning.problems.log_checks import check_apart, checked_logs
-from tuning.problems.log_parts import Parts, parts_of
+from tuning.problems.log_parts import Parts, check_apart, checked_logs, parts_of
 from tuning.problems.parameter import Parameter
 
 AT_GAPS = (

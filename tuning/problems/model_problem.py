@@ -19,12 +19,10 @@ from thruster_env.env.model_env import ModelEnv
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
-from tuning.problems.bound import average_bound
-from tuning.problems.check import check_quantities
-from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.check import average_bound, check_quantities
+from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import Excitation, excitation_of
-from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import BOUND, OPEN_LOOP
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import gymnasium as gym
@@ -15,8 +16,29 @@ from thruster_env.core.checks import at_least, short_repr, vector
 from thruster_env.env.env import as_json
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.excitation import Excitation, Steps, excitation_of
-from tuning.problems.plain import frozen, plain
 from tuning.problems.problem import Problem
+
+# Plain data: mappings and lists as immutable values, and as values for JSON.
+
+
+DEEPEST = 10  # levels of mappings and lists
+
+
+def frozen(value, depth: int = 0):
+    """Mappings and lists as an immutable value; ValueError if they are nested too deep."""
+    if depth > DEEPEST:
+        raise ValueError(f"mappings and lists must be nested at most {DEEPEST} deep, but got {short_repr(value)}")
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: frozen(part, depth + 1) for key, part in value.items()})
+    return tuple(frozen(part, depth + 1) for part in value) if isinstance(value, list | tuple) else value
+
+
+def plain(value):
+    """The inverse of `frozen`: dictionaries and lists, for JSON and deep copies."""
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
 
 MOST_STEPS = 1_000_000
 

@@ -15,7 +15,7 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.reporting.time_figures import one_run
 from tuning.search.objectives import reported, reported_name
-from tuning.search.outcome import best_trial
+from tuning.search.trials import best_trial
 
 NO_TRIALS = "No trial was finished."
 TWO_SIDED = 1.96

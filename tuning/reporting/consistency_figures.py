@@ -16,7 +16,7 @@ from filters.consistency.verdicts import probability_text, rounded
 from filters.logs.figure import colour_of
 from thruster_env.core.plots import BLUE, DARK, RUST, panels, save_figure
 from thruster_env.core.text_tables import TITLE, verbatim
-from tuning.reporting.panels import COLUMNS, plotted_states
+from tuning.reporting.time_figures import COLUMNS, plotted_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

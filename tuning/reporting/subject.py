@@ -15,13 +15,12 @@ from tuning.evaluation.tuned import problem_in, read_tuned
 from tuning.evaluation.versions import versions
 from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
-from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.enqueued import SIZES
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
-from tuning.search.sizing import SIZES
 from tuning.search.space import Choice
-from tuning.search.storage import open_storage
-from tuning.search.storage_url import public_url
+from tuning.search.storage import open_storage, public_url
 from tuning.search.study import chosen_of
+from tuning.search.trials import best_trial, is_consistent
 from tuning.search.validation import choice_from
 
 

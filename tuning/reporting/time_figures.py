@@ -5,21 +5,127 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from filters.logs.figure import TRUTH, colour_of
-from thruster_env.core.angles import with_breaks, wrapped_where
-from thruster_env.core.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
+from filters.logs.figure import MEASURED, TRUTH, colour_of
+from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
+from thruster_env.core.plots import BLUE, GREY, RUST, new_figure, save_figure, thinned, tidy
+from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
-from tuning.reporting.limits import limit_errors, limit_values
-from tuning.reporting.panels import axis_label, plotted_states
+
+# Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest.
+
+
+FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
+WIDEST = 4.0  # times the largest error: how much of a band is shown
+ROOM = 0.08  # of what is shown, above and below
+NOTE = {"xycoords": "axes fraction", "fontsize": 8, "zorder": 5}
+
+
+def limit_errors(
+    axes: Sequence, values: Sequence[np.ndarray], bands: Sequence[np.ndarray], start: int, word: str = "RMSE"
+) -> None:
+    """Limits of a row of errors or innovations in their bands, symmetric, and the RMSE in each panel.
+
+    Args:
+        axes: of the row, a filter each.
+        values: of each filter (K + 1,), NaN where there is none.
+        bands: half widths beside them.
+        start: the first scored step; earlier ones may leave the panel.
+        word: for the root of the mean square.
+    """
+    reaches = [_reach(*pair, start) for pair in zip(values, bands, strict=True)]
+    known = [reach for reach in reaches if reach > 0]
+    differ = len(known) > 1 and max(known) >= FAR * min(known)
+    for place, (axis, of_filter, reach) in enumerate(zip(axes, values, reaches, strict=True)):
+        limit = (reach if differ else max(known, default=0.0)) * (1.0 + ROOM)
+        if limit > 0:
+            axis.set_ylim(-limit, limit)
+        before, scored = of_filter[:start], of_filter[start:]
+        scored = scored[np.isfinite(scored)]
+        clipped = "; start-up is cut off" if limit > 0 and (np.abs(before) > limit).any() else ""
+        said = f"{word} {np.sqrt(np.mean(scored**2)):.3g}{clipped}" if scored.size else clipped.strip("; ")
+        box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
+        axis.annotate(said, (0.995, 0.97), ha="right", va="top", bbox=box, **NOTE)
+        if differ:
+            axis.annotate("axes differ", (0.01, 0.97), ha="left", va="top", bbox=box, **NOTE)
+        elif place:
+            axis.tick_params(labelleft=False)
+
+
+def limit_values(axes: Sequence, plotted: Sequence[np.ndarray], bands: Sequence[np.ndarray]) -> None:
+    """One pair of limits for a row of estimates: everything shown, and at most as much again of the bands.
+
+    Args:
+        axes: of the row, a filter each.
+        plotted: truth and estimates, as far as they have to be seen.
+        bands: their ends.
+    """
+    ends = _ends(plotted)
+    if ends is None:
+        return
+    low, high = ends
+    span = high - low or abs(high) or 1.0
+    edge = _ends(bands) or ends
+    low, high = max(min(low, edge[0]), low - span), min(max(high, edge[1]), high + span)
+    for place, axis in enumerate(axes):
+        axis.set_ylim(low - ROOM * span, high + ROOM * span)
+        if place:
+            axis.tick_params(labelleft=False)
+
+
+def _ends(series: Sequence[np.ndarray]) -> tuple[float, float] | None:
+    """The least and the largest of all finite values."""
+    found = np.concatenate([one[np.isfinite(one)] for one in series])
+    return (float(found.min()), float(found.max())) if found.size else None
+
+
+def _reach(values: np.ndarray, band: np.ndarray, start: int) -> float:
+    """The range of a panel: to the largest error, and to the end of a band not far beyond."""
+    (_, error), (_, width) = (_ends([np.abs(one[start:])]) or (0.0, 0.0) for one in (values, band))
+    return max(error, min(width, WIDEST * error) if error > 0 else width)
+
+
+# Which states have a panel in a figure, and how axes name them.
+
+
+MOST_PANELS = 6  # of states in one figure
+COLUMNS = 3  # of panels side by side
+LABEL_WIDTH = 18  # characters of a line beside a panel
+
+
+def plotted_states(
+    states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
+) -> tuple[list[int], str]:
+    """Indices of the states that a figure shows, in their order, and a line with the number of those left out.
+
+    Args:
+        states: all of them.
+        scored: places of those that count in the score, which come first where not all are shown; all if None.
+    """
+    everyone = range(len(states))
+    if len(states) <= MOST_PANELS:
+        return list(everyone), ""
+    first = sorted(everyone, key=lambda i: scored is not None and i not in scored)[:MOST_PANELS]
+    return sorted(first), f"{len(states) - MOST_PANELS} of {len(states)} states are left out"
+
+
+def axis_label(quantity: Quantity) -> str:
+    """Name and symbol above the unit, in lines as short as the axes of low panels have room for."""
+    named = quantity.symbol in quantity.name.split()  # as "measured thrust" is
+    label = verbatim(quantity.name) if named else quantity._replace(unit="").plot_label
+    label = "\n".join(wrap(label, LABEL_WIDTH, break_long_words=False, break_on_hyphens=False))
+    return f"{label}\n[{verbatim(quantity.unit)}]" if quantity.unit else label
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -203,3 +309,164 @@ def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour:
     """A band over time; of long series the widest of each stretch."""
     (times, below), (_, above) = thinned(time, low, np.fmin), thinned(time, high, np.fmax)
     axis.fill_between(times, below, above, color=colour, alpha=0.22, linewidth=0, label="95 % band of the filter")
+
+
+# The inputs and measurements of one run, innovations, and gain, over time.
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+HEIGHT = 1.5  # of a panel [inch]
+DASHES = ("-", "--", ":", "-.")
+STEP = 1e-6  # of a central difference, in standard deviations
+
+
+def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Figure:
+    """Every measured channel of a run with the filter's prediction, and the inputs below.
+
+    Args:
+        filter_: what predicts.
+        data: of a problem.
+        index: which of its runs.
+        dt: sample time [s]; None for an axis of steps.
+    """
+    found, model, one = one_run(filter_, data, index, dt), filter_.model, data.one(index)
+    seen, left_out = plotted_states(model.measurements)
+    given, _ = plotted_states(model.input_quantities)
+    figure, axes = _signal_rows(len(seen) + len(given), 2 * WIDTH, dt)
+    measured = wrapped_where(one.measurements[0], model.shape.measurement_angles)
+    colour = colour_of(filter_.name)
+    for axis, j in zip(axes, seen, strict=False):
+        angle = model.measurements[j].angle
+        line = line_of(angle, found.time, measured[:, j])
+        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0}))
+        expected = measured[:, j] - found.innovations[:, j]
+        expected = wrapped(expected) if angle else expected
+        line = line_of(angle, found.time, expected)
+        axis.plot(*line, color=colour, linewidth=0.8, label="predicted before the update")
+        axis.set_ylabel(axis_label(model.measurements[j]))
+    for axis, i in zip(axes[len(seen) :], given, strict=True):
+        time, values = thinned(found.time[:-1], one.inputs[0][:, i])
+        axis.plot(time, values, color=GREY, drawstyle="steps-post", linewidth=1.2, label="input")
+        axis.set_ylabel(axis_label(model.input_quantities[i]))
+    _legend(figure, axes, left_out.replace("states", "channels"))
+    return figure
+
+
+def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
+    """Innovations of every channel in the band that each filter expects; one column per filter."""
+    channels = next(iter(filters.values())).model.measurements
+    seen, left_out = plotted_states(channels)
+    figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(seen) + 0.8))
+    axes = figure.subplots(len(seen), len(filters), squeeze=False, sharex=True)
+    tidy(axes.flat)
+    runs = [one_run(filter_, data, index, dt) for filter_ in filters.values()]
+    for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
+        for axis, j in zip(column, seen, strict=True):
+            band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
+            draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour_of(filter_.name))
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
+        column[-1].set_xlabel(_time(dt))
+    for line, j in zip(axes, seen, strict=True):
+        line[0].set_ylabel(axis_label(channels[j]))
+        limit_innovations(line, runs, data.first_scored, j)
+    _legend(figure, axes[:, 0], left_out.replace("states", "channels"))
+    return figure
+
+
+def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
+    """The gain of each step of a run, (K + 1, n, m): K = P H' R^-1, NaN where nothing was measured.
+
+    P is the covariance after the update, H the slope of the measurement at the estimate, R the assumed one. Of a
+    Kalman filter this is its gain; of others it is what their covariance amounts to.
+
+    Source: Anderson, Moore (1979), "Optimal Filtering", section 6.3.
+    """
+    found, model = one_run(filter_, data, index, None), filter_.model
+    means, covs = found.estimates.means[0], found.estimates.covs[0]
+    slopes = np.stack([_slopes(model, mean) for mean in means])  # (K + 1, m, n)
+    products = slopes @ covs.transpose(0, 2, 1)  # H P', (K + 1, m, n)
+    found_gains = np.linalg.solve(model.measurement_noise_cov, products).transpose(0, 2, 1)
+    found_gains[np.isnan(data.one(index).measurements[0]).all(axis=1)] = np.nan
+    return found_gains
+
+
+def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None, scored=None) -> Figure:
+    """The gain on every state, a line per channel and a column per filter, each panel with its own axis."""
+    model = next(iter(filters.values())).model
+    places, left_out = plotted_states(model.states, scored)
+    channels, _ = plotted_states(model.measurements)
+    figure = new_figure((WIDTH * len(filters), HEIGHT * len(places) + 0.8))
+    axes = figure.subplots(len(places), len(filters), squeeze=False, sharex=True)
+    tidy(axes.flat)
+    for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
+        found = gains(filter_, data, index)
+        time = (1.0 if dt is None else dt) * np.arange(len(found))
+        for axis, i in zip(column, places, strict=True):
+            for row, j in enumerate(channels):
+                look = {"color": colour_of(filter_.name), "linestyle": DASHES[row % len(DASHES)], "linewidth": 1.0}
+                axis.plot(*thinned(time, found[:, i, j]), label=f"by {model.measurements[j].text_symbol}", **look)
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
+        column[-1].set_xlabel(_time(dt))
+    for axis, i in zip(axes[:, 0], places, strict=True):
+        units = {_over(model.states[i], model.measurements[j]) for j in channels}
+        unit = units.pop() if len(units) == 1 else "state/channel"
+        axis.set_ylabel(axis_label(model.states[i]._replace(name="gain on", unit=unit)))
+    figure.align_ylabels(axes[:, 0])
+    _legend(figure, axes[:, 0], left_out)
+    return figure
+
+
+def _slopes(model: StateSpaceModel, mean: np.ndarray) -> np.ndarray:
+    """Slopes of the measurements by the states at an estimate, (m, n)."""
+    if not np.isfinite(mean).all():
+        return np.full((model.m, model.n), np.nan)
+    functions, c = model.functions, model.given_constants
+    if functions.observe_jacobian is not None:
+        return np.array(functions.observe_jacobian(as_value(mean.tolist()), c), dtype=float).reshape(
+            model.m, model.n
+        )
+    columns = []
+    for i, step in enumerate(STEP * model.scales):
+        sides = [
+            np.array(functions.observe(as_value((mean + s * step * np.eye(model.n)[i]).tolist()), c))
+            for s in (1, -1)
+        ]
+        columns.append((sides[0] - sides[1]) / (2 * step))
+    return np.stack(columns, axis=-1).reshape(model.m, model.n)
+
+
+def _over(state: Quantity, channel: Quantity) -> str:
+    """Unit of a gain."""
+    if state.unit == channel.unit:
+        return "-"
+    return f"{_whole(state.unit) or '1'}/{_whole(channel.unit)}" if channel.unit else state.unit
+
+
+def _whole(unit: str) -> str:
+    """A unit as part of a quotient."""
+    return f"({unit})" if "/" in unit or " " in unit else unit
+
+
+def _time(dt: float | None) -> str:
+    return "step" if dt is None else "time [s]"
+
+
+def _signal_rows(count: int, width: float, dt: float | None):
+    """A figure of panels one below the other over time."""
+    figure = new_figure((width, HEIGHT * count + 0.8))
+    axes = figure.subplots(count, 1, squeeze=False, sharex=True)[:, 0]
+    tidy(axes)
+    axes[-1].set_xlabel(_time(dt))
+    figure.align_ylabels(axes)
+    return figure, axes
+
+
+def _legend(figure, axes, left_out: str) -> None:
+    named: dict[str, Any] = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    options = {"ncols": min(len(named), 4), "frameon": False, "title": left_out or None}
+    figure.legend(named.values(), named, loc="outside lower center", **options)

@@ -14,8 +14,8 @@ from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
 from tuning.reporting.alternatives import of_estimates
 from tuning.reporting.page import Section, Table, Words, html_page
-from tuning.reporting.run_parts import AXES, READ
-from tuning.reporting.sketchbook import Sketchbook
+from tuning.reporting.search_figures import Sketchbook
+from tuning.reporting.sections import AXES, READ
 from tuning.reporting.time_figures import draw_estimates
 
 

@@ -18,8 +18,8 @@ from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.search.plan import TRAINING_SEEDS, Plan
-from tuning.search.processes import end, orders_of, parent_says_stop, plan_of, read_orders, start
 from tuning.search.space import untuned_choice
+from tuning.search.workers import end, orders_of, parent_says_stop, plan_of, read_orders, start
 
 MODULE = "tuning.search.compiling"
 MOST_HELPERS = 3  # each takes some 300 MB

@@ -5,12 +5,18 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines
+from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
+from tuning.evaluation.summary import sizes_as_data, stored_sizes
 from tuning.likelihood.goal import OF_STATES
+from tuning.problems.data import Data
 from tuning.search.among_types import (
     NEAR_BEST,
     UNTUNED,
@@ -22,14 +28,13 @@ from tuning.search.among_types import (
     is_race,
 )
 from tuning.search.gradient_noise import BY_GRADIENT, MAXIMUM_LIKELIHOOD, MOST_FOR_STARTS, noise_by_gradient
-from tuning.search.local import is_local, near
 from tuning.search.new_trials import enqueue_new
 from tuning.search.objectives import SCORE
-from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
-from tuning.search.space import FILTER_TYPE, trial_parameters, untuned_choice, within_ranges
-from tuning.search.trials import NIS
+from tuning.search.samplers import is_local, near
+from tuning.search.space import FILTER_TYPE, Choice, trial_parameters, untuned_choice, within_ranges
+from tuning.search.trials import NIS, best_trial, is_consistent
 
 # Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
 RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
@@ -141,3 +146,32 @@ def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
     noise = noise_by_gradient(study, plan, objective)
     if noise is not None:
         enqueue_new(study, {**start, **noise}, {BY_GRADIENT: objective})
+
+
+# The ensemble size of a study's choice, from a table stored in the study.
+
+
+SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
+
+
+def sizes_of(
+    study: optuna.Study, choice: Choice, plan: Plan, data: Sequence[Data], consistent: bool
+) -> list[SizeRow]:
+    """The table of ensemble sizes of a choice, stored with the study; empty if there is none."""
+    if not filter_type(choice.name).has_ensemble or len(plan.objectives) > 1:
+        return []
+    kept = stored_sizes(study.user_attrs.get(SIZES), choice, plan)
+    if kept is None:
+        kept = ensemble_sizes(choice, plan, data, consistent)
+        study.set_user_attr(SIZES, sizes_as_data(kept, choice, plan))
+    return kept
+
+
+def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[SizeRow], consistent: bool) -> Choice:
+    """A choice with the smallest sufficient ensemble; unchanged without an ensemble."""
+    if sizes:
+        return choice.with_size(sufficient_size(sizes, consistent))
+    recorded = all(scenario.leads_in for scenario in plan.scenarios)
+    if filter_type(choice.name).has_ensemble and len(plan.objectives) == 1 and recorded:
+        return choice.with_size(close_size(choice, plan, data))
+    return choice

@@ -1,11 +1,17 @@
-"""Optuna's samplers by name."""
+"""Optuna's samplers by name.
+
+Ranges are so wide that no truth lies outside, and most of their values are implausible.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import io
+import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import optuna
@@ -14,9 +20,123 @@ from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.core.checks import one_of
 from thruster_env.core.modules import to_install
-from tuning.search.box import GpInBox, RandomInBox, TpeInBox
-from tuning.search.cma_es import CmaEsSampler
+from thruster_env.core.streams import LOCAL_TRIALS, derived_generator
+from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE
+from tuning.search.trials import best_trial
+
+# Samplers that draw Q and R within a box in their ranges, which grows as the best trial nears a side of it.
+
+
+MARGIN = 10.0  # factor by which the box reaches beyond the best trial
+
+
+def box(
+    space: Mapping[str, BaseDistribution], first: Mapping[str, tuple[float, float]], best: Mapping[str, Any]
+) -> dict[str, BaseDistribution]:
+    """The distributions of a space, those of Q and R within their box.
+
+    A side is the initial one or ten times beyond the best trial, whichever is farther, within the range.
+
+    Args:
+        space: distributions by name.
+        first: the part of a range in which the search begins, by name, for those that have one.
+        best: parameters of the best trial; empty before there is one.
+    """
+    found = dict(space)
+    for name, (low, high) in first.items():
+        one = space.get(name)
+        if isinstance(one, FloatDistribution):
+            if name in best:
+                low, high = min(low, best[name] / MARGIN), max(high, best[name] * MARGIN)
+            found[name] = FloatDistribution(max(low, one.low), min(high, one.high), log=one.log)
+    return found
+
+
+class InBox:
+    """A sampler that draws within the box, which does not limit enqueued trials and those near the best one."""
+
+    def __init__(self, first: Mapping[str, tuple[float, float]], **options):
+        """Remember where the search begins."""
+        super().__init__(**options)
+        self._first = first
+
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        """The parameters sampled together, within the box."""
+        space = super().infer_relative_search_space(study, trial)  # type: ignore[misc]  # of the sampler
+        return self._box(study, space)
+
+    def sample_independent(
+        self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        """A value of one parameter, within the box."""
+        within = self._box(study, {param_name: param_distribution})[param_name]
+        return super().sample_independent(study, trial, param_name, within)  # type: ignore[misc]
+
+    def _box(self, study: optuna.Study, space: Mapping[str, BaseDistribution]) -> dict[str, BaseDistribution]:
+        best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+        return box(space, self._first, {} if best is None else best.params)
+
+
+class TpeInBox(InBox, optuna.samplers.TPESampler):
+    """The tree-structured Parzen estimator, within the box."""
+
+
+class GpInBox(InBox, optuna.samplers.GPSampler):
+    """The Gaussian process, within the box."""
+
+
+class RandomInBox(InBox, optuna.samplers.RandomSampler):
+    """Independent draws, within the box."""
+
+
+# Optuna's CMA-ES, which stores its state in the study, made safe for studies of unknown origin.
+
+
+# The classes in the state of an optimizer of `cmaes`. Any pickle may name any function of any module, and call it.
+_OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
+_ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
+    (f"numpy.{core}.{module}", name)
+    for core in ("_core", "core")  # of NumPy 2 and 1
+    for module, name in (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
+}
+
+
+class CmaEsSampler(optuna.samplers.CmaEsSampler):
+    """`optuna.samplers.CmaEsSampler` that reads only its own state from a journal or database.
+
+    Optuna unpickles the state in a study's trials, so another person's study could run code.
+    """
+
+    def _restore_optimizer(self, completed_trials: list[FrozenTrial]):
+        key = self._attr_key_optimizer
+        for trial in reversed(completed_trials):
+            parts = {name: value for name, value in trial.system_attrs.items() if name.startswith(key)}
+            if parts:
+                return read_state(self._concat_optimizer_attrs(parts))
+        return None
+
+
+def read_state(text: str):
+    """The optimizer stored in a study, a pickle as hexadecimal digits.
+
+    Raises:
+        ValueError: if it is not such a state, or names anything but an optimizer of `cmaes` and arrays of NumPy.
+    """
+    try:
+        return _Unpickler(io.BytesIO(bytes.fromhex(text))).load()
+    except ValueError:
+        raise
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise ValueError(f"the state of CMA-ES must be whole, but a trial's is not: {error}") from None
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str):
+        if (module, name) in _ARRAYS or (module.partition(".")[0] == "cmaes" and name in _OPTIMIZERS):
+            return super().find_class(module, name)
+        raise ValueError(f"the state of CMA-ES must be that of an optimizer, but a trial's names {module}.{name}")
+
 
 SAMPLERS = {
     "tpe": "tree-structured Parzen estimator, all parameters together; good from some ten trials on",
@@ -109,3 +229,42 @@ def _grid(distribution: BaseDistribution) -> list:
     if isinstance(distribution, IntDistribution):
         return sorted({int(round(value)) for value in values})
     return [float(np.clip(value, distribution.low, distribution.high)) for value in values]
+
+
+# Every second trial of the default sampler is near the best one, so that wide ranges do not slow the search.
+
+
+LARGEST = 0.1  # step over the width of a linear range; over a decade of a logarithmic one it is ten times this ...
+DECADES = 1.5  # ... and the smallest step is so many powers of ten below
+MOVED = 0.5  # probability that a number is moved
+
+
+def is_local(plan: Plan, number: int) -> bool:
+    """Whether the trial after this number is to be near the best: every second one of "tpe" with one objective."""
+    return plan.sampler == "tpe" and len(plan.objectives) == 1 and number % 2 == 1
+
+
+def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, number: int) -> dict:
+    """The parameters of the best trial, some of them changed by normal steps of a common random size.
+
+        log10 x' = log10 x + s n,  n ~ N(0, 1),  log10 s ~ U(-1.5, 0); of a linear range s times a tenth of it
+
+    The same trial number in a study with the same seed gives the same trial.
+
+    Source: Beyer, Schwefel (2002), "Evolution strategies, a comprehensive introduction", Natural Computing 1.
+    """
+    generator = derived_generator(plan.seed, LOCAL_TRIALS, number)
+    size, found = 10.0 ** generator.uniform(-DECADES, 0.0), dict(best)
+    names = [name for name in best if isinstance(space.get(name), FloatDistribution | IntDistribution)]
+    moved = generator.random(len(names)) < MOVED
+    if names and not moved.any():
+        moved[generator.integers(len(names))] = True
+    for name, step in zip(names, np.where(moved, size * generator.standard_normal(len(names)), 0.0), strict=True):
+        one, value = space[name], best[name]
+        assert isinstance(one, FloatDistribution | IntDistribution)
+        if step == 0.0:
+            continue
+        value = value * 10.0**step if one.log else value + LARGEST * step * (one.high - one.low)
+        value = float(np.clip(value, one.low, one.high))
+        found[name] = round(value) if isinstance(one, IntDistribution) else value
+    return found

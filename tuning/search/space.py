@@ -16,8 +16,10 @@ from filters.filter import Filter
 from filters.registry import FILTERS, filter_type, make_filter
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.filter_parameters import FilterParameter, default_numbers, filter_parameters
 from tuning.search.parameters import (
+    FilterParameter,
+    default_numbers,
+    filter_parameters,
     has_process_noise,
     model_parameters,
     places_in,

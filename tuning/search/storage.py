@@ -1,22 +1,387 @@
-"""Where studies live: a journal file by default, made safe to resume; a database for several machines."""
+"""Where studies live: a journal file by default, made safe to resume; a database for several machines.
+
+Only a study in a database loads SQLAlchemy, which takes a tenth of a second.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import json
 import os
+import re
 import time
+import uuid
+import warnings
+from collections.abc import Callable, Generator
 from contextlib import suppress
+from functools import wraps
+from itertools import count
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote_plus, urlsplit
 
 import optuna
-from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import BaseStorage
-from optuna.storages.journal import JournalFileOpenLock
-from optuna.trial import FrozenTrial, TrialState
+from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
+from optuna.storages import BaseStorage, GrpcStorageProxy, JournalStorage, RDBStorage
+from optuna.storages._cached_storage import _CachedStorage
+from optuna.storages._heartbeat import BaseHeartbeat
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.trial import FrozenTrial, TrialState, create_trial
+from sqlalchemy.exc import DBAPIError, OperationalError
 
 from thruster_env.core.checks import short_repr
-from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
-from tuning.search.storage_url import first_line, is_misspelt, public_url, without_secrets
+
+# The parts of a storage's URL that may be shown: scheme, host and database, not user, password or options.
+
+
+HIDDEN = "***"
+DATABASES = ("postgresql", "postgres", "mysql", "mariadb", "sqlite", "oracle", "mssql", "redis", "grpc")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*")
+_PLACE = re.compile(r"(?P<host>[\w.-]*|\[[0-9A-Fa-f:.]+\])(?P<port>:\d+)?(?P<database>/[^:@]*)?", re.ASCII)
+_MARKS = re.compile(r"[:/@?#&=;,\s]+")
+_MISSPELT = re.compile(rf"({'|'.join(DATABASES)})(\+\w+)?:(?!//)", re.IGNORECASE)
+
+
+def public_url(storage: str) -> str:
+    """A storage for messages: a path as it is, of a URL scheme, host, port and database.
+
+    For an ambiguous URL, such as one with a question mark in the password, only the scheme is shown.
+    """
+    scheme, separator, rest = storage.partition("://")
+    if not separator:
+        misspelt = _MISSPELT.match(storage)
+        return storage if misspelt is None else f"{misspelt[0]}{HIDDEN}"
+    if not _SCHEME.fullmatch(scheme):
+        return HIDDEN
+    place = _place(rest)
+    return f"{scheme}://{HIDDEN if place is None else place}"
+
+
+def is_misspelt(storage: str) -> bool:
+    """Whether this is a database's URL except for its slashes, and not a path."""
+    return bool(_MISSPELT.match(storage))
+
+
+def _place(rest: str) -> str | None:
+    """Host, port and database of what follows a scheme, None where it is not sure which part they are."""
+    if rest.startswith("/"):  # no host, and so no user
+        return re.split(r"[?#]", rest, maxsplit=1)[0]
+    before, at, after = rest.rpartition("@")
+    if at and re.search(r"[?#]", before):
+        return None
+    place = re.split(r"[?#]", after, maxsplit=1)[0]
+    return place if _PLACE.fullmatch(place) else None
+
+
+def without_secrets(text: str, storage: str) -> str:
+    """A message of a database or its driver without the hidden parts of the storage's URL."""
+    shown = public_url(storage)
+    if shown == storage:
+        return text
+    rest = storage.partition("://")[2]
+    if rest.startswith("/"):
+        login, place = "", rest
+    elif shown.endswith(HIDDEN):  # any part may be a password
+        place = storage if shown == HIDDEN else storage.partition(":")[2]
+        login = f":{place}"
+    else:
+        login, _, place = rest.rpartition("@")
+    options = [option.partition("=")[2] for option in re.split(r"[?#&;]", place)[1:]]
+    secrets = {part for one in (login.partition(":")[2], *options) for part in (one, unquote_plus(one))}
+    # A driver that reads the URL in another way may name a part of a password, as that before its slash.
+    secrets |= {word for secret in secrets for word in _MARKS.split(secret)} - {*_MARKS.split(shown)}
+    text = text.replace(storage, shown)
+    for secret in sorted(secrets - {""}, key=len, reverse=True):
+        text = re.sub(rf"(?<!\w){re.escape(secret)}(?!\w)", HIDDEN, text)
+    return text
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error, or its class's name."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+# Databases as storages of studies, tolerant of outages, and their proxy.
+
+
+TABLE_TRIES = 5  # to make the tables of a database, or to find them made
+PATIENCE_SECONDS = 60  # for which a database may be away
+CONNECT_SECONDS = 10  # timeout of a connection, for drivers that have one
+WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql|mysqldb))?)://")
+HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
+GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
+PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
+MARK = "made by call"  # system attribute of a trial, by which a repeated call finds what the first one made
+OnLost = Callable[[optuna.Study, FrozenTrial], Any]  # of a module: storages are pickled
+
+
+def open_database(url: str, on_lost: OnLost) -> BaseStorage:
+    """Open a database, or the proxy of one, "grpc://host:port"; any error that SQLAlchemy or its drivers raise.
+
+    Args:
+        url: of the database.
+        on_lost: called with a study and one of its trials whose heartbeat has stopped.
+    """
+    return _proxy(url) if url.startswith("grpc://") else _PatientStorage(_database(url, on_lost))
+
+
+def _database(url: str, on_lost: OnLost) -> RDBStorage:
+    """A database, with its tables; tried again when another host makes them at the same time."""
+    for _ in range(TABLE_TRIES - 1):
+        try:
+            return _connected(url, on_lost)
+        except (DBAPIError, AssertionError) as error:
+            if isinstance(error, OperationalError) and "already exists" not in str(error):
+                raise  # it cannot be reached
+            time.sleep(0.5)
+    return _connected(url, on_lost)
+
+
+def _connected(url: str, on_lost: OnLost) -> RDBStorage:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return RDBStorage(
+            url,
+            heartbeat_interval=HEARTBEAT_SECONDS,
+            grace_period=GRACE_SECONDS,
+            engine_kwargs={"connect_args": {"connect_timeout": CONNECT_SECONDS}}
+            if WITH_TIMEOUT.match(url)
+            else None,
+            heartbeat_stale_trial_callback=on_lost,
+        )
+
+
+def _proxy(url: str) -> BaseStorage:
+    parts = urlsplit(url)
+    if parts.hostname is None:
+        raise ValueError("it names no host")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        proxy = GrpcStorageProxy(host=parts.hostname, port=parts.port or PROXY_PORT)
+    proxy.wait_server_ready(timeout=PROXY_SECONDS)
+    return proxy
+
+
+class Outage:
+    """A database that does not answer, for all threads of this process: one deadline for all their calls."""
+
+    def __init__(self):
+        """Begin with a database that answers."""
+        self._since: float | None = None
+        self._failing: set[str] = set()
+        self._told = False
+
+    def answered(self, name: str) -> None:
+        """Note that a call was answered: if it writes, certainly by the database, not by a cache."""
+        if self._failing:
+            self._failing = set() if not name.startswith(("get", "_get")) else self._failing - {name}
+            if not self._failing:
+                self._since, self._told = None, False
+
+    def noticed(self, name: str, reason: str) -> None:
+        """Note that a call was not answered.
+
+        Raises:
+            ValueError: if the database has been away for more than PATIENCE_SECONDS.
+        """
+        now = time.monotonic()
+        since = self._since = now if self._since is None else self._since
+        self._failing = self._failing | {name}
+        if now > since + PATIENCE_SECONDS:
+            raise ValueError(f"a database must answer within {PATIENCE_SECONDS} s, but got: {reason}")
+
+    def tell(self, reason: str) -> None:
+        """Say once that there is one."""
+        if not self._told:
+            self._told = True
+            warnings.warn(f"no answer from the database, trying for {PATIENCE_SECONDS} s: {reason}", stacklevel=3)
+
+
+def _patient(method: Callable) -> Callable:
+    """The same method of a storage, called again until the database answers.
+
+    Raises:
+        ValueError: if the database is away for more than PATIENCE_SECONDS, whichever call noticed it first.
+    """
+    name = method.__name__
+
+    @wraps(method)
+    def patient(self, *args, **kwargs):
+        for attempt in count():
+            try:
+                answer = method(self, *args, **kwargs)
+                self.outage.answered(name)
+                return answer
+            except UpdateFinishedTrialError:
+                self.outage.answered(name)
+                if not attempt:
+                    raise
+                return True  # the attempt whose answer got lost has done its work
+            except StorageInternalError as error:
+                reason = without_secrets(first_line(error.__cause__ or error), self._backend.url)
+            self.outage.noticed(name, reason)
+            if attempt == 1:  # the first may have met a connection from before an outage
+                self.outage.tell(reason)
+            time.sleep(0.5)
+
+    return patient
+
+
+def _all_patient(storage: type) -> type:
+    for name in BaseStorage.__abstractmethods__ | BaseHeartbeat.__abstractmethods__:
+        if name not in vars(storage):
+            setattr(storage, name, _patient(getattr(storage, name)))
+    return storage
+
+
+@_patient
+def _make_once(self: _PatientStorage, study_id: int, template: FrozenTrial, tries: list[bool]) -> int:
+    """Make a marked trial, unless an earlier try, whose answer got lost, has made it."""
+    if tries:
+        mark = template.system_attrs[MARK]
+        for trial in self.get_all_trials(study_id, deepcopy=False):
+            if trial.system_attrs.get(MARK) == mark:
+                return trial._trial_id
+    tries.append(True)
+    return _CachedStorage.create_new_trial(self, study_id, template)
+
+
+@_all_patient
+class _PatientStorage(_CachedStorage):
+    """Optuna's cached storage of a database, whose calls are repeated until the database answers."""
+
+    def __init__(self, database: RDBStorage):
+        super().__init__(database)
+        self.outage = Outage()
+
+    def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
+        """Make one trial: it bears a mark, lest a call that is repeated makes it twice, and it runs twice."""
+        template = copy.deepcopy(template_trial) or create_trial(state=TrialState.RUNNING)
+        template.system_attrs[MARK] = uuid.uuid4().hex
+        return _make_once(self, study_id, template, [])
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        """Give one sign of life; where it gets lost the next one follows soon, and other calls find out why."""
+        try:
+            super().record_heartbeat(trial_id)
+            self.outage.answered("record_heartbeat")
+        except StorageInternalError as error:
+            with contextlib.suppress(ValueError):  # the thread that runs the trial has to end it
+                self.outage.noticed("record_heartbeat", str(error))
+
+
+# A study's journal file, whose lines stay complete after a full disk, a killed process or an interrupt.
+
+
+INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
+BEGINNING = b'{"op_code":'  # of each entry of a journal
+
+
+class Journal(JournalStorage):
+    """Optuna's journal storage, which reports a trial ended by another process as an error once."""
+
+    def _sync_with_backend(self) -> None:
+        """Read what is new; each value that waited would raise the error anew, in calls that others make."""
+        try:
+            super()._sync_with_backend()
+        except UpdateFinishedTrialError:
+            with suppress(UpdateFinishedTrialError):
+                self._sync_with_backend()
+            raise
+
+
+class JournalFile(JournalFileBackend):
+    """Optuna's journal file, to which entries are added as a whole or not at all.
+
+    A disk takes a millisecond to store data permanently, more than a trial of a cheap filter. The file is
+    therefore synchronised only for what must survive a power cut: a finished trial, with everything before it, and
+    the attributes of a study. The values of single seeds of a running trial, which would be repeated anyway, are
+    not urgent: they wait for the next entry of another kind, or the next reader in this process.
+    """
+
+    def __init__(self, path: Path, lock: JournalFileOpenLock):
+        """Take its path, and the lock of its writers."""
+        super().__init__(str(path), lock_obj=lock)
+        self._path, self._writers = path, lock
+        self._waiting: list[dict] = []
+        self._was_put_off = False
+
+    def __getstate__(self) -> dict:
+        """All but what waits, which this one will write: of a copy it would be there twice, or after the end."""
+        return {**vars(self), "_waiting": [], "_was_put_off": False}
+
+    def append_logs(self, logs: list[dict]) -> None:
+        """Add a line for each entry.
+
+        Raises:
+            OSError: if the disk is full; the file is then unchanged, and others can still use it.
+        """
+        self._was_put_off = all(INTERMEDIATE in log for log in logs)
+        if self._was_put_off:
+            self._waiting += logs
+        else:
+            self._write(logs)
+
+    def read_logs(self, log_number_from: int) -> Generator[dict[str, Any], None, None]:
+        """Entries from a number on; none right after one that waits, when Optuna reads what it has just added."""
+        if self._was_put_off:
+            self._was_put_off = False
+            return
+        if self._waiting:
+            self._write([])
+        yield from super().read_logs(log_number_from)
+
+    def _write(self, logs: list[dict]) -> None:
+        """Add what waits and some entries; what waits is of a trial that fails if there is no room for it."""
+        logs, self._waiting = self._waiting + logs, []
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        self._writers.acquire()
+        try:
+            size = self._path.stat().st_size
+            try:
+                with self._path.open("ab") as stream:
+                    stream.write(lines.encode())
+                    stream.flush()
+                    if not all(map(_is_of_running_trial, logs)):
+                        os.fsync(stream.fileno())
+            except BaseException:
+                os.truncate(self._path, size)
+                raise
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from None
+        finally:
+            self._writers.release()
+
+
+def _is_of_running_trial(log: dict) -> bool:
+    """Whether an entry is of a trial that is not finished: which one it is, or when it began, but not its end."""
+    return ("trial_id" in log or "datetime_start" in log) and "datetime_complete" not in log
+
+
+def cut_unfinished_line(path: Path) -> None:
+    """Cut off a last line that a killed process left unfinished, with a warning.
+
+    Raises:
+        ValueError: if it is no journal, or damaged elsewhere.
+    """
+    content = path.read_bytes()
+    lines = content.splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        try:
+            whole = line.endswith(b"\n") and isinstance(json.loads(line), dict)
+        except ValueError:
+            whole = False
+        if whole:
+            continue
+        if number < len(lines):
+            raise ValueError(f"line {number} is no journal entry")
+        if number == 1 and (line.endswith(b"\n") or line[: len(BEGINNING)] != BEGINNING[: len(line)]):
+            raise ValueError("it is no journal")
+        warnings.warn(f"{path}: cut off its last line, which a process left unfinished", stacklevel=4)
+        with path.open("r+b") as stream:
+            stream.truncate(len(content) - len(line))
+
 
 DRIVER = "pip install '.[db]' in the project's folder, and postgresql+psycopg2:// in the URL"
 LOCK_SECONDS = 5  # after which a lock counts as left behind
@@ -39,8 +404,6 @@ def open_storage(storage: Any) -> BaseStorage:
     """
     storage = storage_text(storage)
     if "://" in storage:
-        from tuning.search.database import open_database
-
         try:
             return open_database(storage, retry_once)
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like

@@ -16,17 +16,15 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.search.among_types import choose_type_by_race, is_race
 from tuning.search.cost import COST
-from tuning.search.enqueued import enqueue_after, enqueue_what_is_left
+from tuning.search.enqueued import enqueue_after, enqueue_what_is_left, sized, sizes_of
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
 from tuning.search.objectives import nis_ratio
-from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
 from tuning.search.samplers import give_sampler, make_sampler
-from tuning.search.sizing import sized, sizes_of
 from tuning.search.space import Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
-from tuning.search.trials import cost_of, make_pruner, measure, run_trial
+from tuning.search.trials import best_trial, cost_of, is_consistent, make_pruner, measure, run_trial
 from tuning.search.validation import Validation, as_data, finalists_of, validate
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)

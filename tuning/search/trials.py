@@ -1,6 +1,8 @@
 """One trial of a study: the same seeds for all trials, in blocks, and pruning.
 
 NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+
+NIS is the normalised innovation squared.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from statistics import geometric_mean
 import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution
+from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
@@ -140,3 +143,32 @@ def _report(
         scores.append(np.add.reduceat(run_scores(runs, scenario.scale), begin) / sizes)
     for place, score in enumerate(np.mean(scores, axis=0)):
         trial.report(float(score), first + place)
+
+
+# The outcome of trials: constraints, and the best trial.
+
+
+def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
+    """The complete trial with the lowest first objective, among the consistent ones if there are any.
+
+    A trial over the budget is never complete. If no trial is consistent, the distance of the mean NIS from its
+    band is ignored: an estimate that is many times worse can be closer to it.
+    """
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    complete.sort(key=lambda trial: trial.values[0])  # so that few are asked for their constraints
+    return next(filter(is_consistent, complete), complete[0] if complete else None)
+
+
+def is_consistent(trial: FrozenTrial) -> bool:
+    """Whether a trial's mean NIS is inside its band; true without a band."""
+    return violation(trial) <= 0
+
+
+def violation(trial: FrozenTrial) -> float:
+    """Logarithmic distance of a trial's mean NIS from its band; at most zero inside, or without a band."""
+    return trial.constraints.get(CONSISTENCY, 0.0)
+
+
+def is_over_budget(trial: FrozenTrial) -> bool:
+    """Whether a trial ended because its filter is over the budget."""
+    return trial.constraints.get(BUDGET, 0.0) > 0

@@ -27,7 +27,6 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
-from tuning.search.filter_parameters import ensemble_sizes_of
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.measures import (
     LEVEL,
@@ -40,12 +39,11 @@ from tuning.search.measures import (
     signed_rank,
 )
 from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
-from tuning.search.outcome import best_trial, is_consistent
-from tuning.search.parameters import model_parameters
+from tuning.search.parameters import ensemble_sizes_of, model_parameters
 from tuning.search.plan import Plan
 from tuning.search.relations import obeying
 from tuning.search.space import Choice
-from tuning.search.trials import cost_of
+from tuning.search.trials import best_trial, cost_of, is_consistent
 
 VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
 BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones

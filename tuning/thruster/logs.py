@@ -70,8 +70,7 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
     """
     if preset is None:
         return problem
-    from tuning.thruster.scale import computed_scale
-    from tuning.thruster.scenario import Scenario
+    from tuning.thruster.scenario import Scenario, computed_scale
 
     preset = str(preset)
     if not isinstance(problem, Scenario) or problem.system is not None:

@@ -9,14 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
+from filters.baselines import OpenLoop
+from filters.engine.batch import run
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE
-from thruster_env.core.checks import positive, short_repr, vector
+from thruster_env.core.checks import at_least, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.effects.effects import Effect, set_field
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.engine.copies import simulate
-from thruster_env.thruster.linear.analysis import equilibrium, state_range
+from thruster_env.thruster.control.controllers import PIController, lambda_gains
+from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
+from thruster_env.thruster.engine.copies import Copies, simulate
+from thruster_env.thruster.engine.memory import NEXT_REFERENCE, READINGS
+from thruster_env.thruster.linear.analysis import equilibrium, jacobians, state_range, steady_state
+from thruster_env.thruster.linear.operating import operating_points
 from thruster_env.thruster.linear.published import make_linear_plant
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.plant import (
@@ -29,12 +36,77 @@ from thruster_env.thruster.plant import (
     plant_data,
 )
 from thruster_env.thruster.preset_file import is_file, preset_mapping
-from tuning.problems.bound import average_bound
+from thruster_env.thruster.task import Task
+from tuning.problems.check import average_bound
 from tuning.problems.data import Data
-from tuning.problems.plain import plain
+from tuning.problems.excitation import EXCITATIONS, Excitation
 from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
-from tuning.problems.scenario import BaseScenario
-from tuning.thruster.excitation import voltages_of
+from tuning.problems.scenario import BaseScenario, plain
+
+# Voltages of the thruster's scenarios: any excitation of one input, and the closed loop that only it has.
+
+
+def voltages_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
+    """Voltages (B, steps) [V] for keys (B, 2), not yet clipped to the plant's range."""
+    if isinstance(excitation, ClosedLoop):
+        return excitation.voltages(plant, keys, steps)
+    return excitation.inputs(keys, steps, plant.dt, 1)[..., 0]
+
+
+@EXCITATIONS.register("pi")
+@dataclass(frozen=True)
+class ClosedLoop(Excitation):
+    """The voltage of a PI controller that makes the measured thrust follow a reference.
+
+    The loop is that of `BowThrusterTracking-v0` with the same seed and reference under `PIController.for_env`. It
+    is closed through the sensor with all its effects, not through a filter: all filters get the same voltages.
+
+    Args:
+        low: lowest level of the reference, as a fraction of the steady thrust at max_voltage.
+        high: highest level.
+        hold_time: time for which a level is held [s].
+    """
+
+    low: float = -0.5
+    high: float = 0.5
+    hold_time: float = 0.5
+
+    def __post_init__(self):
+        """Check the arguments."""
+        for name, value in self.reference[0].as_mapping().items():
+            if name != "name":
+                set_field(self, name, value)
+
+    @property
+    def reference(self) -> tuple[Effect, ...]:
+        """The reference's one signal."""
+        levels = {"low": self.low, "high": self.high, "hold_time": self.hold_time}
+        return REFERENCE_SIGNALS.make({"name": "steps", **levels})
+
+    def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
+        """Raise ValueError: the voltages depend on the thruster, see `voltages`."""
+        raise ValueError(
+            "the excitation 'pi' must be a thruster's, because it is a loop closed through its sensor"
+        )
+
+    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
+        """Voltages (B, steps) [V]; ValueError if the plant does not measure its thrust."""
+        if "thrust" not in plant.channels:
+            raise ValueError(f"a closed loop must measure the thrust, but got {', '.join(plant.channels)}")
+        controller = PIController(
+            plant, operating_points(plant), *lambda_gains(plant), plant.channels.index("thrust")
+        )
+        copies = Copies(plant, Task(self.reference), len(keys))
+        out, state, report = np.empty((len(keys), steps)), None, copies.begin(keys)
+        measured = slice(READINGS, READINGS + len(plant.channels))
+        for k in range(steps):
+            # float32, as an env's observation.
+            observation = np.concatenate([report[measured], report[[NEXT_REFERENCE]]]).T.astype(np.float32)
+            action, state = controller.predict(observation, state)
+            out[:, k] = action[:, 0]
+            report = copies.step(out[:, k])
+        return out
+
 
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 
@@ -206,3 +278,57 @@ def _range(plant: Plant) -> np.ndarray:
         return state_range(plant.parameters, plant.max_voltage)
     ends = (equilibrium(plant.linear, (sign * plant.max_voltage, 0.0)) for sign in (1.0, -1.0))
     return np.abs(np.subtract(*ends))[:2]
+
+
+# The scale of a thruster's scenario: its bound or, where there is none, the error of the open loop.
+
+
+SEQUENCES = 1200  # voltage sequences for a stored scale
+ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
+PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
+
+
+def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int = 100) -> np.ndarray:
+    """The scale (2,) of a scenario, over voltage sequences of the seeds 0, 1, 2, ...
+
+    It is `Scenario.bound`, and a score is then RMSE over the bound. Where there is no bound, because Q is
+    singular, it is the RMSE of the open loop: a score below 1 then shows what the measurements contribute.
+
+    Args:
+        scenario: its own scale is not used.
+        sequences: number of seeds.
+        truths: number of true paths drawn for each seed, for the bound.
+
+    Raises:
+        ValueError: if there is neither a bound nor a stable open loop, or the scale is zero or not finite.
+    """
+    data = scenario.data(range(at_least("sequences", sequences, 1)))
+    if scenario.has_bound:
+        what, scale = "the bound", scenario.bound(data, truths)
+    elif is_stable(scenario.plant):
+        open_loop = OpenLoop(model=model_of_plant(scenario.plant))
+        estimates = run(open_loop, data.filter_keys, data.inputs, data.measurements)
+        errors = (estimates.means - data.states)[:, data.late]
+        what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
+    else:
+        raise ValueError(
+            "a scenario needs a bound or a stable open loop as the scale of errors, but Q is singular, "
+            f"{list(scenario.process_noise_cov)}, and the open loop is unstable"
+        )
+    rounding = ROUNDING * np.sqrt(scenario.untuned["process_noise_cov"])
+    if not (np.isfinite(scale).all() and (scale > rounding).all()):
+        raise ValueError(f"scale must be positive in every state, but {what} is {scale.tolist()}")
+    return scale
+
+
+def is_stable(plant: Plant) -> bool:
+    """Whether the plant without feedback is stable: all modes decay, ahead and astern."""
+    if plant.linear is not None:
+        matrices = [plant.linear.a]
+    else:
+        voltages = (sign * part * plant.max_voltage for sign in (1.0, -1.0) for part in PARTS)
+        flow = plant.ambient_velocity
+        matrices = [
+            jacobians(plant.parameters, steady_state(plant.parameters, v, flow)[:2], v, flow)[0] for v in voltages
+        ]
+    return all(np.linalg.eigvals(a).real.max() < 0.0 for a in matrices)

@@ -12,9 +12,8 @@ from typing import Any
 
 from thruster_env.core.checks import one_of
 from tuning.problems.excitation import BinarySequence, Dwells, MultiSine
-from tuning.thruster.excitation import ClosedLoop
-from tuning.thruster.scale import computed_scale
-from tuning.thruster.scenario import Scenario
+from tuning.problems.files import find_in
+from tuning.thruster.scenario import ClosedLoop, Scenario, computed_scale
 
 # Bounds from 1200 voltage sequences and 100 truths each, accurate to half a per cent; a test recomputes them.
 NOMINAL_SCALE = (1.0753, 0.0464)
@@ -158,3 +157,16 @@ def main(names: list[str]) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1:])
+
+
+# The thruster's scenarios by name or file, for `tuning.problems.find`.
+
+
+__all__ = ["NAMES", "NOMINAL", "Scenario", "computed_scale", "find_scenario"]
+NAMES = tuple(SCENARIOS)
+NOMINAL = "nominal"
+
+
+def find_scenario(name: str) -> Scenario:
+    """A scenario by its name, or from a file that ends in .toml; ValueError for another."""
+    return find_in(SCENARIOS, Scenario, "the thruster's", name)

@@ -7,8 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from filters import make_filter
+from filters.engine.session import Session
 from tuning.evaluation.baselines import with_covariances
+from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.ways.task import Task
+from tuning.ways.way import INFLATION
 
 FORGETTING = 0.995  # of Q and R a step
 
@@ -66,3 +69,67 @@ def _diagonals(task: Task, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np
 
 sage_husa = converged("sage-husa", {"forgetting_factor": FORGETTING, "process_forgetting_factor": FORGETTING})
 vb = converged("vb", {"forgetting_factor": FORGETTING})
+
+
+# Adaptive inflation of an ensemble, after Anderson: from each innovation, and then its mean over all steps.
+
+
+DEVIATION = 0.1  # s at the beginning: how well lambda is known
+LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
+NEWTON = 8  # steps to the mode
+SETTLED = 0.25  # part of a run whose lambdas do not count
+
+
+def anderson(task: Task) -> None:
+    """Follow the factor lambda on the members' variance from innovation to innovation; then take its mean root.
+
+        d ~ N(0, lambda p + R_jj),   p = (S_jj - R_jj) / lambda before,   lambda ~ N(l, s^2)
+        l <- the mode of lambda given d,   1/s^2 <- the curvature of the log density there
+
+    for one channel after the other. The next step has it. Q and R stay; a spread that is too small because Q is
+    shows here, too. It needs one pass of the filter, step by step.
+
+    Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
+    Tellus A 59, with a lambda for all states alike; Anderson (2009), Tellus A 61.
+    """
+    one, found, start = FILTER_PARAMETERS[INFLATION], [], 1.0 + 1e-9  # so that there is one to change
+    choice = task.start._replace(numbers={**task.start.numbers, INFLATION: start})
+    for place, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        filter_, variances = choice.filter(problem), np.diag(task.model(choice, place).measurement_noise_cov)
+        for run in range(len(data.seeds)):
+            session, level, spread = Session(filter_), 1.0, DEVIATION
+            inputs, z = data.seen.inputs[run], data.seen.measurements[run]
+            session.start(data.filter_keys[run], z[0])
+            levels = []
+            for k in range(1, int(data.rows[run])):
+                session.set_parameter(INFLATION, level**0.5)
+                session.step(inputs[k - 1], z[k])
+                plain = (np.diag(session.innovation_cov) - variances) / level
+                for d, p, r in zip(session.innovation, plain, variances, strict=True):
+                    if d == d and d != 0.0 and p > 0.0:
+                        level, spread = updated(level, spread, d * d, p, r)
+                levels.append(level)
+            task.charge(1)
+            found += levels[int(SETTLED * len(levels)) :]
+    mean = float(np.clip(np.sqrt(found).mean(), one.low, one.high))
+    task.keep(task.start._replace(numbers={**task.start.numbers, INFLATION: mean}))
+
+
+def updated(level: float, spread: float, square: float, plain: float, noise: float) -> tuple[float, float]:
+    """Mode and deviation of lambda after an innovation with this square, by Newton's method with safe steps.
+
+    Args:
+        level: mean of lambda before.
+        spread: its standard deviation before.
+        square: d^2.
+        plain: variance p of what the members expect, without inflation.
+        noise: variance of the measurement.
+    """
+    at, curvature = level, 1.0 / spread**2
+    for _ in range(NEWTON):
+        total = at * plain + noise
+        slope = (level - at) / spread**2 + 0.5 * plain * (square - total) / total**2
+        # The expected curvature: always positive, so that each step climbs.
+        curvature = 1.0 / spread**2 + 0.5 * (plain / total) ** 2
+        at = max(at + slope / curvature, 0.25 * at)
+    return at, max(curvature**-0.5, LEAST_DEVIATION)

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 from thruster_env.core.checks import one_of
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
-from tuning.ways.adaptive import sage_husa, vb
-from tuning.ways.als import als
-from tuning.ways.anderson import anderson
-from tuning.ways.ascents import ascend
-from tuning.ways.descents import coordinate_steps, nelder_mead
+from tuning.ways.adaptive import anderson, sage_husa, vb
+from tuning.ways.correlations import als, desroziers, mehra
 from tuning.ways.em import em, squarem
-from tuning.ways.innovations import desroziers
-from tuning.ways.map import maximum_a_posteriori
-from tuning.ways.masked import masked
-from tuning.ways.mehra import mehra
-from tuning.ways.noise import noise_estimation
-from tuning.ways.nuts import nuts
-from tuning.ways.okf import okf
-from tuning.ways.posterior import posterior
-from tuning.ways.samplers import SLOWER, sample
-from tuning.ways.scoring import scoring
+from tuning.ways.okf import masked, okf
+from tuning.ways.posterior import maximum_a_posteriori, nuts, posterior
+from tuning.ways.scoring import noise_estimation, scoring
+from tuning.ways.searches import SLOWER, ascend, coordinate_steps, nelder_mead, sample
 from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, MODEL, NOISE, NUTPIE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"

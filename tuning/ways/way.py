@@ -11,7 +11,7 @@ from thruster_env.core.modules import to_install
 from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
-from tuning.ways.lagged import stationary
+from tuning.ways.correlations import stationary
 from tuning.ways.task import Spent, Task, way_out
 
 TRUTH = "truth"  # true states

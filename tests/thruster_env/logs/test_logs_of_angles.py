@@ -18,8 +18,7 @@ from tuning.identification.validation import validation_of
 from tuning.problems.data import Data
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
-from tuning.reporting.signal_figures import draw_signal
-from tuning.reporting.time_figures import draw_estimates
+from tuning.reporting.time_figures import draw_estimates, draw_signal
 
 DT, COUNT = 0.1, 401
 

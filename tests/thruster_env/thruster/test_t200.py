@@ -8,14 +8,18 @@ import pytest
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.linear.analysis import jacobians, required_substeps, steady_state
 from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
-from tuning.experiments.bollard_fit import Identified, PulseWidthMap, identify, predict, relative_errors
-from tuning.experiments.bollard_table import read_table
-from tuning.experiments.t200_identification import (
+from tuning.experiments.bollard import (
     PRESET,
     T200_PULSE_WIDTHS,
+    Identified,
+    PulseWidthMap,
     coefficients,
     identified_numbers,
+    identify,
     main,
+    predict,
+    read_table,
+    relative_errors,
     study,
 )
 

@@ -12,7 +12,7 @@ from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.text_tables import plain_text
 from thruster_env.logs.recorders.registry import fields
 from thruster_env.logs.table import read_table
-from tuning.cli.fields import as_table, sparkline
+from tuning.cli.log import as_table, sparkline
 
 COLUMNS = ("--column", "V_s=actuator_outputs.output[2]", "--column", "thrust=load_cell#1.force")
 

@@ -24,7 +24,7 @@ from thruster_env.thruster.preset_file import read_preset
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
-from tuning.search.filter_parameters import filter_parameters
+from tuning.search.parameters import filter_parameters
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.render import renderer as video
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.rendering.renderer import Moment, Overlay
-from tuning.cli import episodes
+from tuning.cli import play as episodes
 
 
 @pytest.fixture
@@ -122,6 +122,6 @@ def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
 
 
 def test_torch_is_not_imported():
-    code = "import sys, tuning.cli.play, tuning.cli.episodes; print('torch' in sys.modules)"
+    code = "import sys, tuning.cli.play, tuning.cli.play; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr

@@ -25,10 +25,10 @@ from tuning.api.run import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
 from tuning.cli.benchmark import fitted
-from tuning.cli.tuning_report import way_out
+from tuning.cli.tune import way_out
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem
-from tuning.reporting.figures import draw_history
+from tuning.reporting.search_figures import draw_history
 from tuning.search.interruption import STOPPING, stop_on_interrupt
 from tuning.search.plan import Plan
 

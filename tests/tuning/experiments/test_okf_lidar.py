@@ -4,15 +4,18 @@ import numpy as np
 import pytest
 
 from tuning.evaluation.baselines import with_covariances
-from tuning.experiments.lidar import BEARING, RANGE, drawn, lidar_problem
-from tuning.experiments.okf_lidar import (
+from tuning.experiments.lidar import (
+    BEARING,
     GRADIENT,
     IN_A_FIFTH,
     NOISE,
     OKF,
+    RANGE,
     WAYS,
     compared,
+    drawn,
     is_installed,
+    lidar_problem,
     markdown,
     okf_itself,
     row_of,

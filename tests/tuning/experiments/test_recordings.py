@@ -8,14 +8,32 @@ import pytest
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
-from tuning.experiments.recordings.clock import clock_offset
-from tuning.experiments.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_of
-from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
-from tuning.experiments.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
+from tuning.experiments.recordings.identification import (
+    CHOSEN,
+    STRUCTURES,
+    Structure,
+    identified,
+    identify_all,
+    tasks_of,
+    thrusts,
+)
+from tuning.experiments.recordings.measure import (
+    LOOKUP,
+    OURS,
+    OWN,
+    STATIC,
+    after_reversal,
+    averaged,
+    best_rmse,
+    error,
+    estimates_of,
+    ratios,
+    regimes,
+    rmse,
+    settled_rmse,
+)
 from tuning.experiments.recordings.model import DT, model, to_identify
-from tuning.experiments.recordings.regime import after_reversal, regimes
-from tuning.experiments.recordings.results import identify_all, tasks_of
-from tuning.experiments.recordings.runs import read_recordings
+from tuning.experiments.recordings.runs import clock_offset, read_recordings
 from tuning.experiments.recordings.tables import ladder_rows, number_rows
 from tuning.identification.values import valued
 
@@ -140,7 +158,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
 
     asked = []
     monkeypatch.setattr(
-        "tuning.experiments.recordings.results.identified",
+        "tuning.experiments.recordings.identification.identified",
         lambda structure, *_: asked.append(structure) or Learnt(structure),
     )
     file, told = tmp_path / "results.json", []

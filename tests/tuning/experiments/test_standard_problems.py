@@ -23,7 +23,7 @@ from tuning.experiments.benchmark import (
     mean_of_roots,
     noise_free_problem,
 )
-from tuning.experiments.tuned_inflation import tune_inflation
+from tuning.experiments.lorenz96 import tune_inflation
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.seeds import held_out_seeds

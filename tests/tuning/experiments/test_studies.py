@@ -12,11 +12,20 @@ from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear.published import PUBLISHED
 from tuning.cli.main import main
 from tuning.experiments import STUDIES
-from tuning.experiments.comparison import compare, compare_all, discrete_model, optimum
-from tuning.experiments.findings import findings, study_statements
-from tuning.experiments.published import NOISE_LEVELS, STEPS, SYSTEMS, H
-from tuning.experiments.series import series
-from tuning.experiments.unupdated_ensemble import unupdated_ensemble_means
+from tuning.experiments.thruster_papers import (
+    NOISE_LEVELS,
+    STEPS,
+    SYSTEMS,
+    H,
+    compare,
+    compare_all,
+    discrete_model,
+    findings,
+    optimum,
+    series,
+    study_statements,
+    unupdated_ensemble_means,
+)
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {

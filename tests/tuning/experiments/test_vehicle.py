@@ -9,10 +9,21 @@ from tests.tuning.experiments.test_studies import command_line
 from tuning.cli import output
 from tuning.experiments import VEHICLE_STUDIES, ngatini2017, ngatini2019
 from tuning.experiments.vehicle import estimators
-from tuning.experiments.vehicle.estimators import kalman, measured
+from tuning.experiments.vehicle.estimators import (
+    MeanPropagatingEnKF,
+    full_pose,
+    kalman,
+    measured,
+    planar_pose,
+    pose_errors,
+    reckoned_attitude,
+)
 from tuning.experiments.vehicle.experiment import (
+    PAPERS,
+    PATHS,
     Task,
     along_path,
+    find_path,
     keys_of,
     measured_velocities,
     noise_free,
@@ -20,15 +31,9 @@ from tuning.experiments.vehicle.experiment import (
     scores_of,
     true_runs,
 )
-from tuning.experiments.vehicle.findings import why_different
-from tuning.experiments.vehicle.mean_propagation import MeanPropagatingEnKF
 from tuning.experiments.vehicle.models import papers_model
-from tuning.experiments.vehicle.paths import PATHS, find_path
-from tuning.experiments.vehicle.pose import full_pose, planar_pose, pose_errors, reckoned_attitude
 from tuning.experiments.vehicle.printed import DT, NOISE, PrintedRow
-from tuning.experiments.vehicle.statements import GOLDEN, MEAN_ONLY, unstable_corners
-from tuning.experiments.vehicle.tasks import PAPERS
-from tuning.experiments.vehicle.wording import digits
+from tuning.experiments.vehicle.statements import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code
     "I": (-2.415, 3.789, 0.114),

@@ -11,11 +11,18 @@ from scipy.stats import ttest_1samp, ttest_rel
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments.ways import runs as study_runs
 from tuning.experiments.ways.entries import Result, Scored, data_set, reference, run_way, start_of
-from tuning.experiments.ways.predictions import PREDICTIONS
-from tuning.experiments.ways.problems import CASES, GROUPS, QUICK, ring
-from tuning.experiments.ways.protocol import ENTRIES, FAST, REFERENCE, Protocol
-from tuning.experiments.ways.runs import file_of, jobs_of, run_protocol
-from tuning.experiments.ways.statistics import chance, regrets, student
+from tuning.experiments.ways.problems import (
+    CASES,
+    ENTRIES,
+    FAST,
+    GROUPS,
+    PREDICTIONS,
+    QUICK,
+    REFERENCE,
+    Protocol,
+    ring,
+)
+from tuning.experiments.ways.runs import chance, file_of, jobs_of, regrets, run_protocol, student
 from tuning.experiments.ways.tables import percent, tables
 
 WALK = QUICK[0]

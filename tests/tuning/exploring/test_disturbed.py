@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tuning.exploring.bench import Bench
-from tuning.exploring.disturbed import disturbances_of, disturbed
+from tuning.exploring.knobs import disturbances_of, disturbed
 from tuning.problems.find import find_problem
-from tuning.problems.plain import plain
+from tuning.problems.scenario import plain
 
 SEEDS = range(3)
 

@@ -12,18 +12,17 @@ pytest.importorskip("stable_baselines3")
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.policies.classical import classical_policy
 from tuning.policies.comparison import runs
-from tuning.policies.comparison.answers import answers
 from tuning.policies.comparison.plan import BEST, CLASSICAL, QUICK, VARIANTS, WRONG, Comparison, Run, runs_of
 from tuning.policies.comparison.runs import Result, run_comparison
 from tuning.policies.comparison.statistics import as_interval, typical_error, typical_return
-from tuning.policies.comparison.tables import HEADER, rows_of, summary_rows
+from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
 from tuning.policies.environments import make_environments
 from tuning.policies.plants.plant import Part
 from tuning.policies.plants.thruster import FIRST_SCORED_STEP, THRUSTER
 from tuning.policies.score import Scores, run_episodes, score
 from tuning.policies.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 MEDIUM = find_scenario("medium_noise")
 SEEDS = held_out_seeds(0, 3)

@@ -16,9 +16,7 @@ from thruster_env.core.threads import wait_policy
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.model import new_model
-from tuning.policies.rollouts import EpochBuffer
-from tuning.policies.tanh import NumpyTanh, numpys_tanh
-from tuning.policies.torch_settings import learning
+from tuning.policies.torch_settings import EpochBuffer, NumpyTanh, learning, numpys_tanh
 
 SEEDS = range(4)
 

@@ -9,15 +9,14 @@ pytest.importorskip("stable_baselines3")
 
 from tuning.cli.study import app
 from tuning.policies.classical import classical_policy
-from tuning.policies.comparison.answers import GOAL
 from tuning.policies.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
-from tuning.policies.comparison.tables import HEADER, name_of
+from tuning.policies.comparison.tables import GOAL, HEADER, name_of
 from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.plants.find import TASKS
 from tuning.policies.score import score
 from tuning.policies.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "policies.md").read_text()

@@ -18,7 +18,7 @@ from tuning.policies.environments import make_environments, make_single
 from tuning.policies.observations import OBSERVATION_SETS, STACKED
 from tuning.policies.setup import in_scenario, make_configuration
 from tuning.policies.vec_env import NativeVecEnv
-from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30
 SEEDS = [7, 107, 5]

@@ -14,10 +14,16 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.als import semidefinite
-from tuning.ways.anderson import updated
-from tuning.ways.lagged import Noise, autocovariances, lagged, stationary, steady_gain
-from tuning.ways.mehra import mehra_equations
+from tuning.ways.adaptive import updated
+from tuning.ways.correlations import (
+    Noise,
+    autocovariances,
+    lagged,
+    mehra_equations,
+    semidefinite,
+    stationary,
+    steady_gain,
+)
 from tuning.ways.registry import find_way
 from tuning.ways.task import Budget, Task
 
@@ -285,7 +291,7 @@ def test_fisher_scoring_ends_where_l_bfgs_ends():
 
 
 def test_als_refuses_what_it_cannot_do():
-    from tuning.thruster.find import find_scenario
+    from tuning.thruster.scenarios import find_scenario
 
     problem = find_scenario("nominal")
     task = Task("ekf", problem, problem.data(range(2)))

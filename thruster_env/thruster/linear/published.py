@@ -21,7 +21,7 @@ Other open questions of the print:
   the trace gives 523.83.
 - Open-bladed: B_11 = 0.65 here; Nurhadi et al. print 0.065, but the printed B_d follows from 0.65 only.
 - The tunnel's C serves as measurement matrix in both cases of the papers' runs: see
-  `tuning.experiments.published`.
+  `tuning.experiments.thruster_papers`.
 
 Sources: M. Kiki (2020), final project KM184801, Institut Teknologi Sepuluh Nopember, Surabaya (in Indonesian);
 H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), IJECE 12(6), 5988-5997,

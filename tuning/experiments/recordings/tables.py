@@ -7,10 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.experiments.recordings.comparison import OURS, structure_ratios
-from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES
-from tuning.experiments.recordings.measure import ratios, rmse, settled_rmse
-from tuning.experiments.recordings.results import Task
+from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES, Task
+from tuning.experiments.recordings.measure import OURS, ratios, rmse, settled_rmse, structure_ratios
 from tuning.experiments.recordings.runs import Recording
 
 MEAN = "mean"

@@ -1,19 +1,196 @@
-"""Which filters the studies of the vehicle compare, by name."""
+"""Which filters the studies of the vehicle compare, by name.
+
+Integrals are by the trapezoidal rule. Yaw counts full turns; its errors are the short way round.
+
+Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, FuzzyKalmanFilter, UnscentedKalmanFilter
+from filters.algebra.members import mean
+from filters.engine.belief import Kernels, memory_places
 from filters.filter import Filter
+from filters.pages.kernels import page_kernels
+from filters.pages.page import Page
+from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes, planar_kinematics
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.experiments.vehicle.mean_propagation import MeanPropagatingEnKF
 from tuning.experiments.vehicle.models import papers_model
-from tuning.experiments.vehicle.own_attitude import OwnAttitudeKalmanFilter
 from tuning.experiments.vehicle.printed import FUZZY_HIGH, FUZZY_LOW
+
+# Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
+
+
+POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
+
+
+@inlined
+def next_attitude(phi, theta, before, after, dt):
+    """Roll and pitch [rad] a step later, by Heun's rule; p, q, r [rad/s] were before and are after."""
+    rolling, pitching, _ = angle_rates(attitude_of(phi, theta), before[0], before[1], before[2])
+    there = attitude_of(phi + dt * rolling, theta + dt * pitching)
+    rolling_there, pitching_there, _ = angle_rates(there, after[0], after[1], after[2])
+    half = 0.5 * dt
+    return phi + half * (rolling + rolling_there), theta + half * (pitching + pitching_there)
+
+
+@cache
+def _attitude_reckoner(interpreting: bool) -> CompiledOrPython:
+    fingerprint = function_fingerprint(next_attitude, within=__name__)
+
+    def reckon(rates, dt, attitudes):
+        fingerprint  # noqa: B018 - part of the cache's key
+        for b in range(rates.shape[0]):
+            phi = theta = 0.0
+            for k in range(1, rates.shape[1]):
+                before = rates[b, k - 1, 0], rates[b, k - 1, 1], rates[b, k - 1, 2]
+                after = rates[b, k, 0], rates[b, k, 1], rates[b, k, 2]
+                phi, theta = next_attitude(phi, theta, before, after, dt)
+                attitudes[b, k, 0] = phi
+                attitudes[b, k, 1] = theta
+
+    return CompiledOrPython(reckon)
+
+
+def reckoned_attitude(velocities: np.ndarray, dt: float) -> np.ndarray:
+    """Roll and pitch (B, K + 1, 2) [rad] from p, q, r of velocities (B, K + 1, 6), level at the start."""
+    attitudes = np.zeros((*velocities.shape[:2], 2))
+    _attitude_reckoner(is_interpreting())(np.ascontiguousarray(velocities[..., 3:]), dt, attitudes)
+    return attitudes
+
+
+def full_pose(velocities: np.ndarray, attitudes: np.ndarray | None, dt: float) -> np.ndarray:
+    """Position x, y, z [m] and yaw [rad], (B, K + 1, 4), by the full transformation from the origin.
+
+    Args:
+        velocities: u, v, w [m/s] and p, q, r [rad/s] in the body's axes, (B, K + 1, 6).
+        attitudes: roll and pitch [rad], (B, K + 1, 2); dead-reckoned from the velocities if None.
+        dt: time of a step [s].
+    """
+    if attitudes is None:
+        attitudes = reckoned_attitude(velocities, dt)
+    u, v, w, p, q, r = np.moveaxis(velocities, -1, 0)
+    attitude = attitude_of(attitudes[..., 0], attitudes[..., 1])
+    yaw = _integral(angle_rates(attitude, p, q, r)[2], dt)
+    return np.stack([*(_integral(rate, dt) for rate in in_earth_axes(attitude, yaw, u, v, w)), yaw], axis=-1)
+
+
+def planar_pose(velocities: np.ndarray, dt: float) -> np.ndarray:
+    """The same by the papers' transformation, which turns by yaw alone: z' = w, psi' = r."""
+    components = np.moveaxis(velocities, -1, 0)
+    yaw = _integral(components[5], dt)
+    rates = planar_kinematics(tuple(components), yaw)
+    return np.stack([*(_integral(rate, dt) for rate in rates[:3]), yaw], axis=-1)
+
+
+def pose_errors(poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
+    """Errors (..., 4) of positions [m] and of yaw [rad], which are the short way round."""
+    return difference(poses, true_poses, POSE_ANGLES)
+
+
+def _integral(rates: np.ndarray, dt: float) -> np.ndarray:
+    return cumulative_trapezoid(rates, dx=dt, initial=0.0)
+
+
+# An extended Kalman filter of six velocities that takes roll and pitch from its own dead reckoning.
+
+
+KEPT = 5  # roll, pitch and the last p, q, r
+
+
+@lru_cache(maxsize=64)
+def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the extended filter for a model whose last two inputs are roll and pitch."""
+    n, m, inner = shape.n, shape.m, page_kernels(ExtendedKalmanFilter.page, functions, shape)
+    places, source, constants = memory_places(n, m), number_places(n, m), constants_reader(shape)
+    start_filter, predict_filter, update_filter = inner.start, inner.predict, inner.update
+    mean, step, kept, substeps = places.mean, places.step, places.extras, source.substeps
+    roll, pitch = shape.inputs - 2, shape.inputs - 1
+
+    @inlined
+    def start(memory, numbers, size):
+        start_filter(memory, numbers, size)
+        for i in range(KEPT):
+            memory[0][kept + i] = 0.0
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        u[roll] = row[kept]
+        u[pitch] = row[kept + 1]
+        predict_filter(memory, u, numbers, size)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        update_filter(memory, z, numbers, size)
+        after = row[mean + 3], row[mean + 4], row[mean + 5]
+        if row[step] > 0.0:
+            before = row[kept + 2], row[kept + 3], row[kept + 4]
+            dt = constants(numbers).substep * numbers[substeps]
+            row[kept], row[kept + 1] = next_attitude(row[kept], row[kept + 1], before, after, dt)
+        row[kept + 2], row[kept + 3], row[kept + 4] = after
+
+    return inner._replace(start=start, predict=predict, update=update, extras=KEPT, vectors=())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnAttitudeKalmanFilter(ExtendedKalmanFilter):
+    """The extended Kalman filter of u, v, w, p, q, r with its own attitude.
+
+        predict: with roll and pitch as inputs, integrated from its estimates of p, q, r
+        update:  that of `ExtendedKalmanFilter`, then roll and pitch a step further by Heun's rule
+
+    It treats the attitude as known, so its covariance is too small. The given roll and pitch, the last two inputs
+    of the model `auv_model(states="velocities")`, are overwritten. The vehicle starts level.
+    """
+
+    name: ClassVar[str] = "own attitude"
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        model = self.kernel_model
+        return own_attitude_kernels(model.functions, model.shape)
+
+
+# The ensemble Kalman filter as printed in one paper: every member is predicted from the mean, not from itself.
+
+
+def advance_from_the_mean(model, x, u):
+    """One of the model's substeps, of all members at once."""
+    return model.f(mean(x), u)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeanPropagatingEnKF(EnsembleKalmanFilter):
+    """The stochastic ensemble Kalman filter with a forecast that forgets the members.
+
+        predict: x_j = f(mean, u) + w_j,  w_j ~ N(0, Q)
+        update:  that of `EnsembleKalmanFilter`
+
+    The members' covariance before an update is always Q, so the gain is Q H' (H Q H' + R)^-1: correlations that
+    the model builds up over steps, such as of heave and pitch, are not used, and states that H does not contain
+    are those of the model alone. With Q = R a state that is measured directly is estimated with the variance 2/3
+    R; a correct filter has 0.618 R. It should not be used, so it is here and not in `filters`.
+
+    Source: Ngatini, Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), equation (24), which has no
+    index on the state that is moved; probably a misprint, for the authors' slides of 2017 have one.
+    """
+
+    name: ClassVar[str] = "mean-propagating enkf"
+    page: ClassVar[Page] = EnsembleKalmanFilter.page._replace(propagate=advance_from_the_mean)
+
 
 MEMBERS = (50, 100, 200, 300)
 NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: approximate range on the paths after the start

@@ -1,10 +1,16 @@
 """All filters on the same runs of a path: truth, estimates and scores.
 
 NEES is the normalised estimation error squared.
+
+The papers do not define their paths. These are ours with the same names: each starts at rest at the origin,
+and on IV the planes are chosen so that the path ends at the printed point, (10, 18, 6) m.
+
+NEES is the normalised estimation error squared.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -12,18 +18,128 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.bounds import path_bound
+from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
 from filters.consistency.nees import normalized_squares
 from filters.engine.batch import run
 from filters.filter import Filter
 from filters.wrapped import wrapped_variances
-from thruster_env.core.checks import at_least
+from thruster_env.core.checks import at_least, one_of
 from thruster_env.model.simulate import Truth, simulate
-from tuning.experiments.vehicle.estimators import Estimator
+from tuning.experiments import ngatini2017, ngatini2019
+from tuning.experiments.vehicle.estimators import (
+    Estimator,
+    ensembles,
+    full_pose,
+    fuzzy,
+    kalman,
+    measured,
+    planar_pose,
+    pose_errors,
+)
 from tuning.experiments.vehicle.models import papers_model
-from tuning.experiments.vehicle.paths import PATHS, find_path
-from tuning.experiments.vehicle.pose import full_pose, planar_pose, pose_errors
-from tuning.experiments.vehicle.printed import DT, MEASURED, RUNS
-from tuning.experiments.vehicle.scores import Scores, joined
+from tuning.experiments.vehicle.printed import DT, MEASURED, RUNS, Paper
+
+# The vehicle's inputs over time on each of the papers' five paths.
+
+
+THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed
+TORQUE_ARM = -0.006  # propeller's torque over its thrust [m]
+TORQUE = -0.017  # [N m]; that of the constant thrust
+
+
+class Manoeuvre(NamedTuple):
+    """Constant thrust and planes, or ones that change sign."""
+
+    meaning: str
+    stern: float  # angle of the stern plane [deg]
+    rudder: float  # [deg]
+    duration: float  # [s]
+    stern_period: float = math.inf  # of a full cycle of the sign [s]
+    rudder_period: float = math.inf
+    thrust_period: float = math.inf
+    thrust_swing: float = 0.0  # as a fraction of the thrust
+
+    @property
+    def steps(self) -> int:
+        """Steps of DT within the duration."""
+        return math.floor(self.duration / DT)
+
+    def inputs(self, steps: int | None = None) -> np.ndarray:
+        """X_prop [N], K_prop [N m], delta_s and delta_r [rad] of the first so many steps, all if None, (K, 4)."""
+        time = DT * np.arange(self.steps if steps is None else min(steps, self.steps))
+        swing = self.thrust_swing * switching(time, self.thrust_period)
+        torque = np.full(len(time), TORQUE) if self.thrust_swing == 0.0 else TORQUE_ARM * THRUST * (1.0 + swing)
+        stern = math.radians(self.stern) * switching(time, self.stern_period)
+        rudder = math.radians(self.rudder) * switching(time, self.rudder_period)
+        return np.stack([THRUST * (1.0 + swing), torque, stern, rudder], axis=1)
+
+
+def switching(time: np.ndarray, period: float) -> np.ndarray:
+    """Sign of sin(2 pi t/period), which is 1 at the start and for ever where the period is infinite."""
+    return np.where((time / period) % 1.0 < 0.5, 1.0, -1.0)
+
+
+PATHS = {
+    "I": Manoeuvre("turn", 0.0, -5.0, 25.0),
+    "II": Manoeuvre("dive", 5.0, 0.0, 25.0),
+    "III": Manoeuvre("straight", 0.0, 0.0, 25.0),
+    "IV": Manoeuvre("three-dimensional", 6.0483275, -1.3502966, 31.560424),
+    "dynamic": Manoeuvre("dynamic", 5.0, 5.0, 25.0, 14.0, 10.0, 9.0, 0.4),
+}
+"""By name. The meanings of I, II and III are inferred from the order of a conclusion."""
+
+
+def find_path(name: str) -> Manoeuvre:
+    """A path by name; ValueError for an unknown one."""
+    return PATHS[one_of("path", name, tuple(PATHS))]
+
+
+# Scores of a filter: mean squares by run, from which intervals and ratios follow.
+
+
+class Scores(NamedTuple):
+    """A filter's errors in B runs; NaN where it has no estimate.
+
+    Velocities are u, v, w [m/s] and p, q, r [rad/s], attitude is roll and pitch [rad]; both are scored from 2 s
+    on, as the NEES is. A pose is x, y, z [m] and psi [rad], scored over the whole run as the papers do, it seems.
+    """
+
+    velocities: np.ndarray  # (B, 6), mean squares
+    attitude: np.ndarray  # (B, 2), mean squares
+    full: np.ndarray  # (B, 4), mean squares of the pose by the full transformation
+    planar: np.ndarray  # (B, 4), the same by yaw alone
+    planar_both: np.ndarray  # (B, 4), by yaw alone, against the path that true velocities give by yaw alone
+    full_end: np.ndarray  # (B, 4), absolute errors at the end
+    planar_end: np.ndarray  # (B, 4)
+    nees: np.ndarray  # (B,), mean
+    divergences: np.ndarray  # (B,), filter resets: restarts from the prior
+    seconds: np.ndarray  # (B,), of one core
+
+    def rmse(self, field: str) -> np.ndarray:
+        """RMSE of each component of a field of mean squares."""
+        return np.sqrt(getattr(self, field).mean(axis=0))
+
+    def intervals(self, field: str) -> tuple[Interval, ...]:
+        """The same with 95 % intervals by bootstrap over runs."""
+        return rmse_intervals(getattr(self, field))
+
+    @property
+    def nees_interval(self) -> Interval:
+        """Mean NEES with its interval."""
+        return mean_interval(self.nees)
+
+
+def joined(parts: Sequence[Scores]) -> Scores:
+    """Scores of all runs from those of some at a time."""
+    return Scores(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
+    """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
+    above, below = (getattr(one, field)[:, :3].sum(axis=1) for one in (a, b))
+    ratios = np.sqrt(resampled_means(above) / resampled_means(below))
+    return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
+
 
 MOST_RUNS = 10_000
 AT_A_TIME = (
@@ -214,3 +330,23 @@ def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
         np.sqrt(variances[:, [9, 10, 11, 8]].mean(axis=0)),
     )
     return pose[-1], np.sqrt(np.square(gap).mean(axis=0)), outside, bound
+
+
+# The filters of each paper's study, with their paths and worlds.
+
+
+PAPERS: dict[str, Paper] = {module.PAPER.name: module.PAPER for module in (ngatini2017, ngatini2019)}
+OTHER_WORLD = "no restoring moments"
+
+
+def tasks_of(paper: str) -> list[Task]:
+    """The tasks of "ngatini2017" or "ngatini2019"; ValueError for another name."""
+    if one_of("paper", paper, tuple(PAPERS)) == ngatini2019.PAPER.name:
+        return [Task("IV", "vehicle", [measured(), *kalman(), *ensembles(8)])]
+    (printed, *others), ekf8, enkf = fuzzy(), kalman()[0], ensembles(8, members=(ngatini2017.MEMBERS,))[0]
+    few = [measured(), ekf8, enkf, printed]
+    paths = [Task(name, "vehicle", few) for name in ("I", "II", "III")]
+    paths += [Task(name, "vehicle", [*few, *others]) for name in ("IV", "dynamic")]
+    ekf8, _, ekf6, _ = kalman(OTHER_WORLD)
+    there = [measured(), ekf8, ekf6, *ensembles(6, OTHER_WORLD), *fuzzy(OTHER_WORLD)]
+    return [*paths, Task("dynamic", OTHER_WORLD, there)]

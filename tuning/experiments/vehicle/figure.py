@@ -13,10 +13,8 @@ from filters.logs.figure import plot_style
 from thruster_env.core.checks import at_least
 from thruster_env.core.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from tuning.experiments import ngatini2017, ngatini2019
-from tuning.experiments.vehicle.estimators import Estimator, ensembles, fuzzy
-from tuning.experiments.vehicle.experiment import estimate, keys_of, true_runs
-from tuning.experiments.vehicle.paths import PATHS
-from tuning.experiments.vehicle.pose import full_pose, planar_pose
+from tuning.experiments.vehicle.estimators import Estimator, ensembles, full_pose, fuzzy, planar_pose
+from tuning.experiments.vehicle.experiment import PATHS, estimate, keys_of, true_runs
 from tuning.experiments.vehicle.printed import DT
 
 TRUTH = "truth"

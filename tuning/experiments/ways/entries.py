@@ -15,9 +15,11 @@ import numpy as np
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
-from tuning.experiments.ways.problems import FULL, LIDAR_RUNS, LIDAR_SETS, Case, lidar
-from tuning.experiments.ways.protocol import (
+from tuning.experiments.ways.problems import (
     FROM_NOISE,
+    FULL,
+    LIDAR_RUNS,
+    LIDAR_SETS,
     ORACLE,
     REFERENCE,
     RUNS,
@@ -28,7 +30,9 @@ from tuning.experiments.ways.protocol import (
     STUDY_LOG_SCORE,
     TRIALS,
     WITH_FULL,
+    Case,
     Protocol,
+    lidar,
 )
 from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.likelihood.gradient import optimum

@@ -17,6 +17,7 @@ from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
+from tuning.ways.registry import WAYS
 
 NOTHING: Mapping[str, bool] = {}
 FULL: Mapping[str, bool] = {"full_q": True, "full_r": True}
@@ -190,3 +191,73 @@ CASES = (
     *(Case(f"velocity, {runs} runs", "H", velocity, "kf", runs=runs) for runs in (1, 3, 10)),
 )
 QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "kf", runs=4, truth=False))
+
+
+# How much is done: cases, ways, data sets and budgets.
+
+
+RUNS, SECONDS = (1e3, 1e4, 1e5), (1.0, 10.0, 100.0)  # budgets
+STARTS = ((1.0, 1.0), (100.0, 1.0), (0.01, 100.0))  # factors on the rule of thumb's Q and R, by turns of data sets
+REFERENCE = "reference"  # the best constant numbers
+START, SCALED, ORACLE = "start", "scaled default", "oracle"
+STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
+TRIALS = 50
+WITH_FULL = ", full"  # behind a way: it tunes full Q and R, where the others of a case tune diagonals
+FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
+FULL_WAYS = (
+    *(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood", "als")),
+    *(f"{way}{FROM_NOISE}" for way in ("mse", "log-score")),
+)
+ENTRIES = (*WAYS, *FULL_WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
+
+
+class Protocol(NamedTuple):
+    """How much is done."""
+
+    cases: tuple[Case, ...] = CASES
+    ways: tuple[str, ...] = ENTRIES
+    sets: int = 20
+    runs: float = max(RUNS)
+    seconds: float = max(SECONDS)
+    held_out: int = 200
+    many: int = 2000  # runs for the reference ...
+    starts: int = 20  # ... and its starts
+
+
+FAST = Protocol(
+    QUICK, ("likelihood", "log-score", "em", "noise-estimation", "random", START), 3, 200, 2.0, 20, 20, 2
+)
+
+
+# What the authors of the ways, and we, would predict of the study; written before its first run.
+
+
+class Prediction(NamedTuple):
+    """A statement that the study can contradict."""
+
+    who: str
+    says: str
+
+
+PREDICTIONS = (
+    Prediction("Greenberg et al. (OKF)", "Adam on the error beats noise estimation wherever the model is wrong."),
+    Prediction("Abbeel et al.", "The log score beats likelihood and noise estimation on real error."),
+    Prediction("Chen et al.", "A consistent NIS finds Q and R, and no local minimum holds it."),
+    Prediction("Rawlings et al.", "ALS equals maximum likelihood on long runs of a linear model."),
+    Prediction("Dunik et al.", "Likelihood is the most accurate, correlation methods 10 to 100 times faster."),
+    Prediction("Durbin, Koopman", "Maximum likelihood is efficient where the model is right."),
+    Prediction("Shumway, Stoffer", "EM ends where maximum likelihood ends, slowly."),
+    Prediction("Sarkka, Nummenmaa", "A converged adaptive filter loses 1 to 3 % on constant noise."),
+    Prediction(
+        "Desroziers et al.", "Innovations tell R and a factor on Q within 2 % of the best, without a search."
+    ),
+    Prediction("The MathWorks", "A step up or half of it, a number at a time, is enough."),
+    Prediction("we", "A model that is right: noise estimation is best and free."),
+    Prediction(
+        "we", "A model that is right, one to three runs: likelihood beats tuning on truth of the same runs."
+    ),
+    Prediction("we", "From ten numbers on, gradients beat samplers by 5 % in a tenth of the time."),
+    Prediction("we", "The log score is within 2 % of the least error, with a NEES near 1, everywhere."),
+    Prediction("we", "Ways without truth lose less than 5 % but on wrong models."),
+    Prediction("we", "Random search within 1e4 runs is beaten by every search but coordinate steps."),
+)

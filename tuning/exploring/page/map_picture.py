@@ -9,12 +9,11 @@ from bokeh.events import Tap
 from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, CustomJSTickFormatter, LogColorMapper
 from bokeh.palettes import Cividis256, RdBu11
 
+from tuning.exploring.bench import Trial
+from tuning.exploring.exported import Map
 from tuning.exploring.knobs import Knob
-from tuning.exploring.maps import Map
-from tuning.exploring.page.colours import Colours, paint
+from tuning.exploring.page.pictures import Colours, new_figure, paint
 from tuning.exploring.page.sent import Sent, as_sent
-from tuning.exploring.page.signal import new_figure
-from tuning.exploring.trials import Trial
 
 HEIGHT = 330  # [px]
 BAD = 5.0  # times the least score, where the scale of colours ends

@@ -16,8 +16,8 @@ import numpy as np
 from tuning.policies.setup import TrainingConfiguration, make_configuration
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import find_scenario
 
 TASK = "manoeuvre"
 NOISES = {"low": "low_noise", "medium": "medium_noise", "high": "high_noise"}  # names of scenarios

@@ -9,11 +9,10 @@ from pathlib import Path
 
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
-from tuning.policies.comparison.answers import answers
 from tuning.policies.comparison.figures import cost_against_error, learning_curves
 from tuning.policies.comparison.plan import Comparison
 from tuning.policies.comparison.runs import Result
-from tuning.policies.comparison.tables import HEADER, rows_of, summary_rows
+from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
 
 PAGE = "policies.md"
 CURVES, ERRORS = "policies_curves.png", "policies_errors.png"

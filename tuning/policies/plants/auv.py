@@ -14,9 +14,8 @@ from thruster_env.auv.model import MODEL_ARGUMENTS, auv_model
 from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
 from thruster_env.env.commands import ObserveState
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
-from tuning.auv.scenarios import SCENARIOS
+from tuning.auv.scenarios import SCENARIOS, find_scenario
 from tuning.policies.algorithms import LAYERS
 from tuning.policies.observations import find_observation_set
 from tuning.policies.plants.plant import Part, Task, TrainingPlant, part_of

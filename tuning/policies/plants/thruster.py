@@ -15,9 +15,8 @@ from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.task import thrust_scale
 from tuning.policies.plants.plant import Part, Task, TrainingPlant, part_of
 from tuning.problems.scenario import BaseScenario
-from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.thruster.scenarios import SCENARIOS, find_scenario
 
 TRANSIENT = 0.15  # [s] after a step of the reference; later steps are steady tracking
 STEP_OF_REFERENCE = 0.02  # least change within one sample time that is a step [T_max]

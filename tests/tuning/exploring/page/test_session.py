@@ -18,8 +18,8 @@ from bokeh.document import Document
 from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
 from tuning.exploring.figure import present
-from tuning.exploring.page.colours import DARK, HELD
 from tuning.exploring.page.document import page_of
+from tuning.exploring.page.pictures import DARK, HELD
 from tuning.exploring.page.sent import as_sent
 from tuning.exploring.page.server import Server
 from tuning.exploring.page.session import Session, _plain

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tuning.exploring.page.thinning import corners, extremes, places
+from tuning.exploring.page.pictures import corners, extremes, places
 
 
 def test_a_short_run_is_drawn_whole():

@@ -1,4 +1,4 @@
-"""Ways down an objective without its gradient: the downhill simplex, and one number at a time."""
+"""Ways by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts."""
 
 from __future__ import annotations
 
@@ -6,10 +6,40 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import optuna
+from optuna.distributions import BaseDistribution
 
-from tuning.problems.coordinates import Coordinates
+from tuning.likelihood.gradient import optimum, start_at, starts_of
+from tuning.problems.parameter import Coordinates
+from tuning.search.quiet import quiet_optuna
+from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice
 from tuning.ways.task import Task
+
+
+def ascend(objective: str) -> Callable[[Task], None]:
+    """The way that follows the gradient of an objective: from the task's start, then from those of `starts_of`.
+
+    It is what `tune_by_gradient` does, which adds standard errors.
+    """
+
+    def follow(task: Task) -> None:
+        goal = task.goal(objective)
+        coordinates = goal.coordinates
+        first = np.clip(coordinates.of(goal.untuned), coordinates.low, coordinates.high)
+        best = optimum(goal, first)
+        task.keep(goal.choice_at(coordinates.of(best.parameters)))
+        for factors in starts_of(coordinates.free)[1:]:
+            other = optimum(goal, np.clip(start_at(goal, factors), coordinates.low, coordinates.high))
+            if other.value > best.value:
+                best = other
+            task.keep(goal.choice_at(coordinates.of(best.parameters)))
+
+    return follow
+
+
+# Ways down an objective without its gradient: the downhill simplex, and one number at a time.
+
 
 FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
 ITERATIONS, LIMIT = 20, 0.1  # MATLAB's defaults: passes over all numbers, and the RMS error that is small enough
@@ -87,3 +117,39 @@ def coordinate_steps(task: Task) -> None:
                     break
         if least == before:
             return
+
+
+# Ways that ask one of Optuna's samplers for trials, and know of an objective nothing but its values.
+
+
+MOST_TRIALS = 10_000
+SLOWER = 10  # steps from one measurement to the next at the second sample time: 0.1 s and 1 s in the source
+
+
+def sample(sampler: str, objective: str | None = None, slower: int | None = None) -> Callable[[Task], None]:
+    """The way that minimises an objective, by default the task's, over trials of a sampler, from the start on.
+
+    Every trial has the same runs, so that the differences between trials are not those of noise. With a second
+    sample time, slower by so many steps, each trial is measured at both, and the larger value counts.
+    """
+
+    def follow(task: Task) -> None:
+        rates = [task.data] if slower is None else [task.data, [one.every(slower) for one in task.data]]
+        space: dict[str, BaseDistribution] = {one.name: one.distribution for one in task.searched}
+        with task.uncounted(), quiet_optuna():  # packages are loaded
+            made = make_sampler(sampler, task.seed, 0, space)
+            study = optuna.create_study(sampler=made)
+        given = dict(zip(space, task.values_of(task.start, task.searched), strict=True))
+        study.enqueue_trial({one.name: min(max(given[one.name], one.low), one.high) for one in task.searched})
+        least = math.inf
+        for _ in range(MOST_TRIALS):
+            with quiet_optuna():
+                trial = study.ask(space)
+            choice = task.with_values([trial.params[name] for name in space], task.searched)
+            value = max(task.value(choice, objective, data) for data in rates)
+            study.tell(trial, value)
+            if value < least:
+                least = value
+                task.keep(choice)
+
+    return follow

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from filters.adaptive import RobustExtendedKalmanFilter
 from filters.starts import Starts
+from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.objective import Objective
-from tuning.identification.runs import runs_of
-from tuning.identification.starts import estimates_of
+from tuning.identification.result import covariance, is_narrow
+from tuning.identification.starts import estimates_of, runs_of
 from tuning.problems.data import Data
 
 ROUNDS = 30  # of leaving out and identifying again, at most; a narrow gate takes many
@@ -54,3 +55,31 @@ class WithoutOutliers:
 def without_outliers(objective: Objective, outliers: np.ndarray, gate: float) -> Objective:
     """The same objective without the outliers, which are those beyond a gate."""
     return objective.with_changes(data=WithoutOutliers(objective.data, outliers), gate=gate)
+
+
+# Whether logs excite the free parameters.
+
+
+def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarray) -> None:
+    """Raise ValueError for logs with constant inputs that do not determine the free parameters.
+
+    Args:
+        objective: log-likelihood of the logs.
+        logs: the logs as recorded.
+        start: coordinates (p,) of the free parameters.
+
+    Raises:
+        ValueError: with the parameters that are not identifiable, by Fisher's information at the start.
+    """
+    levels = [np.ptp(log.inputs, axis=0) for log in logs]
+    if any(level.any() for level in levels):
+        return
+    coordinates, found = objective.coordinates, objective(start)
+    cov = covariance(found.information, found.scores[:0], coordinates.high - coordinates.low)
+    narrow = is_narrow(cov, coordinates)
+    loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
+    if loose:
+        raise ValueError(
+            f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
+            "hold these, or record steps"
+        )

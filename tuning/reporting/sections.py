@@ -1,0 +1,496 @@
+"""Sections of a report: the advice, the results, the course of the search, and ensemble sizes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from math import isnan, sqrt
+from pathlib import Path
+from textwrap import fill
+
+import numpy as np
+from numpy import isfinite
+from optuna import Study
+from optuna.trial import FrozenTrial, TrialState
+
+from filters.consistency.verdicts import rounded, sentences
+from filters.registry import filter_type
+from thruster_env.core.sources import is_array
+from thruster_env.model.quantities import Quantity
+from tuning.evaluation.baselines import TUNED, baseline_size, baselines
+from tuning.evaluation.evaluate import check_consistency, restart_sentences
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import SizeRow
+from tuning.evaluation.versions import versions
+from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, without_truth, worth
+from tuning.problems.augmented import within
+from tuning.problems.log_problem import LogProblem
+from tuning.problems.plant_packages import built_in
+from tuning.problems.problem import BOUND, OPEN_LOOP, Problem, score_label
+from tuning.reporting.alternatives import (
+    of_comparison,
+    of_estimates,
+    of_front,
+    of_history,
+    of_importances,
+    of_series,
+    of_sizes,
+    of_slices,
+)
+from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
+from tuning.reporting.consistency_figures import draw_consistency
+from tuning.reporting.matlab import matlab_function
+from tuning.reporting.page import Code, Part, Picture, Section, Table, Words
+from tuning.reporting.search_figures import (
+    FEWEST_TRIALS,
+    Sketchbook,
+    counted_trials,
+    draw_comparison,
+    draw_front,
+    draw_history,
+    draw_importance,
+    draw_sizes,
+    draw_slices,
+    importances,
+)
+from tuning.reporting.subject import Subject
+from tuning.reporting.tables import errors_table
+from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innovations, draw_signal, gains
+from tuning.search.among_types import filter_types_tried, trials_of_type
+from tuning.search.objectives import NIS_BAND, find_objective, reported_about, reported_name
+from tuning.search.parameters import index_pairs
+from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.search.ranges import range_warning, range_words
+from tuning.search.space import AUTO, Choice
+
+MANY_TRIALS = 50
+
+
+def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen: Mapping | None = None) -> str:
+    """The choice and its reason, if `chosen` has them; the gain of tuning, N, and whether the covariance is right.
+
+    The covariance is checked by the mean NEES; without truth by the mean NIS.
+    """
+    places = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
+    gains = [f"{worth(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
+    subject = "On held-out runs the tuned filter" if chosen else "Tuning"
+    parts = [f"{subject} {' and '.join(gains)}"]
+    if "ensemble_size" in choice.numbers:
+        parts.append(f"take N = {choice.numbers['ensemble_size']}")
+    squares = [consistency_of(comparison) for comparison in comparisons]
+    if not any(isnan(mean.value) for _, mean, *_ in squares):
+        found = [
+            f"{word}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
+            for (name, mean, right, word), place in zip(squares, places, strict=True)
+        ]
+        parts.append(f"the covariance is {' and '.join(found)}")
+    warned = all_warnings(comparisons, plan.scenarios, plan.forget)
+    warned += range_warning(choice, plan)
+    doubts = [model_doubts(*pair, plan.seed) for pair in zip(plan.scenarios, comparisons, strict=True)]
+    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])
+
+
+def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[Comparison]) -> Section:
+    """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
+    parts: list[Part] = []
+    for scenario, comparison in zip(subject.plan.scenarios, comparisons, strict=True):
+        restarts = [*restart_sentences(comparison.evaluations), memory_sentence(comparison.tuned, scenario)]
+        if not comparison.tuned.has_truth:
+            parts += [Words([without_truth(scenario.name)]), errors_table(scenario, comparison)]
+            parts.append(Words(restarts))
+            continue
+        where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
+        bound = ", and the bound" if isfinite(comparison.bound).any() else ""
+        name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
+        scaling = scaling_sentence(comparison)
+        said = [*([scaling] if scaling else []), *restarts]
+        parts += [errors_table(scenario, comparison), Words(said)]
+        caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
+        parts.append(book.picture(draw_comparison(comparison, place, name), caption, of_comparison(comparison)))
+    return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
+
+
+def search_section(book: Sketchbook, subject: Subject) -> Section:
+    """The course of the study: convergence, importances, slices, and the front of two objectives."""
+    study, title = subject.study, "The study"
+    if study is None:
+        said = f"Study {subject.name!r} is not in the storage, so its course is not shown here."
+        return Section(title, [Words([said])])
+    trials = study.get_trials(deepcopy=False)
+    objectives = subject.plan.objectives
+    labels = [
+        score_label(subject.plan.scenarios)
+        if name == "score"
+        else fill(f"{reported_name(name)}: {reported_about(name)}", 34)
+        for name in objectives
+    ]
+    word = subject.plan.scenarios[0].seed_word
+    caption = f"First objective of each trial on the training {word}, and the best so far."
+    picture = draw_history(trials, f"Study {subject.name}", labels[0], objectives[0])
+    parts: list[Part] = [
+        book.picture(picture, caption, of_history(trials, objectives[0])),
+        _importance_part(book, study, word),
+    ]
+    caption = (
+        "First objective against each parameter; dashed is the best trial. Hollow: mean NIS outside its band. "
+        f"Crosses: pruned, at the mean of the {word} seen."
+    )
+    of_kind = trials_of_type(trials, subject.choice.name)
+    parts.append(book.picture(draw_slices(of_kind, labels[0], objectives[0]), caption, of_slices(of_kind)))
+    if subject.plan.filter == AUTO:
+        parts.append(_kinds_table(trials, objectives[0]))
+    if len(objectives) > 1:
+        caption = "Trials by both objectives; no trial is better than those of the Pareto front in both."
+        picture = draw_front(trials, study.best_trials, labels, objectives)
+        parts.append(book.picture(picture, caption, of_front(study.best_trials, objectives)))
+    return Section(title, parts)
+
+
+def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Words:
+    """Importances, and how they were computed; or how many trials they need."""
+    found = importances(study)
+    if not found:
+        return Words([f"Importances need {FEWEST_TRIALS} finished trials or more."])
+    complete, early = counted_trials(study)
+    rough = ", rough on so few" if complete + early < MANY_TRIALS else ""
+    pruned = f" and {early} pruned ones, each at the mean of the {word} that it reached" if early else ""
+    caption = (
+        "Importance of each parameter for a trial to be among the best tenth, from the difference between "
+        f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
+    )
+    return book.picture(draw_importance(found), caption, of_importances(found))
+
+
+def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
+    """Filter types that the trials chose, the best first."""
+    columns = ["filter", "trials", "pruned", "over budget", f"best {reported_name(objective)}", "µs/step"]
+    rows = [
+        [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
+        + [kind.best(objective)]
+        + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
+        for kind in filter_types_tried(trials)
+    ]
+    caption = "Filters that were tried; the slices are those of the best"
+    return Table(f"{caption}. *: mean NIS outside its band, chosen only if all are", columns, rows)
+
+
+def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
+    """Errors against ensemble size, with the number of seeds of each if they differ."""
+    first = subject.plan.scenarios[0]
+    fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
+    where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
+    caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
+    kept = subject.choice.numbers["ensemble_size"]
+    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
+    said = (
+        f"Score relative to the best, paired on the same {first.seed_word}; the largest of several scenarios. "
+        "The smallest N whose upper end is below 1.01 is sufficient"
+    )
+    columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
+    if len({row.seeds for row in sizes}) == 1:
+        columns, ratios = columns[:-1], [row[:-1] for row in ratios]
+    picture = book.picture(draw_sizes(sizes, kept), caption, of_sizes(sizes, kept))
+    return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
+
+
+# Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study.
+
+
+MOST_ROWS = 40  # of a table of variances
+
+
+def score_section(subject: Subject) -> Section:
+    """The definition of the score, in words and with its scales."""
+    said = []
+    for scenario in subject.plan.scenarios:
+        if scenario.scale is None:
+            said.append(
+                f"{scenario.name} has no truth, so there is no score. The criterion is the log-likelihood of "
+                "the innovations, the probability that the filter assigns to the measurements; higher is "
+                "better."
+            )
+            continue
+        states = scenario.quantities.states
+        scales = [
+            f"{scale:.4g} {state.unit}".rstrip() + f" for {state.text_symbol}"
+            for state, scale in zip(states, scenario.scale, strict=False)
+            if isfinite(scale)
+        ]
+        said.append(
+            f"The score of a filter on {scenario.name} is the mean over {', '.join(_scored(scenario))} of its "
+            f"RMSE over a fixed scale: {', '.join(scales)}. It has no unit, lower is better, and 1 means "
+            f"errors as large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
+        )
+    said.append(
+        f"The filter tuned on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
+        "trial saw. Intervals contain 95 % of resampled sets of runs; ratios are paired, run by run."
+    )
+    return Section("What the score is", [Words(said)])
+
+
+def _no_bound(scenario: Problem) -> str:
+    """Why a score uses another scale than the bound; empty if it uses the bound."""
+    if scenario.scale_about == BOUND:
+        return " It is the least error that any filter can have."
+    if not scenario.scale_about.startswith(OPEN_LOOP):
+        return ""
+    return (
+        " A posterior Cramér-Rao bound needs the inverse of Q: one state without process noise rules it out, "
+        "so scores here cannot be compared with those of a problem whose scale is the bound."
+    )
+
+
+def _scored(scenario: Problem) -> list[str]:
+    pairs = zip(scenario.quantities.states, scenario.scale or (), strict=False)
+    return [state.text_symbol for state, scale in pairs if isfinite(scale)]
+
+
+def _word(subject: Subject) -> str:
+    return subject.plan.scenarios[0].seed_word
+
+
+def model_section(choice: Choice, scenario: Problem) -> Section:
+    """The model that the tuned filter assumes, and its Q and R in words and numbers."""
+    model, kind = scenario.model(**choice.model), filter_type(choice.name).filter_class
+    f = "f" if model.substeps == 1 else f"f (of {model.substeps} equal parts a step)"
+    sample = f", one step each {scenario.dt:g} s" if scenario.dt else ""
+    said = [
+        f"x[k+1] = f(x[k], u[k]) + w, z[k] = h(x[k]) + v: {f} moves {_listed(model.states)} under "
+        f"{_listed(model.input_quantities) or 'no input'}; h gives {_listed(model.measurements)}{sample}.",
+    ]
+    if not kind.has_covariance:
+        said.append(f"The filter {choice.name} has neither Q nor R.")
+        return Section("Model, Q and R", [Words(said)])
+    said.append(
+        "The filter assumes that w and v are white Gaussian noise of covariance Q and R. Covariances are per "
+        "step and do not scale with dt: another sample time needs another Q."
+    )
+    said += [
+        f"In each step {one.text_symbol} moves by {_amount(variance, one)} (standard deviation) beyond the model."
+        for one, variance in zip(model.states, model.process_noise_cov.diagonal(), strict=True)
+    ][:6]
+    said += [
+        f"A reading of {one.text_symbol} is off by {_amount(variance, one)} (standard deviation)."
+        for one, variance in zip(model.measurements, model.measurement_noise_cov.diagonal(), strict=True)
+    ][:6]
+    if "ensemble_size" in choice.numbers:
+        said.append(f"It carries {choice.numbers['ensemble_size']} members.")
+    rows = [*_rows("Q", model.process_noise_cov, model.states), *_rows("P0 ", model.prior_cov, model.states)]
+    rows += _rows("R", model.measurement_noise_cov, model.measurements)
+    columns = ["", "of", "variance", "standard deviation"]
+    table = Table("Diagonals of Q, of P_0, the prior's covariance, and of R", columns, rows[:MOST_ROWS])
+    return Section("Model, Q and R", [Words(said), table])
+
+
+def _rows(name: str, matrix, quantities: Sequence[Quantity]) -> list[list[str]]:
+    found = []
+    for i, one in enumerate(quantities):
+        unit = f" {one.unit}" if one.unit else ""
+        square = "" if not one.unit else f" ({one.unit})²" if set("/ ^") & set(one.unit) else f" {one.unit}²"
+        deviation = sqrt(max(matrix[i, i], 0.0))
+        found.append(
+            [
+                index_pairs(f"{name}{i + 1}{i + 1}"),
+                one.text_symbol,
+                f"{matrix[i, i]:.4g}{square}",
+                f"{deviation:.4g}{unit}",
+            ]
+        )
+    return found
+
+
+def _amount(variance: float, one: Quantity) -> str:
+    return f"{sqrt(max(variance, 0.0)):.3g} {one.unit}".rstrip()
+
+
+def _listed(quantities: Sequence[Quantity]) -> str:
+    names = [one.name if one.symbol in one.name.split() else f"{one.name} {one.text_symbol}" for one in quantities]
+    return ", ".join(
+        f"{name}{f' [{one.unit}]' if one.unit else ''}" for name, one in zip(names, quantities, strict=True)
+    )
+
+
+def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
+    """What was tuned, on which data and how; `nis` is the choice's on training seeds, over the channels."""
+    plan, word = subject.plan, _word(subject)
+    trained = dict.fromkeys(one.training_seeds(plan.seed, TRAINING_SEEDS) for one in plan.scenarios)
+    about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
+    rows = [
+        ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],
+        *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
+        ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
+        ["minimised", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
+        [
+            "mean NIS",
+            _nis_words(nis, plan) if plan.is_constrained else "free",
+        ],
+        ["sampler", plan.sampler],
+        *([["ranges", range_words(plan)]] if range_words(plan) else []),
+        [f"training {word}", "; ".join(f"{some[0]} to {some[-1]}" for some in trained)],
+        ["study", subject.name],
+    ]
+    if subject.study is not None:
+        states = [trial.state for trial in subject.study.get_trials(deepcopy=False)]
+        complete, early = states.count(TrialState.COMPLETE), states.count(TrialState.PRUNED)
+        rows.append(["finished trials", f"{complete + early}, {early} of them pruned"])
+    rows.append(["computed here with", ", ".join(f"{name} {version}" for name, version in versions().items())])
+    return Section("What was done", [Table("", [], rows)])
+
+
+def _nis_words(nis: Sequence[float], plan: Plan) -> str:
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
+    low, high = NIS_BAND
+    place = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
+    found, low, high = " and ".join(f"{channels * ratio:.3g}" for ratio in nis), channels * low, channels * high
+    return (
+        f"to lie between {low:g} and {high:g}, where {channels} is right; it is {found}, {place}, on the "
+        f"training {word}"
+    )
+
+
+# Lines of a report to copy: Python, JSON and MATLAB that use the tuned filter.
+
+
+ON_ENV = """from filters import EstimateState
+{problem}
+env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
+tuned = env.filter  # with its model, Q and R
+"""
+ON_LOG = """import tuning
+
+found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
+tuned = found.filter  # with its model, Q and R
+"""
+BY_HAND = """
+belief = tuned.init()
+for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
+    belief, innovation = tuned.update(belief, measurement)
+    print(belief.mean, belief.cov)
+    belief = tuned.predict(belief, command)
+"""
+UNSAVED = "TUNED.json"  # a name to be replaced
+
+
+def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section:
+    """Lines that use the tuned filter.
+
+    Args:
+        choice: the tuned filter.
+        problem: what it was tuned on.
+        file: the tuned file; None where the report is of a study, which has none yet.
+    """
+    name = Path(file).name if file else UNSAVED
+    model = problem.model(**choice.model)
+    lines = ON_LOG if isinstance(within(problem), LogProblem) else ON_ENV
+    python = lines.format(file=name, problem=_found_by(problem)) + BY_HAND
+    noise = {"process_noise_cov": model.process_noise_cov, "measurement_noise_cov": model.measurement_noise_cov}
+    entry = {"name": choice.name, "numbers": dict(choice.numbers)}
+    entry["model"] = {key: value.tolist() for key, value in noise.items()} | dict(choice.model)
+    command = f"`study.save({UNSAVED!r})` or `thruster tune --out {UNSAVED}`"
+    said = [] if file else [Words([f"{command} writes the tuned file that these lines read."])]
+    matlab = matlab_function(choice, model, problem.name, problem.dt)
+    return Section(
+        "Lines to copy",
+        [
+            *said,
+            Code("Python", python),
+            Code("JSON: the filter, as in the tuned file", json.dumps(entry, indent=2, default=str)),
+            Code("MATLAB or GNU Octave: a function that needs no toolbox", matlab, folded=True),
+        ],
+    )
+
+
+def _found_by(problem: Problem) -> str:
+    """Lines that load a problem: by its name or, if it is the user's code, from its module."""
+    if problem.name in built_in() or problem.name.endswith(".toml"):
+        return f"from tuning.problems.find import find_problem\n\nproblem = find_problem({problem.name!r})"
+    module, colon, name = problem.name.partition(":")
+    if colon and module.replace(".", "").isidentifier() and name.isidentifier():
+        found = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
+        return f"{found}  # if it is a function: problem = problem()\n"
+    return "from your_module import problem  # the object that it was tuned on\n"
+
+
+# Sections of a report on one run over time: estimates, measurements, innovations, gain, consistency.
+
+
+AXES = (
+    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
+    "are over these steps."
+)
+READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
+
+
+def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> list[Section]:
+    """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
+    choice, scenario = subject.choice, subject.plan.scenarios[0]
+    data, tuned = scenario.data(comparison.seeds), choice.filter(scenario)
+    size = baseline_size(choice)
+    known = baselines(choice.name, scenario, subject.plan.seed, comparison.default, size)
+    name, before = next(iter(known.items()))
+    pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
+    word = scenario.seed_word.removesuffix("s")
+    where = f"{scenario.name}, held-out {word} {comparison.seeds.start}"
+    has_covariance, scored = filter_type(choice.name).has_covariance, comparison.tuned.scored or None
+    what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
+    caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
+    alt = of_estimates(pair, data, 0, dt)
+    remark = [] if data.states is not None else [Words([f"{scenario.name} has no truth, so there are no errors."])]
+    picture = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt)
+    sections = [Section("One run over time", [picture, *remark])]
+    model = tuned.model
+    named = [one.name for one in model.measurements], [one.unit for one in model.measurements]
+    alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
+    caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
+    sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
+    if not has_covariance:
+        return sections
+    if data.states is not None:
+        without = data._replace(states=None, outputs=None)
+        caption = (
+            f"Innovations on {where}, each in the 95 % band that the filter expects, before and after. {AXES}"
+        )
+        picture = book.picture(draw_innovations(pair, data, 0, dt), caption, of_estimates(pair, without, 0, dt))
+        sections.append(Section("Innovations", [picture]))
+    if not is_array(model.n, model.m):
+        sections.append(_gain_section(book, pair, data, dt, scored, where))
+    report = check_consistency(tuned, data, dt)
+    said = sentences(report)
+    runs = f"{report.runs} held-out {scenario.seed_word} of {scenario.name}"
+    drawn = draw_consistency(report, f"{choice.name}, tuned, on {runs}", scored=scored, filter_name=choice.name)
+    parts: list[Part] = [
+        Words([NEES_NIS]),
+        Words(said),
+        book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(said)),
+    ]
+    return [*sections, Section("Is the covariance consistent?", parts)]
+
+
+NEES_NIS = (
+    "NEES, the normalised estimation error squared, relates the error to the filter's covariance: if the "
+    "covariance is right, its mean is the number of states. NIS, the normalised innovation squared, does the "
+    "same with the innovation: its mean is the number of channels. CRPS, the continuous ranked probability "
+    "score, is the error of a whole distribution, in the unit of the state."
+)
+
+
+def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Section:
+    """The gain over time, before and after."""
+    told = []
+    for title, filter_ in pair.items():
+        found, model = gains(filter_, data, 0), filter_.model
+        last = [matrix for matrix in found if np.isfinite(matrix).all()]
+        if last:
+            values = ", ".join(
+                f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
+                for i, state in enumerate(model.states)
+                for j, channel in enumerate(model.measurements)
+            )
+            told.append(f"{title}: {values} at the end")
+    caption = (
+        f"Gain K on {where}: the change of each state per unit of innovation, before and after tuning. It "
+        "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
+        "panel has its own axis."
+    )
+    picture = book.picture(draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(told)}.")
+    return Section("Gain over time", [picture])

@@ -1,0 +1,396 @@
+"""Lagged covariances of a fixed gain's innovations: what they are, what they should be, and what they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.bounds import steady_state
+from filters.tuned_file import NOISE
+from thruster_env.model.affine import linearize
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.evaluation.baselines import with_covariances
+from tuning.likelihood.family import Family
+from tuning.problems.data import Data, estimates_in_parts
+from tuning.search.space import Choice
+from tuning.ways.task import Task
+
+LAGS = 15
+DROPPED = 100  # rows at the beginning, at most a fifth of a run
+ITERATIONS = 3  # the gain of each is that of the Q and R found before
+LEAST_DECAY = 1e-9  # of an error in a step
+ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
+LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
+
+
+class Stationary(NamedTuple):
+    """A linear model x' = A x + B u + a, z = C x + d."""
+
+    a: np.ndarray
+    b: np.ndarray
+    offset: np.ndarray
+    c: np.ndarray
+    zero: np.ndarray
+
+
+class Noise(NamedTuple):
+    """Q and R as sums of numbers times units, and of what no number moves."""
+
+    q: np.ndarray  # units, (p, n, n)
+    r: np.ndarray  # (p, m, m)
+    rest: tuple[np.ndarray, np.ndarray]
+
+
+def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np.ndarray]]) -> None:
+    """Numbers not below zero that solve linear equations in the lagged covariances of innovations, three times.
+
+    Args:
+        task: what is tuned.
+        name: of the way, for errors.
+        equations: (linear, gain, covariances (lags, m, m), noise) returns the matrix (rows, p) and the right side.
+
+    Raises:
+        ValueError: of a model that is not linear, or whose Q and R are not linear in the numbers.
+    """
+    from scipy.optimize import nnls
+
+    family = Family(task.start, task.problems[0], task.free)
+    coordinates = family.coordinates
+    if not coordinates.log.all():
+        raise ValueError(
+            f"way {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
+        )
+    model = task.model(task.start)
+    linear = stationary(model, task.problems[0].name, name)
+    point = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
+    for _ in range(ITERATIONS):
+        model, slopes = family.at(point)
+        each = np.exp(point)
+        units = [one / each[:, None, None] for one in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
+        of_model = model.process_noise_cov, model.measurement_noise_cov
+        q, r = (of - np.tensordot(each, one, 1) for of, one in zip(of_model, units, strict=True))
+        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip((q, r), of_model, strict=True)):
+            if not task.options.get("hold_r"):
+                raise ValueError(
+                    f"way {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
+                )
+        gain, seen = observed(task, linear, *of_model)
+        design, wanted = equations(linear, gain, seen, Noise(units[0], units[1], (q, r)))
+        scale = np.maximum(abs(design).max(axis=0), 1e-300)
+        found, _ = nnls(design / scale, wanted)
+        values = np.maximum(found / scale, np.exp(coordinates.low))
+        point = np.clip(coordinates.of(values), coordinates.low, coordinates.high)
+        task.keep(family.choice_at(point))
+
+
+def observed(task: Task, linear: Stationary, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The gain (n, m) of a Q and R, and its innovations' lagged covariances (lags, m, m) on all runs: one pass."""
+    gain, first = steady_gain(linear, q, r), task.model(task.start).prior_mean
+    lags = min(LAGS, *(max(2, int(one.rows.min()) // 4) for one in task.data))
+    seen = autocovariances([_innovations(linear, gain, one, first) for one in task.data], lags)
+    task.charge(task.passes)
+    return gain, seen
+
+
+def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
+    """The matrices of a linear model; ValueError for another one."""
+    about = np.zeros(model.n), np.zeros(model.inputs)
+    away = np.ones(model.n) * model.scales, np.ones(model.inputs)
+    found, other = (linearize(model, *one).matrices() for one in (about, away))
+    pairs = zip(found, other, strict=True)
+    if not all(
+        np.allclose(one, two, rtol=ALIKE, atol=ALIKE * max(abs(one).max(initial=0), 1.0)) for one, two in pairs
+    ):
+        raise ValueError(
+            f"way {way!r} needs a linear model, such as that of the filter kf, but {name} has another one"
+        )
+    return Stationary(*found)
+
+
+def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The gain L (n, m) of the stationary Kalman filter."""
+    rule = "ways by lagged covariances need a model with a stationary filter"
+    try:
+        gain = steady_state(linear.a, linear.c, q, r)[1]
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"{rule}, but {error}") from None
+    radius = float(abs(np.linalg.eigvals(linear.a - linear.a @ gain @ linear.c)).max())
+    if radius >= 1.0 - LEAST_DECAY:
+        raise ValueError(
+            f"{rule}, but an eigenvalue of A - A L C is {radius:.9g}: its errors do not decay; "
+            "give Q noise in each state that does not decay by itself"
+        )
+    return gain
+
+
+def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:
+    """C_0, C_1, ..., C_{N-1} of a gain's innovations, under a Q and R, (lags, m, m)."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    a, c = linear.a, linear.c
+    through = a @ gain
+    closed = a - through @ c
+    p = solve_discrete_lyapunov(closed, q + through @ r @ through.T)
+    blocks, power = [c @ p @ c.T + r], np.eye(len(a))
+    for _ in range(1, lags):
+        blocks.append(c @ (closed @ power @ p @ c.T - power @ through @ r))
+        power = closed @ power
+    return np.array(blocks)
+
+
+def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: np.ndarray) -> list[np.ndarray]:
+    """The innovations of each run, (rows, m), without those of the beginning."""
+    seen, measurements = data.seen, data.measurements
+    times = measurements.shape[1]
+    means, found = np.tile(prior_mean, (len(measurements), 1)), np.empty(measurements.shape)
+    for k in range(times):
+        found[:, k] = measurements[:, k] - means @ linear.c.T - linear.zero
+        if k < times - 1:
+            after = means + np.nan_to_num(found[:, k]) @ gain.T
+            means = after @ linear.a.T + seen.inputs[:, k] @ linear.b.T + linear.offset
+    return [run[min(DROPPED, rows // 5) : rows] for run, rows in zip(found, data.rows.tolist(), strict=True)]
+
+
+def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
+    """Means of e_{k+j} e_k' over all times at which both were measured, (lags, m, m)."""
+    runs = [run for part in parts for run in part]
+    found = []
+    for j in range(lags):
+        pairs = [(run[j:], run[: len(run) - j]) for run in runs if len(run) > j]
+        ahead, behind = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        there = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
+        products = np.nan_to_num(ahead)[:, :, None] * np.nan_to_num(behind)[:, None, :]
+        found.append(products.sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+    return np.array(found)
+
+
+# Autocovariance least squares: Q and R from how the innovations of a fixed gain go together over time.
+
+
+LEAST = 1e-10  # part of the start's variances below which none falls, so that a gain exists
+PRECISE, MOST = 1e-12, 400  # relative change of squares and roots that ends Gauss and Newton's steps; and how many
+
+
+def als(task: Task) -> None:
+    """Least squares of lagged covariances of innovations, with variances not below zero; three times over.
+
+        e_k = z_k - C x^_k,   x^' = A (x^ + L e),   C_j = E[e_{k+j} e_k'],   Ab = A - A L C
+        b = (C x O)(I - Ab x Ab)^-1 [vec Q + (A L x A L) vec R] + (I x Gam) vec R,   b = vec(C_0; C_1; ...)
+        O = (C; C Ab; ...),   Gam = (I; -C A L; -C Ab A L; ...),   x the product of Kronecker
+
+    Q and R have to be linear in the numbers that are tuned, or are full matrices that stay positive semidefinite.
+    The first gain is that of the start. It needs one pass of a filter an iteration. With more unknowns in Q than
+    n m the answer is not unique.
+
+    Source: Odelson, Rajamani, Rawlings (2006), "A new autocovariance least-squares method for estimating noise
+    covariances", Automatica 42(2); Rajamani, Rawlings (2009), Automatica 45(1).
+    """
+
+    def equations(linear: Stationary, gain: np.ndarray, seen: np.ndarray, noise: Noise):
+        lags = len(seen)
+        design = [lagged(linear, gain, q, r, lags).ravel() for q, r in zip(noise.q, noise.r, strict=True)]
+        return np.column_stack(design), (seen - lagged(linear, gain, *noise.rest, lags)).ravel()
+
+    wanted = [bool(task.options.get(one)) for one in ("full_q", "full_r")]
+    if any(wanted) and set(NOISE) <= set(task.start.model):
+        _matrices(task, *wanted)
+    else:
+        by_lags(task, "als", equations)
+
+
+def _matrices(task: Task, full_q: bool, full_r: bool) -> None:
+    """The same of Q, R or both in full; of what is not full the diagonal is found."""
+    model, held = task.model(task.start), bool(task.options.get("hold_r"))
+    linear = stationary(model, task.problems[0].name, "als")
+    first = q, r = model.process_noise_cov, model.measurement_noise_cov
+    free = _free(q, full_q), _free(r, full_r) & (not held)
+    for _ in range(ITERATIONS):
+        gain, seen = observed(task, linear, q, r)
+        q, r = semidefinite(linear, gain, seen, first, free)
+        task.keep(with_covariances(task.start, q, None if held else r))
+
+
+def semidefinite(
+    linear: Stationary,
+    gain: np.ndarray,
+    seen: np.ndarray,
+    first: tuple[np.ndarray, np.ndarray],
+    free: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Q = S S' and R = T T' with the least squares of lagged covariances, over their triangular roots S and T.
+
+        d b / d S_ik = 2 sum_j B_ij S_jk,   B_ij the lagged covariances of Q = (e_i e_j' + e_j e_i') / 2
+
+    The squares are convex in Q and R, and roots with as many columns as rows have no minimum but theirs.
+
+    Args:
+        linear: the model.
+        gain: L (n, m).
+        seen: lagged covariances of its innovations, (lags, m, m).
+        first: Q (n, n) and R (m, m), at whose diagonals the search begins; what has no free entry stays.
+        free: which entries of their roots are free, (n, n) and (m, m) bool.
+
+    Source: Burer, Monteiro (2005), "Local minima and convergence in low-rank semidefinite programming",
+    Mathematical Programming 103(3).
+    """
+    from scipy.optimize import least_squares
+
+    pairs = list(zip(first, free, strict=True))
+    roots = [np.sqrt(np.diag(np.diag(one))) if mask.any() else np.linalg.cholesky(one) for one, mask in pairs]
+    parts = [one[mask] for one, mask in zip(roots, free, strict=True)]
+    by = [_responses(linear, gain, len(seen), side, len(one)) for side, one in enumerate(first)]
+    wanted, end = seen.ravel(), len(parts[0])
+
+    def filled(point: np.ndarray) -> list[np.ndarray]:
+        for root, mask, some in zip(roots, free, (point[:end], point[end:]), strict=True):
+            root[mask] = some
+        return roots
+
+    def left(point: np.ndarray) -> np.ndarray:
+        expected = [np.tensordot(one, root @ root.T) for one, root in zip(by, filled(point), strict=True)]
+        return expected[0] + expected[1] - wanted
+
+    def slopes(point: np.ndarray) -> np.ndarray:
+        pairs = zip(by, filled(point), free, strict=True)
+        return np.concatenate([2.0 * (one @ root)[:, mask] for one, root, mask in pairs], axis=1)
+
+    ends = {"ftol": PRECISE, "xtol": PRECISE, "gtol": None, "max_nfev": MOST}
+    found = least_squares(left, np.concatenate(parts), slopes, x_scale="jac", **ends)
+    floors = (LEAST * np.diag(np.diag(one)) for one in first)
+    q, r = (root @ root.T + floor for root, floor in zip(filled(found.x), floors, strict=True))
+    return q, r
+
+
+def _free(cov: np.ndarray, full: bool) -> np.ndarray:
+    """Which entries of a root are free, (n, n) bool: none of a state without noise."""
+    there = np.diag(cov) > 0.0
+    return np.tril(np.outer(there, there)) if full else np.diag(there)
+
+
+def _responses(linear: Stationary, gain: np.ndarray, lags: int, side: int, size: int) -> np.ndarray:
+    """Lagged covariances by each entry of Q, side 0, or of R, (lags m m, size, size), symmetric in the entries."""
+    n, m = gain.shape
+    found = np.empty((lags * m * m, size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            noise = np.zeros((n, n)), np.zeros((m, m))
+            noise[side][i, j] += 0.5
+            noise[side][j, i] += 0.5
+            found[:, i, j] = found[:, j, i] = lagged(linear, gain, *noise, lags).ravel()
+    return found
+
+
+# Mehra's covariance matching: P H', R and Q, one after the other, from lagged covariances of innovations.
+
+
+def mehra(task: Task) -> None:
+    """The equations of `mehra_equations`, for numbers that are not below zero; three times over.
+
+    Q and R have to be linear in the numbers that are tuned, and A has to have an inverse.
+
+    Source: Mehra (1970), "On the identification of variances and adaptive Kalman filtering", IEEE Transactions on
+    Automatic Control 15(2), equations (20) to (29).
+    """
+    by_lags(task, "mehra", mehra_equations)
+
+
+def mehra_equations(
+    linear: Stationary, gain: np.ndarray, seen: np.ndarray, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix (rows, p) and the right side of equations in the numbers of Q and R.
+
+        P C' = L C_0 + pinv(C A; C Ab A; ...) (C_1; C_2; ...; C_n),   Ab = A - A L C,   R = C_0 - C P C'
+        sum_{j<k} C A^j Q A^(j-k)' C' = C P A^-k' C' - C A^k P C' - sum_{j<k} C A^j W A^(j-k)' C',   k = 1 ... n
+        W = A (L C_0 L' - L C P - P C' L') A'
+
+    P is the covariance of the predictions of the gain L.
+
+    Args:
+        linear: the model.
+        gain: L (n, m).
+        seen: lagged covariances of its innovations, (lags, m, m).
+        noise: Q and R by the numbers.
+
+    Raises:
+        ValueError: if A has no inverse, or there are fewer lags than states.
+    """
+    a, c, n = linear.a, linear.c, len(linear.a)
+    if len(seen) <= n or np.linalg.matrix_rank(a) < n:
+        raise ValueError(f"way 'mehra' needs an A with an inverse and {n} lags, but one of them is missing")
+    closed, power, rows = a - a @ gain @ c, np.eye(n), []
+    for _ in range(n):
+        rows.append(c @ power @ a)
+        power = closed @ power
+    crossed = gain @ seen[0] + np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(seen[1 : n + 1])  # P C'
+    middle = gain @ seen[0] @ gain.T - gain @ crossed.T - crossed @ gain.T
+    known = noise.rest[0] + a @ middle @ a.T
+    forward = [np.linalg.matrix_power(a, k) for k in range(n + 1)]
+    back = [np.linalg.solve(one, np.eye(n)) for one in forward]
+
+    def moved(q: np.ndarray) -> np.ndarray:
+        sums = [sum(c @ forward[j] @ q @ back[k - j].T @ c.T for j in range(k)) for k in range(1, n + 1)]
+        return np.ravel(sums)
+
+    ends = [crossed.T @ back[k].T @ c.T - c @ forward[k] @ crossed for k in range(1, n + 1)]
+    of_r = np.column_stack([one.ravel() for one in noise.r])
+    of_q = np.column_stack([moved(one) for one in noise.q])
+    r = seen[0] - c @ crossed - noise.rest[1]
+    return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - moved(known)])
+
+
+# R and one factor on Q from innovations before and after updates, as Desroziers has it.
+
+
+DESROZIERS_ITERATIONS = 30
+CLOSE = 1e-3  # relative change that ends it
+MOST_CHANGE = 10.0  # factor on Q or R in an iteration
+
+
+def desroziers(task: Task) -> None:
+    """Repeat until neither R nor a factor on Q changes.
+
+        R_jj <- mean of (R S^-1 d d')_jj,   Q <- Q (mean of d'd - tr R) / mean of tr(H P H')
+
+    d is the innovation and R S^-1 d = z - H x_a what an update leaves of it: E[d_a d'] = R if both covariances are
+    right. An iteration is one pass of the filter, of an ensemble as of a Kalman filter; where a filter has an
+    inflation, it stays. Only what acts on the measurements is told: the proportions within Q stay, too.
+
+    Source: Desroziers, Berre, Chapnik, Poli (2005), "Diagnosis of observation, background and analysis-error
+    statistics in observation space", Quarterly J. Royal Meteorological Society 131(613).
+    """
+    choice = task.start
+    for _ in range(DESROZIERS_ITERATIONS):
+        moments = _moments(task, choice)
+        task.charge(task.passes)
+        if moments is None:
+            return
+        left, squares, spread = moments
+        model = task.model(choice)
+        r, q = model.measurement_noise_cov, model.process_noise_cov
+        before = np.diag(r)
+        after = before if task.options.get("hold_r") else np.clip(left, before / MOST_CHANGE, before * MOST_CHANGE)
+        grown = np.sqrt(after / before)
+        factor = float(np.clip((squares - after.sum()) / spread, 1.0 / MOST_CHANGE, MOST_CHANGE))
+        choice = with_covariances(choice, factor * q, r * np.outer(grown, grown))
+        task.keep(choice)
+        if max(abs(np.log(factor)), abs(np.log(after / before)).max()) < CLOSE:
+            return
+
+
+def _moments(task: Task, choice: Choice) -> tuple[np.ndarray, float, float] | None:
+    """Means over scored steps of (R S^-1 d d')_jj, (m,), d'd and tr(H P H'); None unless these are finite."""
+    left: list[np.ndarray] = []
+    totals: Sequence[list[np.ndarray]] = ([], [])
+    for place, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        r = task.model(choice, place).measurement_noise_cov
+        for some, found in estimates_in_parts(choice.filter(problem), data):
+            there = some.scored & (~np.isnan(some.seen.measurements)).all(axis=-1)
+            d, s = found.innovations[there], found.innovation_covs[there]
+            whitened = np.linalg.solve(s, d[..., None])[..., 0]
+            left.append((whitened @ r) * d)
+            totals[0].append((d**2).sum(axis=-1))
+            totals[1].append(np.trace(s - r, axis1=1, axis2=2))
+    means = np.concatenate(left).mean(axis=0), *(float(np.concatenate(one).mean()) for one in totals)
+    return means if all(np.isfinite(one).all() for one in means) and means[2] > 0 else None
