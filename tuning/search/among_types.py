@@ -45,12 +45,14 @@ def enqueue_next_type(study: optuna.Study, plan: Plan) -> None:
     compared only where their innovations are consistent.
     """
     trials = study.get_trials(deepcopy=False)
-    if any(one.state == TrialState.WAITING for one in trials) or (trials and UNTUNED not in trials[0].user_attrs):
+    if any(trial.state == TrialState.WAITING for trial in trials) or (
+        trials and UNTUNED not in trials[0].user_attrs
+    ):
         return  # a study that begins with something else has enqueued all at once
     for key, name in _first_trials(plan, trials):
-        if not any(one.user_attrs.get(key) == name for one in trials):
+        if not any(trial.user_attrs.get(key) == name for trial in trials):
             parameters = _first_parameters(study, plan, key, name)
-            if parameters is not None and not any(is_near(one.params, parameters) for one in trials):
+            if parameters is not None and not any(is_near(trial.params, parameters) for trial in trials):
                 study.enqueue_trial(parameters, user_attrs={key: name})
                 return
 
@@ -79,18 +81,21 @@ def race_of(plan: Plan, trials: Sequence[FrozenTrial]) -> Race:
     International Conference on Artificial Intelligence and Statistics.
     """
     finished: dict[str, list[FrozenTrial]] = {name: [] for name in plan.filter_types}
-    for one in trials:
-        if one.state in (TrialState.COMPLETE, TrialState.PRUNED):
-            finished[one.params[FILTER_TYPE]].append(one)
-    best = best_trial([one for some in finished.values() for one in some])
-    rank = {name: min((_in_race(one, best) for one in some), default=math.inf) for name, some in finished.items()}
-    running = [name for name, some in finished.items() if not some or not all(map(is_over_budget, some))]
-    place, wanted = 0, 1
+    for trial in trials:
+        if trial.state in (TrialState.COMPLETE, TrialState.PRUNED):
+            finished[trial.params[FILTER_TYPE]].append(trial)
+    best = best_trial([trial for of_type in finished.values() for trial in of_type])
+    rank = {
+        name: min((_in_race(trial, best) for trial in of_type), default=math.inf)
+        for name, of_type in finished.items()
+    }
+    running = [name for name, of_type in finished.items() if not of_type or not all(map(is_over_budget, of_type))]
+    round_number, wanted = 0, 1
     while len(running) > 1 and all(len(finished[name]) >= wanted for name in running):
         if is_race(plan):
             running = sorted(running, key=rank.__getitem__)[: -(-len(running) // REMAINING)]
-        place, wanted = place + 1, wanted + MORE ** (place + 1)
-    return Race(place, tuple(sorted(running, key=rank.__getitem__)), wanted)
+        round_number, wanted = round_number + 1, wanted + MORE ** (round_number + 1)
+    return Race(round_number, tuple(sorted(running, key=rank.__getitem__)), wanted)
 
 
 def _in_race(trial: FrozenTrial, best: FrozenTrial | None) -> float:
@@ -101,13 +106,13 @@ def _in_race(trial: FrozenTrial, best: FrozenTrial | None) -> float:
     seeds = trial.intermediate_values.keys() & best.intermediate_values.keys() if best is not None else set()
     if best is None or not seeds:
         return math.inf
-    own, other = (sum(one.intermediate_values[seed] for seed in seeds) for one in (trial, best))
-    return best.values[0] * own / other
+    total, best_total = (sum(tried.intermediate_values[seed] for seed in seeds) for tried in (trial, best))
+    return best.values[0] * total / best_total
 
 
 def next_in_race(plan: Plan, trials: Sequence[FrozenTrial]) -> str:
     """The filter type of the next trial: of those in the race the one with the fewest, the best of these first."""
-    begun = Counter(one.params.get(FILTER_TYPE) for one in trials if one.state != TrialState.WAITING)
+    begun = Counter(trial.params.get(FILTER_TYPE) for trial in trials if trial.state != TrialState.WAITING)
     return min(race_of(plan, trials).running or plan.filter_types, key=begun.__getitem__)
 
 
@@ -116,7 +121,7 @@ def choose_type_by_race(sampler: optuna.samplers.BaseSampler, plan: Plan) -> opt
     of_all, of_one = sampler.infer_relative_search_space, sampler.sample_independent
 
     def without_type(study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return {name: one for name, one in of_all(study, trial).items() if name != FILTER_TYPE}
+        return {name: distribution for name, distribution in of_all(study, trial).items() if name != FILTER_TYPE}
 
     def sample(
         study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
@@ -150,12 +155,12 @@ def _first_parameters(study: optuna.Study, plan: Plan, key: str, name: str) -> d
     space, untuned = plan.space(), untuned_choice(name, plan.scenarios[0])
     if key == UNTUNED:
         return within_ranges(trial_parameters(untuned, space), space)
-    tried = [one for one in study.get_trials(deepcopy=False) if one.params.get(FILTER_TYPE) == name]
-    within = [one for one in tried if not is_over_budget(one)]
+    tried = [trial for trial in study.get_trials(deepcopy=False) if trial.params.get(FILTER_TYPE) == name]
+    within = [trial for trial in tried if not is_over_budget(trial)]
     if tried and not within:
         return None
-    own = within[-1].params if within else trial_parameters(untuned, space)
-    return within_ranges({**own, **(_estimated(study, plan, with_r=key == ESTIMATED) or {})}, space)
+    start = within[-1].params if within else trial_parameters(untuned, space)
+    return within_ranges({**start, **(_estimated(study, plan, with_r=key == ESTIMATED) or {})}, space)
 
 
 def _estimated(study: optuna.Study, plan: Plan, with_r: bool) -> dict | None:
@@ -194,7 +199,10 @@ def enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial,
 
 def ends_a_round(plan: Plan, trials: Sequence[FrozenTrial], last: FrozenTrial) -> bool:
     """Whether a round of the race ended with the last trial."""
-    return race_of(plan, trials).round > race_of(plan, [one for one in trials if one.number != last.number]).round
+    return (
+        race_of(plan, trials).round
+        > race_of(plan, [trial for trial in trials if trial.number != last.number]).round
+    )
 
 
 def enqueue_transferred_noise(study: optuna.Study, plan: Plan) -> None:
@@ -216,10 +224,10 @@ def enqueue_transferred_noise(study: optuna.Study, plan: Plan) -> None:
 def enqueue_near_in_race(study: optuna.Study, plan: Plan, number: int) -> None:
     """Enqueue a trial near the best one of the type that is next, once all other enqueued trials have been run."""
     trials = study.get_trials(deepcopy=False)
-    if any(one.state == TrialState.WAITING for one in trials):
+    if any(trial.state == TrialState.WAITING for trial in trials):
         return
     name = next_in_race(plan, trials)
-    best = best_trial([one for one in trials if one.params.get(FILTER_TYPE) == name])
+    best = best_trial([trial for trial in trials if trial.params.get(FILTER_TYPE) == name])
     if best is not None:
         enqueue_new(study, near(best.params, plan.space(), plan, number), {NEAR_BEST: best.number})
 
@@ -251,7 +259,7 @@ def filter_types_tried(trials: Sequence[FrozenTrial]) -> list[TypeResult]:
     for trial in trials:
         if FILTER_TYPE in trial.params and trial.state in (TrialState.COMPLETE, TrialState.PRUNED):
             by_type.setdefault(trial.params[FILTER_TYPE], []).append(trial)
-    rows = [_row(name, some) for name, some in by_type.items()]
+    rows = [_row(name, of_type) for name, of_type in by_type.items()]
     return sorted(rows, key=lambda row: (row.value is None, not row.consistent, row.value or 0.0))
 
 

@@ -42,12 +42,12 @@ def compile_filters(
     data = _steps(plan)
     helpers: list[subprocess.Popen] | None = None
     try:
-        for place, name in enumerate(names):
+        for index, name in enumerate(names):
             on_filter(name)
             started = time.perf_counter()
             _compile(plan, name, data)
             if helpers is None and time.perf_counter() - started > COMPILED:
-                helpers = _helpers(plan, names[place + 1 :])
+                helpers = _helpers(plan, names[index + 1 :])
     finally:
         for process in helpers or ():
             end(process)
@@ -55,21 +55,21 @@ def compile_filters(
 
 def _steps(plan: Plan) -> list[Data]:
     """As many runs of each problem as a trial has, of one step and all the same: different ones may take long."""
-    found = []
+    steps = []
     for problem in plan.scenarios:
         seeds = problem.training_seeds(plan.seed, TRAINING_SEEDS)
-        one = problem.data(seeds[:1]).seen
-        parts = one.filter_keys, one.inputs[:, :1], one.measurements[:, :2]
+        first_run = problem.data(seeds[:1]).seen
+        parts = first_run.filter_keys, first_run.inputs[:, :1], first_run.measurements[:, :2]
         keys, inputs, measurements = (np.repeat(part, len(seeds), axis=0) for part in parts)
-        found.append(Data(tuple(seeds), inputs, measurements, keys))
-    return found
+        steps.append(Data(tuple(seeds), inputs, measurements, keys))
+    return steps
 
 
 def _compile(plan: Plan, name: str, data: Sequence[Data]) -> None:
-    for problem, one in zip(plan.scenarios, data, strict=True):
+    for problem, problem_data in zip(plan.scenarios, data, strict=True):
         with suppress(ValueError):
             filter_ = untuned_choice(name, problem).filter(problem)
-            run(filter_, one.filter_keys, one.inputs, one.measurements)
+            run(filter_, problem_data.filter_keys, problem_data.inputs, problem_data.measurements)
 
 
 def _helpers(plan: Plan, names: Sequence[str]) -> list[subprocess.Popen]:
@@ -77,7 +77,7 @@ def _helpers(plan: Plan, names: Sequence[str]) -> list[subprocess.Popen]:
     count = min(MOST_HELPERS, cores() - 1, len(names) // 2)
     with suppress(ValueError):  # a model that cannot be sent
         orders = orders_of(plan)
-        shares = [[*reversed(names)][place::count] for place in range(count)]
+        shares = [[*reversed(names)][first::count] for first in range(count)]
         return [start(MODULE, {**orders, "names": share}, **SILENT) for share in shares]
     return []
 

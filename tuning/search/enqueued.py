@@ -160,11 +160,11 @@ def sizes_of(
     """The table of ensemble sizes of a choice, stored with the study; empty if there is none."""
     if not filter_type(choice.name).has_ensemble or len(plan.objectives) > 1:
         return []
-    kept = stored_sizes(study.user_attrs.get(SIZES), choice, plan)
-    if kept is None:
-        kept = ensemble_sizes(choice, plan, data, consistent)
-        study.set_user_attr(SIZES, sizes_as_data(kept, choice, plan))
-    return kept
+    rows = stored_sizes(study.user_attrs.get(SIZES), choice, plan)
+    if rows is None:
+        rows = ensemble_sizes(choice, plan, data, consistent)
+        study.set_user_attr(SIZES, sizes_as_data(rows, choice, plan))
+    return rows
 
 
 def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[SizeRow], consistent: bool) -> Choice:

@@ -41,8 +41,8 @@ def time_constants_on(filter_: Filter, problem: Problem, seed: int = 0) -> TimeC
     """
     if isinstance(filter_, ForeignFilter):
         return None
-    found = time_constants(filter_, _runs(problem, seed))
-    return found and found._replace(length=problem.shortest_log or found.length)
+    constants = time_constants(filter_, _runs(problem, seed))
+    return constants and constants._replace(length=problem.shortest_log or constants.length)
 
 
 def forgetting(
@@ -80,31 +80,31 @@ def raised_noise(
         return None
 
     def stated(cov: np.ndarray) -> float:
-        found = time_constants_on(_with_noise(choice, cov).filter(problem), problem, seed)
-        return inf if found is None else max(found.steps, default=0.0)
+        constants = time_constants_on(_with_noise(choice, cov).filter(problem), problem, seed)
+        return inf if constants is None else max(constants.steps, default=0.0)
 
     model = problem.model(**choice.model)
     return forgetting_noise(path, model, seconds / problem.dt, stated if exact else None)
 
 
-def with_oracle_and_advice(found: TimeConstants, choice: Choice, problem: Problem, seed: int) -> TimeConstants:
+def with_oracle_and_advice(constants: TimeConstants, choice: Choice, problem: Problem, seed: int) -> TimeConstants:
     """Time constants of a filter that sleeps, with those of the plant's own Q and R and a longest one to ask for.
 
     The advice is a fifth of a run, or more where a larger Q does not reach that: `--forget` accepts it, and the
     choice with a larger Q keeps it.
     """
-    if not (found.is_slow or found.has_no_gain):
-        return found
+    if not (constants.is_slow or constants.has_no_gain):
+        return constants
     true = oracle_choice(choice.name, problem)
-    own = None if true is None else time_constants_on(true.filter(problem), problem, seed)
-    if own is not None and own.steps:
-        found = found._replace(oracle=(own.steps[0], own.uptake))
-    if found.is_slow and problem.dt is not None:
-        fifth = max(_two_digits(SHARE * found.length * problem.dt, floor), problem.dt)
+    true_constants = None if true is None else time_constants_on(true.filter(problem), problem, seed)
+    if true_constants is not None and true_constants.steps:
+        constants = constants._replace(oracle=(true_constants.steps[0], true_constants.uptake))
+    if constants.is_slow and problem.dt is not None:
+        fifth = max(_two_digits(SHARE * constants.length * problem.dt, floor), problem.dt)
         advised = reachable(choice.name, problem, seed, fifth, choice)
-        if advised is not None and advised < found.steps[0] * problem.dt:
-            found = found._replace(advised=advised)
-    return found
+        if advised is not None and advised < constants.steps[0] * problem.dt:
+            constants = constants._replace(advised=advised)
+    return constants
 
 
 def reachable(
@@ -124,8 +124,8 @@ def reachable(
     """
     asked = [(untuned_choice(name, problem), False), *([] if choice is None else [(choice, True)])]
     for _ in range(ATTEMPTS):
-        found = [raised_noise(one, problem, seed, seconds, exact=exact) for one, exact in asked]
-        longest = max(inf if one is None or problem.dt is None else one.steps * problem.dt for one in found)
+        raised = [raised_noise(candidate, problem, seed, seconds, exact=exact) for candidate, exact in asked]
+        longest = max(inf if noise is None or problem.dt is None else noise.steps * problem.dt for noise in raised)
         if longest <= TOLERANCE * seconds:
             return seconds
         if not isfinite(longest):
@@ -151,10 +151,10 @@ def _runs(problem: Problem, seed: int) -> tuple[Run, ...]:
 
 
 @lru_cache(maxsize=64)
-def _path(name: str, problem: Problem, seed: int, own: tuple) -> Path | None:
+def _path(name: str, problem: Problem, seed: int, parameters: tuple) -> Path | None:
     """Slopes of the model that a filter of this name assumes, along estimates with the untuned Q and R."""
     untuned = problem.model(**problem.untuned)
-    model = problem.model(**dict(own)) if own else untuned
+    model = problem.model(**dict(parameters)) if parameters else untuned
     model = model.replace(**{noise: getattr(untuned, noise) for noise in NOISE})
     used = make_filter("ekf", make_filter(name, model).kernel_model)
     return slopes_along(used, _runs(problem, seed))

@@ -37,17 +37,17 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
     if known is not None:
         return known or None
     small = len(plan.scenarios[0].quantities.states) <= MOST_STATES
-    own = small and has_gradient(plan.filter) and not keeps_more(plan.filter)
-    name = plan.filter if plan.filter == "kf" or own else "ekf"
+    has_own_gradient = small and has_gradient(plan.filter) and not keeps_more(plan.filter)
+    name = plan.filter if plan.filter == "kf" or has_own_gradient else "ekf"
     try:
         goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
-        some = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL
-        goal = goal.of_few(MAXIMUM_LIKELIHOOD_RUNS) if some else goal
-        found = optimum(goal, _best_start(goal))
+        on_few = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL
+        goal = goal.of_few(MAXIMUM_LIKELIHOOD_RUNS) if on_few else goal
+        best = optimum(goal, _best_start(goal))
     except ValueError:  # more than numbers changes, or whole numbers
         study.set_user_attr(key, {})
         return None
-    noise = within_ranges(dict(zip(goal.coordinates.names, found.parameters.tolist(), strict=True)), plan.space())
+    noise = within_ranges(dict(zip(goal.coordinates.names, best.parameters.tolist(), strict=True)), plan.space())
     study.set_user_attr(key, noise)
     return noise
 
@@ -57,5 +57,5 @@ def _best_start(goal: Goal) -> np.ndarray:
     free, few = goal.coordinates.free, goal.of_few(MAXIMUM_LIKELIHOOD_RUNS)
     if goal.is_large or len(free) > MOST_FOR_STARTS:
         return start_at(goal, [1.0] * len(free))
-    best = max((optimum(few, start_at(goal, one)) for one in starts_of(free)), key=lambda one: one.value)
+    best = max((optimum(few, start_at(goal, start)) for start in starts_of(free)), key=lambda ascent: ascent.value)
     return goal.coordinates.of(best.parameters)

@@ -61,25 +61,37 @@ class Measured(NamedTuple):
 
 def measured(choice: Choice, plan: Plan, data: Sequence[Data]) -> Measured:
     """Run a choice on all data and measure the plan's first objective, with its penalty for each restart."""
-    found = [_on(choice, problem, one, plan) for problem, one in zip(plan.scenarios, data, strict=True)]
-    wholes = [whole for whole, *_ in found]
-    decisive = (int(np.argmax(wholes)),) if plan.worst else tuple(range(len(found)))
+    results = [
+        _on(choice, problem, problem_data, plan)
+        for problem, problem_data in zip(plan.scenarios, data, strict=True)
+    ]
+    wholes = [objective for objective, *_ in results]
+    decisive = (int(np.argmax(wholes)),) if plan.worst else tuple(range(len(results)))
     if plan.worst:
-        rest = [max((*wholes[:i], *wholes[i + 1 :]), default=-math.inf) for i in range(len(found))]
-        value, parts = max(wholes), tuple(np.maximum(one[1], rest[i]) for i, one in enumerate(found))
+        rest = [max((*wholes[:i], *wholes[i + 1 :]), default=-math.inf) for i in range(len(results))]
+        value, parts = max(wholes), tuple(np.maximum(result[1], rest[i]) for i, result in enumerate(results))
     else:
         value = float(np.mean(wholes))
-        parts = tuple(value + (parts - whole) / len(found) for whole, parts, *_ in found)
-    evaluations = [evaluation for _, _, evaluation, *_ in found]
-    scored = not any(math.isnan(one.log_score.value) for one in evaluations)
-    proper = float(np.mean([one.log_score.value if scored else one.log_likelihood for one in evaluations]))
-    others = (
-        [proper + (others - one.log_score.value) / len(found) for *_, one, others, _ in found] if scored else ()
+        parts = tuple(value + (parts - objective) / len(results) for objective, parts, *_ in results)
+    evaluations = [evaluation for _, _, evaluation, *_ in results]
+    scored = not any(math.isnan(evaluation.log_score.value) for evaluation in evaluations)
+    proper = float(
+        np.mean(
+            [evaluation.log_score.value if scored else evaluation.log_likelihood for evaluation in evaluations]
+        )
     )
-    states = [ratio for one in evaluations for ratio in one.scored_nees.values()]
+    log_scores = (
+        [
+            proper + (left_out - evaluation.log_score.value) / len(results)
+            for *_, evaluation, left_out, _ in results
+        ]
+        if scored
+        else ()
+    )
+    states = [ratio for evaluation in evaluations for ratio in evaluation.scored_nees.values()]
     nees = farthest(map(nees_ratio, evaluations)), farthest(states)
-    nis, runs = tuple(map(nis_ratio, evaluations)), tuple(runs for *_, runs in found)
-    return Measured(value, parts, proper, nis, tuple(others), *nees, runs, decisive)
+    nis, runs = tuple(map(nis_ratio, evaluations)), tuple(runs for *_, runs in results)
+    return Measured(value, parts, proper, nis, tuple(log_scores), *nees, runs, decisive)
 
 
 def _on(choice: Choice, problem, data: Data, plan: Plan) -> tuple[float, np.ndarray, Evaluation, np.ndarray, Runs]:
@@ -109,9 +121,9 @@ def _values(
         if objective == LOG_SCORE:  # over steps, of which runs may have more or fewer
             steps = np.asarray(runs.log_scores)
             totals, counts = -np.nansum(steps, axis=1), (~np.isnan(steps)).sum(axis=1)
-        others = np.maximum(counts.sum() - counts, 1)
+        left_out = np.maximum(counts.sum() - counts, 1)
         each = _finite(totals / np.maximum(counts, 1))[:, None]
-        return _finite(totals.sum() / counts.sum()), _finite((totals.sum() - totals) / others), each
+        return _finite(totals.sum() / counts.sum()), _finite((totals.sum() - totals) / left_out), each
     squares, scale = runs.mean_squares, evaluation.scale
     if objective.startswith(OUTPUT) or output:
         squares, scale = runs.output_mean_squares[output], np.ones(1)
@@ -119,10 +131,12 @@ def _values(
         raise ValueError("an error must be of runs with true states, but got runs without truth")
     weights = runs.counts[:, None].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
-        others = ((weights * squares).sum(axis=0) - weights * squares) / (weights.sum() - weights)
+        left_out = ((weights * squares).sum(axis=0) - weights * squares) / (weights.sum() - weights)
     counted = np.isfinite(scale)
     with np.errstate(invalid="ignore"):
-        relative, each = (np.maximum(some[:, counted], 0.0) / scale[counted] ** 2 for some in (others, squares))
+        relative, each = (
+            np.maximum(errors[:, counted], 0.0) / scale[counted] ** 2 for errors in (left_out, squares)
+        )
         parts = relative.sum(axis=1) if objective == MSE else np.sqrt(relative).mean(axis=1)
     if objective == MSE:
         each = each.sum(axis=1, keepdims=True)
@@ -135,7 +149,7 @@ def _finite(value):
     return np.clip(np.nan_to_num(value, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST * 1e6), None, LARGEST * 1e6)
 
 
-def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
+def over(result: Measured, other: Measured, *, ratio: bool) -> Interval:
     """The ratio (or difference) of two objectives on the same runs, with Student's interval by the jackknife.
 
         theta = log(V_1 / V_2),   var = sum over problems of (B - 1)/B sum_b (theta_(b) - mean theta_(b))^2
@@ -143,7 +157,7 @@ def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
     It is paired: each run is left out of both. Below 1 (or 0) the first is better.
 
     Args:
-        one: of one filter.
+        result: of one filter.
         other: of the other, on the same runs.
         ratio: whether objectives are errors, compared by their ratio; otherwise by their difference.
 
@@ -153,15 +167,15 @@ def over(one: Measured, other: Measured, *, ratio: bool) -> Interval:
     def between(a, b):
         return np.log(a / b) if ratio else a - b
 
-    each = [between(a, b) for a, b in zip(one.left_out, other.left_out, strict=True)]
-    ends = _jackknife(float(between(one.value, other.value)), each, one.runs)
+    each = [between(a, b) for a, b in zip(result.left_out, other.left_out, strict=True)]
+    ends = _jackknife(float(between(result.value, other.value)), each, result.runs)
     return Interval(*(math.exp(min(end, 700.0)) if ratio else end for end in ends))
 
 
-def log_score_gain(one: Measured, other: Measured) -> Interval:
+def log_score_gain(result: Measured, other: Measured) -> Interval:
     """The log score of the true states [nat a step] of one filter minus another's, with the interval of `over`."""
-    each = [a - b for a, b in zip(one.log_scores, other.log_scores, strict=True)]
-    return _jackknife(one.proper - other.proper, each, one.runs)
+    each = [a - b for a, b in zip(result.log_scores, other.log_scores, strict=True)]
+    return _jackknife(result.proper - other.proper, each, result.runs)
 
 
 def _jackknife(value: float, left_out: Sequence[np.ndarray], runs: Sequence[Runs]) -> Interval:
@@ -178,7 +192,7 @@ def _jackknife(value: float, left_out: Sequence[np.ndarray], runs: Sequence[Runs
     return Interval(value, value - half, value + half)
 
 
-def signed_rank(one: Measured, other: Measured, *, ratio: bool) -> float:
+def signed_rank(result: Measured, other: Measured, *, ratio: bool) -> float:
     """One-sided p-value of "one filter is no better than the other in most runs", by Wilcoxon's signed ranks.
 
         d_b = v_1b - v_2b   or, of errors,   d_b = sum_i (m_1bi - m_2bi) / sqrt(mean_b m_1bi + mean_b m_2bi),
@@ -190,7 +204,7 @@ def signed_rank(one: Measured, other: Measured, *, ratio: bool) -> float:
     other runs say. Of blocks of logs r is the autocorrelation of neighbours.
 
     Args:
-        one: of one filter.
+        result: of one filter.
         other: of the other, on the same runs.
         ratio: whether objectives are errors, compared by their ratio; otherwise by their difference.
 
@@ -198,24 +212,26 @@ def signed_rank(one: Measured, other: Measured, *, ratio: bool) -> float:
     Bayley, J. M. Hammersley (1946), "The 'effective' number of independent observations in an autocorrelated time
     series", Suppl. J. Royal Statistical Society 8(2).
     """
-    return _rank_chance(_differences(one, other, ratio)) if one.runs else 1.0
+    return _rank_chance(_differences(result, other, ratio)) if result.runs else 1.0
 
 
-def is_better(one: Measured, other: Measured, *, ratio: bool) -> bool:
+def is_better(result: Measured, other: Measured, *, ratio: bool) -> bool:
     """Whether a filter is significantly better by the interval of `over`, or as a whole and by signed ranks."""
-    found, equal = over(one, other, ratio=ratio), 1.0 if ratio else 0.0
-    return found.high < equal or (found.value < equal and signed_rank(one, other, ratio=ratio) < LEVEL / 2.0)
+    interval, equal = over(result, other, ratio=ratio), 1.0 if ratio else 0.0
+    return interval.high < equal or (
+        interval.value < equal and signed_rank(result, other, ratio=ratio) < LEVEL / 2.0
+    )
 
 
-def logs_with_loss(one: Measured, other: Measured, *, ratio: bool) -> list[tuple[int, int]]:
+def logs_with_loss(result: Measured, other: Measured, *, ratio: bool) -> list[tuple[int, int]]:
     """The logs, as (problem, log), in which one filter is worse by a standard error, in the mean or by ranks.
 
     Blocks of another log, to come, may resemble those of any one log and not their mixture.
     """
     from scipy.special import stdtr
 
-    lost, places = [], _places(one, other)
-    for place, (each, logs) in zip(places, _differences(one, other, ratio), strict=True):
+    lost, problems = [], _decisive_problems(result, other)
+    for problem, (each, logs) in zip(problems, _differences(result, other, ratio), strict=True):
         for log in [] if logs is None else np.unique(logs).tolist():
             gain = -each[logs == log]
             if len(gain) < FEWEST or not gain.any():
@@ -223,23 +239,23 @@ def logs_with_loss(one: Measured, other: Measured, *, ratio: bool) -> list[tuple
             error = gain.std(ddof=1) / math.sqrt(len(gain))
             by_mean = stdtr(len(gain) - 1, gain.mean() / error) if error > 0 else float(gain[0] > 0)
             if min(by_mean, _rank_chance([(gain, None)])) < ONE_ERROR:
-                lost.append((place, log))
+                lost.append((problem, log))
     return lost
 
 
-def _places(one: Measured, other: Measured) -> list[int]:
-    return sorted({*one.decisive, *other.decisive})
+def _decisive_problems(result: Measured, other: Measured) -> list[int]:
+    return sorted({*result.decisive, *other.decisive})
 
 
-def _differences(one: Measured, other: Measured, ratio: bool) -> list[tuple[np.ndarray, np.ndarray | None]]:
+def _differences(result: Measured, other: Measured, ratio: bool) -> list[tuple[np.ndarray, np.ndarray | None]]:
     """Differences of runs (B,), negative where the first filter is better, and their logs, by decisive problem."""
-    found = []
-    for place in _places(one, other):
-        a, b = one.runs[place].values, other.runs[place].values
+    differences = []
+    for problem in _decisive_problems(result, other):
+        a, b = result.runs[problem].values, other.runs[problem].values
         weights = a.mean(axis=0) + b.mean(axis=0) if ratio else np.ones(a.shape[1])
         weights = np.where(weights > 0.0, weights, 1.0)  # a state without any error
-        found.append((((a - b) / np.sqrt(weights)).sum(axis=1), one.runs[place].logs))
-    return found
+        differences.append((((a - b) / np.sqrt(weights)).sum(axis=1), result.runs[problem].logs))
+    return differences
 
 
 def _rank_chance(parts: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> float:
@@ -247,11 +263,11 @@ def _rank_chance(parts: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> float
     from scipy.special import ndtr
 
     differences = np.concatenate([each for each, _ in parts])
-    _, places, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
-    ranks = np.sign(differences) * (np.cumsum(counts) - (counts - 1) / 2.0)[places]
+    _, inverse, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
+    ranks = np.sign(differences) * (np.cumsum(counts) - (counts - 1) / 2.0)[inverse]
     ends = np.cumsum([len(each) for each, _ in parts])[:-1]
     split = zip(np.split(ranks, ends), parts, strict=True)
-    variance = sum(float(some @ some) * _inflation(some, logs) for some, (_, logs) in split)
+    variance = sum(float(part @ part) * _inflation(part, logs) for part, (_, logs) in split)
     return float(ndtr((ranks.sum() + 1.0) / math.sqrt(variance))) if variance else 1.0
 
 

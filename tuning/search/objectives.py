@@ -52,8 +52,8 @@ def _from_one(*ratios: Callable[[Evaluation], float]) -> Callable[[Evaluation, f
     """The sum of |log| of ratios whose expected value is 1, as a function of an evaluation; infinite for none."""
 
     def value(evaluation: Evaluation, _: float) -> float:
-        found = [ratio(evaluation) for ratio in ratios]
-        return sum(abs(math.log(one)) for one in found) if all(one > 0.0 for one in found) else math.inf
+        values = [ratio(evaluation) for ratio in ratios]
+        return sum(abs(math.log(ratio)) for ratio in values) if all(ratio > 0.0 for ratio in values) else math.inf
 
     return value
 
@@ -134,7 +134,7 @@ def check_objectives(names: Iterable[str], problem: Problem) -> None:
     for name in names:
         objective = find_objective(name)
         if TRUTH in objective.needs and problem.scale is None:
-            free = ", ".join(known for known, one in OBJECTIVES.items() if TRUTH not in one.needs)
+            free = ", ".join(known for known, objective in OBJECTIVES.items() if TRUTH not in objective.needs)
             raise ValueError(
                 f"an objective on {problem.name}, which has no truth, must be one of {free}, "
                 f"but got {short_repr(name)}"

@@ -64,9 +64,9 @@ class Correlation:
             return choice  # to the last digit
         variances = _diagonal(before)
         count = len(variances) * (len(variances) - 1) // 2
-        found = correlations_of(np.asarray(before)) if np.ndim(before) == 2 else [0.0] * count
-        given = np.clip(found, *CORRELATIONS).tolist()  # those of a singular Q may be 1
-        cov = full_covariance(variances, _replaced(given, self.index, value))
+        correlations = correlations_of(np.asarray(before)) if np.ndim(before) == 2 else [0.0] * count
+        clipped = np.clip(correlations, *CORRELATIONS).tolist()  # those of a singular Q may be 1
+        cov = full_covariance(variances, _replaced(clipped, self.index, value))
         return choice._replace(model={**choice.model, self.covariance: tuple(map(tuple, cov.tolist()))})
 
 
@@ -114,8 +114,8 @@ def model_parameters(
         prior: choose the scale of P_0, too.
         where: relations among them (`tuning.search.relations`), which reduce the free ones.
     """
-    found = _all_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
-    return related(found, where) if where else found
+    parameters = _all_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
+    return related(parameters, where) if where else parameters
 
 
 def index_pairs(text: str) -> str:
@@ -126,52 +126,53 @@ def index_pairs(text: str) -> str:
 def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: bool, prior: bool) -> list[Parameter]:
     if problem.parameters is not None:
         return list(problem.parameters)
-    untuned, quantities, found = problem.untuned, problem.quantities, []
+    untuned, quantities, parameters = problem.untuned, problem.quantities, []
     variances, count = _diagonal(untuned[Q]), len(quantities.states)
-    given = untuned if problem.given is None else problem.given
-    given_q, given_r = _diagonal(given[Q]), _diagonal(given[R])
+    user_values = untuned if problem.given is None else problem.given
+    given_q, given_r = _diagonal(user_values[Q]), _diagonal(user_values[R])
     scales = [*(() if problem.scale is None else problem.scale), *[0.0] * count]
     for i, (variance, state) in enumerate(zip(variances, quantities.states, strict=True)):
         if variance > 0:  # otherwise the state has no noise, and no range
             # Where the input hardly moves a state, noise may move it more.
             scale = scales[i] if np.isfinite(scales[i]) else 0.0
             ends = _range(variance, given_q[i], max(variance, scale**2))
-            found.append(_variance(f"Q{i + 1}{i + 1}", ends, Q_FIRST, state.unit, ProcessVariance(i)))
+            parameters.append(_variance(f"Q{i + 1}{i + 1}", ends, Q_FIRST, state.unit, ProcessVariance(i)))
     if full_q:
-        found += _correlations(Q, count)
+        parameters += _correlations(Q, count)
     if not hold_r:
         channels = quantities.measurements
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
             ends = _range(variance, given_r[i], variance)
-            name, place = r_name(i, len(channels)), MeasurementVariance(i)
-            found.append(_variance(name, ends, R_FIRST, channel.unit, place))
-        found += _correlations(R, len(channels)) if full_r else []
+            name, location = r_name(i, len(channels)), MeasurementVariance(i)
+            parameters.append(_variance(name, ends, R_FIRST, channel.unit, location))
+        parameters += _correlations(R, len(channels)) if full_r else []
     if prior:
-        found.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
-    return found
+        parameters.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
+    return parameters
 
 
 def _variance(
-    name: str, ends: tuple[float, float], factors: tuple[float, float], unit: str, place: Place
+    name: str, ends: tuple[float, float], factors: tuple[float, float], unit: str, location: Place
 ) -> Parameter:
     """A variance of Q or R, with the part of its range in which a search begins."""
     first = ends[0] * factors[0] / FACTORS[0], ends[1] * factors[1] / FACTORS[1]
-    return Parameter(name, *ends, unit=squared(unit), first=first, place=place)
+    return Parameter(name, *ends, unit=squared(unit), first=first, place=location)
 
 
 def _correlations(covariance: str, size: int) -> list[Parameter]:
     """The correlations of Q or R."""
     names = correlation_names(size, covariance)
-    places = [Correlation(covariance, k) for k in range(len(names))]
+    locations = [Correlation(covariance, k) for k in range(len(names))]
     return [
-        Parameter(name, *CORRELATIONS, log=False, place=place) for name, place in zip(names, places, strict=True)
+        Parameter(name, *CORRELATIONS, log=False, place=location)
+        for name, location in zip(names, locations, strict=True)
     ]
 
 
-def _range(variance: float, given: float, largest: float) -> tuple[float, float]:
+def _range(variance: float, user_value: float, largest: float) -> tuple[float, float]:
     """The range of a variance, by the rule of thumb; what was given lies inside."""
     low, high = FACTORS[0] * variance, FACTORS[1] * largest
-    return (min(low, given) if given > 0 else low), max(high, given)
+    return (min(low, user_value) if user_value > 0 else low), max(high, user_value)
 
 
 def places_in(choice) -> dict[str, Place]:
@@ -179,23 +180,23 @@ def places_in(choice) -> dict[str, Place]:
 
     Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
     """
-    found: dict[str, Place] = {}
+    locations: dict[str, Place] = {}
     if not filter_type(choice.name).has_covariance:
-        return found
+        return locations
     q, r = choice.model.get(Q), choice.model.get(R)
-    found |= {name: Argument(name) for name in choice.model if name not in (Q, R, PRIOR.name)}
+    locations |= {name: Argument(name) for name in choice.model if name not in (Q, R, PRIOR.name)}
     if q is not None:
-        found |= {f"Q{i + 1}{i + 1}": ProcessVariance(i) for i in range(len(q))}
+        locations |= {f"Q{i + 1}{i + 1}": ProcessVariance(i) for i in range(len(q))}
         if np.ndim(q) == 2:
-            found |= {name: Correlation(Q, k) for k, name in enumerate(correlation_names(len(q)))}
+            locations |= {name: Correlation(Q, k) for k, name in enumerate(correlation_names(len(q)))}
     if r is not None:
         count = np.size(_diagonal(r))
-        found |= {r_name(i, count): MeasurementVariance(i) for i in range(count)}
+        locations |= {r_name(i, count): MeasurementVariance(i) for i in range(count)}
         if np.ndim(r) == 2:
-            found |= {name: Correlation(R, k) for k, name in enumerate(correlation_names(count, R))}
+            locations |= {name: Correlation(R, k) for k, name in enumerate(correlation_names(count, R))}
     if PRIOR.name in choice.model:
-        found["P0"] = PRIOR
-    return found
+        locations["P0"] = PRIOR
+    return locations
 
 
 def correlation_names(size: int, covariance: str = Q) -> list[str]:
@@ -292,8 +293,8 @@ def _own(name: str, low: float, high: float, **options) -> Parameter:
 # Ranges of the parameters that filters have beside Q, R and N; the defaults of all filters lie within them.
 # `rotations` is not tuned: a smoother refuses a filter that has some, and a tuned filter can be smoothed.
 FILTER_PARAMETERS = {
-    one.name: one
-    for one in (
+    parameter.name: parameter
+    for parameter in (
         _own("inflation", 1.0, 1.3),
         _own("relaxation", 0.0, 0.9),
         _own("iterations", 1, 8, integer=True),
@@ -317,7 +318,10 @@ FILTER_PARAMETERS = {
 
 # Without process noise only `regularisation` separates the copies of a particle; with process noise Q does.
 # A `window` gains most there; elsewhere a tuned filter shall have none, for neither a smoother nor C takes one.
-WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0), _own("window", 0, 3, integer=True))}
+WITHOUT_NOISE = {
+    parameter.name: parameter
+    for parameter in (_own("regularisation", 0.0, 3.0), _own("window", 0, 3, integer=True))
+}
 
 
 def filter_parameters(kind: FilterType, process_noise: bool) -> list[Parameter]:
@@ -326,25 +330,32 @@ def filter_parameters(kind: FilterType, process_noise: bool) -> list[Parameter]:
     An estimator declares its own parameters. Some parameters are chosen only without process noise.
     """
     if kind.is_estimator:
-        return [replace(one, place=FilterParameter(one.name)) for one in kind.declared]
+        return [replace(parameter, place=FilterParameter(parameter.name)) for parameter in kind.declared]
     if kind.is_foreign:
-        own = kind.filter_class
-        return [_own_of_user(own, number, *ends) for number, ends in getattr(own, "ranges", {}).items()]
-    known, found = kind.numbers, []
+        filter_class = kind.filter_class
+        return [
+            _own_of_user(filter_class, number, *ends)
+            for number, ends in getattr(filter_class, "ranges", {}).items()
+        ]
+    known, parameters = kind.numbers, []
     if kind.has_ensemble:
         _, low, high = ensemble_sizes_of(kind)
-        found = [Parameter("N", low, high, integer=True, place=FilterParameter("ensemble_size"))]
+        parameters = [Parameter("N", low, high, integer=True, place=FilterParameter("ensemble_size"))]
     numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
-    return found + [one for number, one in numbers.items() if number in known]
+    return parameters + [parameter for number, parameter in numbers.items() if number in known]
 
 
 def default_numbers(kind: FilterType, process_noise: bool) -> dict[str, Any]:
     """The values of these parameters in the untuned filter."""
-    own = filter_parameters(kind, process_noise)
+    parameters = filter_parameters(kind, process_noise)
     if kind.is_foreign:
-        return {one.name: one.start for one in own}
+        return {parameter.name: parameter.start for parameter in parameters}
     size = {"ensemble_size": ensemble_sizes_of(kind).untuned} if kind.has_ensemble else {}
-    return size | {one.name: getattr(kind.filter_class, one.name) for one in own if one.name != "N"}
+    return size | {
+        parameter.name: getattr(kind.filter_class, parameter.name)
+        for parameter in parameters
+        if parameter.name != "N"
+    }
 
 
 def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Parameter:

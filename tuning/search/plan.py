@@ -61,9 +61,9 @@ class Plan(NamedTuple):
     @property
     def identity(self) -> dict:
         """What must be the same for a study to be continued, including the code of a user's own estimator."""
-        own = {name: digest_of(filter_type(name).estimator) for name in self.filter_types if is_code(name)}
+        digests = {name: digest_of(filter_type(name).estimator) for name in self.filter_types if is_code(name)}
         return {
-            **({"estimators": own} if own else {}),
+            **({"estimators": digests} if digests else {}),
             **({"worst": True} if self.worst else {}),
             **({"full_r": True} if self.full_r else {}),
             **({"where": list(self.where)} if self.where else {}),
@@ -88,7 +88,7 @@ class Plan(NamedTuple):
         """Names of the filters among which a trial chooses."""
         if self.filter != AUTO:
             return (self.filter,)
-        return tuple(name for name in AUTO_FILTER_TYPES if all(fits(name, one) for one in self.scenarios))
+        return tuple(name for name in AUTO_FILTER_TYPES if all(fits(name, problem) for problem in self.scenarios))
 
     @property
     def is_constrained(self) -> bool:
@@ -130,7 +130,7 @@ class Plan(NamedTuple):
             check_objectives(self.objectives, problem)
         parameters = self.scenarios[0].parameters
         if parameters is not None and (self.hold_r or (self.full_r and not self.full_q)):
-            names = ", ".join(one.name for one in parameters)
+            names = ", ".join(parameter.name for parameter in parameters)
             raise ValueError(
                 f"a held R, or a full R without a full Q, needs a problem that tunes Q and R, but "
                 f"{self.scenarios[0].name} tunes {names}"
@@ -162,7 +162,7 @@ class Plan(NamedTuple):
                 raise ValueError(f"forget (--forget) needs a sample time, but {problem.name} has none")
             if seconds < problem.dt:
                 raise ValueError(f"forget must be at least the sample time, {problem.dt:g} s, but got {seconds:g}")
-        if len({one.model().n for one in self.scenarios}) > 1:
+        if len({problem.model().n for problem in self.scenarios}) > 1:
             raise ValueError("forget (--forget) needs problems with the same number of states")
         choice = untuned_choice(self.filter_types[0], self.scenarios[0])
         for problem in self.scenarios:
@@ -185,19 +185,21 @@ class Plan(NamedTuple):
     def _check_problems(self) -> None:
         """Raise ValueError unless all scenarios are problems, and the same parameters have a meaning for each."""
         shapes = []
-        for one in self.scenarios:
-            if not isinstance(one, Problem):
-                raise ValueError(f"a study must be of tuning.problems.problem.Problem, but got {short_repr(one)}")
-            checked_problem(one)
-            own = [parameter.name for parameter in one.parameters or ()]
-            sizes = () if own else (len(one.quantities.states), len(one.quantities.measurements))
-            shapes.append((sizes, own))
+        for problem in self.scenarios:
+            if not isinstance(problem, Problem):
+                raise ValueError(
+                    f"a study must be of tuning.problems.problem.Problem, but got {short_repr(problem)}"
+                )
+            checked_problem(problem)
+            parameters = [parameter.name for parameter in problem.parameters or ()]
+            sizes = () if parameters else (len(problem.quantities.states), len(problem.quantities.measurements))
+            shapes.append((sizes, parameters))
             if shapes[-1] != shapes[0]:
                 raise ValueError(
                     "problems of one study must have the same numbers of states and measurements, or the "
-                    f"same parameters of their own, but {self.scenarios[0].name} and {one.name} do not"
+                    f"same parameters of their own, but {self.scenarios[0].name} and {problem.name} do not"
                 )
-        names = [one.name for one in self.scenarios]
+        names = [problem.name for problem in self.scenarios]
         if len(set(names)) < len(names):
             raise ValueError(f"problems of one study must have different names, but got {', '.join(names)}")
 
@@ -210,10 +212,10 @@ class Plan(NamedTuple):
 
         The scale of P_0 is one of them where a scenario scores the start-up.
         """
-        found = joint_distributions(self.filter_types, self.scenarios[0], **self.options)
-        if self.ensemble_size is not None and "N" in found:
-            found["N"] = IntDistribution(self.ensemble_size, self.ensemble_size)
-        return found
+        distributions = joint_distributions(self.filter_types, self.scenarios[0], **self.options)
+        if self.ensemble_size is not None and "N" in distributions:
+            distributions["N"] = IntDistribution(self.ensemble_size, self.ensemble_size)
+        return distributions
 
     def parameters(self) -> dict[str, Parameter]:
         """A trial's parameters by name, without the filter type."""
@@ -221,7 +223,9 @@ class Plan(NamedTuple):
 
     def first_ranges(self) -> dict[str, tuple[float, float]]:
         """The parts of the ranges of Q and R in which a search begins, by name."""
-        return {name: one.first for name, one in self.parameters().items() if one.first is not None}
+        return {
+            name: parameter.first for name, parameter in self.parameters().items() if parameter.first is not None
+        }
 
     @property
     def tunes_noise(self) -> bool:
@@ -232,8 +236,8 @@ class Plan(NamedTuple):
     def options(self) -> dict[str, Any]:
         """The tuned parts of the model, as arguments of `model_parameters`."""
         prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
-        told = {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
-        return {**told, "where": self.where}
+        tuned = {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
+        return {**tuned, "where": self.where}
 
     def choice_of(self, values: Mapping[str, Any]) -> Choice:
         """The choice of a trial's parameters."""
@@ -250,12 +254,12 @@ class Plan(NamedTuple):
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""
-        return [data_of(one, one.training_seeds(self.seed, TRAINING_SEEDS)) for one in self.scenarios]
+        return [data_of(problem, problem.training_seeds(self.seed, TRAINING_SEEDS)) for problem in self.scenarios]
 
     def validation_data(self) -> list[Data]:
         """Data on which the best trials are compared with the baselines, one for each scenario."""
-        return [one.data(one.validation_seeds(self.seed, VALIDATION_SEEDS)) for one in self.scenarios]
+        return [problem.data(problem.validation_seeds(self.seed, VALIDATION_SEEDS)) for problem in self.scenarios]
 
     def size_data(self) -> list[Data]:
         """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
-        return [data_of(one, one.size_seeds(self.seed, SIZE_SEEDS)) for one in self.scenarios]
+        return [data_of(problem, problem.size_seeds(self.seed, SIZE_SEEDS)) for problem in self.scenarios]

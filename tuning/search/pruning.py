@@ -32,16 +32,16 @@ class PairedPruner(optuna.pruners.WilcoxonPruner):
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
         """Whether a trial of a study that minimises is significantly worse than its best one, and in the mean."""
         complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        complete.sort(key=lambda one: one.values[0])  # so that few are asked for their constraints
-        found = next(filter(_is_feasible, complete), None)
-        if found is None:
+        complete.sort(key=lambda finished: finished.values[0])  # so that few are asked for their constraints
+        best_so_far = next(filter(_is_feasible, complete), None)
+        if best_so_far is None:
             return False
-        own, best = trial.intermediate_values, found.intermediate_values
-        if not own or not best or not own.keys() <= best.keys() or not _all_finite(own, best):
+        values, best = trial.intermediate_values, best_so_far.intermediate_values
+        if not values or not best or not values.keys() <= best.keys() or not _all_finite(values, best):
             return super().prune(study, trial)
-        if len(own) >= BLOCK and _mean(best) >= _mean(own):
+        if len(values) >= BLOCK and _mean(best) >= _mean(values):
             return False
-        differences = [value - best[step] for step, value in own.items()]
+        differences = [value - best[step] for step, value in values.items()]
         sizes = {abs(difference) for difference in differences}
         if not BLOCK <= len(differences) <= MOST_EXACT or len(sizes) < len(differences) or 0.0 in sizes:
             return super().prune(study, trial)
@@ -50,7 +50,7 @@ class PairedPruner(optuna.pruners.WilcoxonPruner):
 
 def positive_rank_sum(differences: Sequence[float]) -> int:
     """Sum of the ranks of positive differences, ranked by size from 1; of differences without ties."""
-    return sum(rank for rank, one in enumerate(sorted(differences, key=abs), start=1) if one > 0)
+    return sum(rank for rank, difference in enumerate(sorted(differences, key=abs), start=1) if difference > 0)
 
 
 @cache
@@ -74,7 +74,7 @@ def _is_feasible(trial: FrozenTrial) -> bool:
 
 
 def _all_finite(*values: dict[int, float]) -> bool:
-    return all(math.isfinite(value) for one in values for value in one.values())
+    return all(math.isfinite(value) for trial_values in values for value in trial_values.values())
 
 
 def _mean(values: dict[int, float]) -> float:

@@ -19,14 +19,14 @@ NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has end
 
 def model_ranges(plan: Plan) -> dict[str, Parameter]:
     """The parameters of the model that a study chooses, by name."""
-    return {name: one for name, one in plan.parameters().items() if _is_of_model(one)}
+    return {name: parameter for name, parameter in plan.parameters().items() if _is_of_model(parameter)}
 
 
 def range_words(plan: Plan) -> str:
     """The ranges of the model's parameters in words; empty if none is chosen."""
     parts = [
-        f"{index_pairs(name)} {one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
-        for name, one in model_ranges(plan).items()
+        f"{index_pairs(name)} {parameter.low:.3g} to {parameter.high:.3g} {parameter.unit}".rstrip()
+        for name, parameter in model_ranges(plan).items()
     ]
     return "; ".join(parts)
 
@@ -42,20 +42,20 @@ class Ended(NamedTuple):
     @property
     def wider(self) -> str:
         """The option that widens the range at that end."""
-        one = self.parameter
-        ends = (one.low / WIDER, one.high) if self.low else (one.low, one.high * WIDER)
+        parameter = self.parameter
+        ends = (parameter.low / WIDER, parameter.high) if self.low else (parameter.low, parameter.high * WIDER)
         return f"--where '{self.name} = {ends[0]:.3g}..{ends[1]:.3g}'"
 
 
 def at_ends(choice: Choice, plan: Plan) -> list[str]:
     """A sentence for each parameter of a choice at an end of its range, with advice."""
-    said = []
-    for found in _ended(choice, plan):
-        one, end = found.parameter, "lower" if found.low else "upper"
-        ends = f"{one.low:.3g} to {one.high:.3g} {one.unit}".rstrip()
-        ended = f"{index_pairs(found.name)} = {found.value:.3g} ended at the {end} end of its range, {ends}"
-        said.append(f"{ended}: {_advice(found)}.")
-    return said
+    sentences = []
+    for reached in _ended(choice, plan):
+        parameter, end = reached.parameter, "lower" if reached.low else "upper"
+        ends = f"{parameter.low:.3g} to {parameter.high:.3g} {parameter.unit}".rstrip()
+        ended = f"{index_pairs(reached.name)} = {reached.value:.3g} ended at the {end} end of its range, {ends}"
+        sentences.append(f"{ended}: {_advice(reached)}.")
+    return sentences
 
 
 def _ended(choice: Choice, plan: Plan) -> list[Ended]:
@@ -64,19 +64,22 @@ def _ended(choice: Choice, plan: Plan) -> list[Ended]:
     Given values are not ends, nor are parameters that do not determine the choice's Q and R, nor a Q that
     `--forget` may have raised.
     """
-    given: Mapping = plan.scenarios[0].given or {}
+    user_values: Mapping = plan.scenarios[0].given or {}
     own_noise = plan.scenarios[0].parameters is not None and bool(set(NOISE) & set(choice.model))
-    found = []
-    for name, one in model_ranges(plan).items():
-        value, raised = one.get(choice), plan.forget is not None and isinstance(one.place, ProcessVariance)
-        if value is None or own_noise or raised or value <= 0 < one.low:
+    reached = []
+    for name, parameter in model_ranges(plan).items():
+        value, raised = (
+            parameter.get(choice),
+            plan.forget is not None and isinstance(parameter.place, ProcessVariance),
+        )
+        if value is None or own_noise or raised or value <= 0 < parameter.low:
             continue
-        if value == _given_value(one, choice, given):
+        if value == _given_value(parameter, choice, user_values):
             continue
-        part = _part(value, one)
+        part = _part(value, parameter)
         if not NEAR_END < part < 1.0 - NEAR_END:
-            found.append(Ended(name, one, value, part <= NEAR_END))
-    return found
+            reached.append(Ended(name, parameter, value, part <= NEAR_END))
+    return reached
 
 
 def range_warning(choice: Choice, plan: Plan) -> list[str]:
@@ -84,11 +87,17 @@ def range_warning(choice: Choice, plan: Plan) -> list[str]:
 
     If the Q and R from which the ranges follow are far too small, the filter looks as if its model were wrong.
     """
-    high = [one for one in _ended(choice, plan) if not one.low and not isinstance(one.parameter.place, Argument)]
+    high = [
+        reached
+        for reached in _ended(choice, plan)
+        if not reached.low and not isinstance(reached.parameter.place, Argument)
+    ]
     if not high:
         return []
-    names, more = [index_pairs(one.name) for one in high], len(high) - MOST_OPTIONS
-    options = " ".join(one.wider for one in high[:MOST_OPTIONS]) + (f" and {more} more" if more > 0 else "")
+    names, more = [index_pairs(reached.name) for reached in high], len(high) - MOST_OPTIONS
+    options = " ".join(reached.wider for reached in high[:MOST_OPTIONS]) + (
+        f" and {more} more" if more > 0 else ""
+    )
     listed = " and ".join([*([", ".join(names[:-1])] if names[:-1] else []), names[-1]])
     ends = "the upper end of its range" if len(names) == 1 else "the upper ends of their ranges"
     return [
@@ -97,27 +106,27 @@ def range_warning(choice: Choice, plan: Plan) -> list[str]:
     ]
 
 
-def _is_of_model(one: Parameter) -> bool:
-    return isinstance(one.place, ProcessVariance | MeasurementVariance | Argument)
+def _is_of_model(parameter: Parameter) -> bool:
+    return isinstance(parameter.place, ProcessVariance | MeasurementVariance | Argument)
 
 
-def _given_value(one: Parameter, choice: Choice, given: Mapping) -> float | None:
-    return one.get(choice._replace(model=dict(given))) if given else None
+def _given_value(parameter: Parameter, choice: Choice, user_values: Mapping) -> float | None:
+    return parameter.get(choice._replace(model=dict(user_values))) if user_values else None
 
 
-def _part(value: float, one: Parameter) -> float:
+def _part(value: float, parameter: Parameter) -> float:
     """Where a value lies in its range, from 0 to 1 on the range's scale."""
-    if one.log:
-        return (log(value) - log(one.low)) / (log(one.high) - log(one.low))
-    return (value - one.low) / (one.high - one.low)
+    if parameter.log:
+        return (log(value) - log(parameter.low)) / (log(parameter.high) - log(parameter.low))
+    return (value - parameter.low) / (parameter.high - parameter.low)
 
 
-def _advice(found: Ended) -> str:
+def _advice(reached: Ended) -> str:
     """What to do about a parameter at an end of its range."""
-    place, low = found.parameter.place, found.low
-    if isinstance(place, Argument):
+    location, low = reached.parameter.place, reached.low
+    if isinstance(location, Argument):
         return f"give its Parameter a {'lower low' if low else 'higher high'}, if that has a meaning"
-    if isinstance(place, ProcessVariance):
+    if isinstance(location, ProcessVariance):
         if low:
             return "the data do not require this noise, and it may be zero"
         cause = "the model lacks something there: repair it, or estimate a constant (--augment NAME)"
@@ -125,4 +134,4 @@ def _advice(found: Ended) -> str:
         cause = "the sensor is better than its data sheet, or its readings are smoothed: keep R with --hold-r"
     else:
         cause = "the sensor is far worse than its sheet, or stuck, or its model is wrong: look at its readings"
-    return f"widen the range ({found.wider}). If it ends at the new end, too, {cause}"
+    return f"widen the range ({reached.wider}). If it ends at the new end, too, {cause}"

@@ -43,15 +43,15 @@ class Relation(NamedTuple):
 
 def relation_of(text: str) -> Relation:
     """A relation from its text; ValueError for another form."""
-    found = FORM.fullmatch(text) if isinstance(text, str) else None
-    if found is None:
+    match = FORM.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
         raise ValueError(f"{RULE}, but got {short_repr(text)}")
-    name, of = found["name"], found["in_proportion"] or found["equal"]
-    if found["value"]:
-        return Relation(name, value=float(found["value"]))
-    if found["low"]:
-        return Relation(name, ends=(float(found["low"]), float(found["high"])))
-    return Relation(name, of, float(found["factor"] or 1.0))
+    name, of = match["name"], match["in_proportion"] or match["equal"]
+    if match["value"]:
+        return Relation(name, value=float(match["value"]))
+    if match["low"]:
+        return Relation(name, ends=(float(match["low"]), float(match["high"])))
+    return Relation(name, of, float(match["factor"] or 1.0))
 
 
 def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[Parameter]:
@@ -65,45 +65,47 @@ def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[P
         ValueError: for another form, an unknown name, a parameter with two relations or in proportion to one that
             is not free, an invalid value, or if no parameter is left to tune.
     """
-    found = [relation_of(text) for text in relations]
-    known = {one.name: one for one in parameters}
-    names = [one.name for one in found]
-    for relation, text in zip(found, relations, strict=True):
-        unknown = next((one for one in (relation.name, relation.of) if one and one not in known), None)
+    parsed = [relation_of(text) for text in relations]
+    known = {parameter.name: parameter for parameter in parameters}
+    names = [relation.name for relation in parsed]
+    for relation, text in zip(parsed, relations, strict=True):
+        unknown = next((name for name in (relation.name, relation.of) if name and name not in known), None)
         if unknown is not None:
             raise ValueError(f"relations must be among {', '.join(known)}, but got {short_repr(text)}")
         if names.count(relation.name) > 1:
             raise ValueError(f"each parameter must have at most one relation, but {relation.name} has more")
         _check(known[relation.name], relation, text)
-    bound = {one.name for one in found if one.ends is None}
-    for relation, text in zip(found, relations, strict=True):
+    bound = {relation.name for relation in parsed if relation.ends is None}
+    for relation, text in zip(parsed, relations, strict=True):
         if relation.of in bound:
             raise ValueError(f"numbers must be in proportion to one that is free, but got {short_repr(text)}")
-    free = {one.name: one for one in parameters if one.name not in bound}
+    free = {parameter.name: parameter for parameter in parameters if parameter.name not in bound}
     if not free:
         raise ValueError(f"relations must leave a parameter to tune, but got {', '.join(relations)}")
-    for relation in found:
+    for relation in parsed:
         if relation.of:
             root = free[relation.of]
             free[relation.of] = replace(root, tied=(*root.tied, (known[relation.name].place, relation.factor)))
         elif relation.ends:
             low, high = relation.ends
             free[relation.name] = replace(free[relation.name], low=low, high=high, first=None, default=None)
-    held = tuple((known[one.name].place, one.value) for one in found if one.value is not None)
-    return [replace(one, held=held) for one in free.values()]
+    fixed = tuple(
+        (known[relation.name].place, relation.value) for relation in parsed if relation.value is not None
+    )
+    return [replace(parameter, held=fixed) for parameter in free.values()]
 
 
-def _check(one: Parameter, relation: Relation, text: str) -> None:
+def _check(parameter: Parameter, relation: Relation, text: str) -> None:
     """Raise ValueError unless a number can be what its relation says."""
-    least = 0.0 if one.place.is_variance else -1.0 if "correlation" in one.name else None
+    least = 0.0 if parameter.place.is_variance else -1.0 if "correlation" in parameter.name else None
     most = -least if least is not None and least < 0 else None
     for value in (relation.value, *(relation.ends or ())):
         if value is None or least is None:
             continue
         if value <= least or (most is not None and value >= most):
             rule = "positive" if most is None else "within -1 and 1"
-            raise ValueError(f"{one.name} must be {rule}, but got {short_repr(text)}")
-    if relation.of and one.place.is_variance and relation.factor <= 0:
+            raise ValueError(f"{parameter.name} must be {rule}, but got {short_repr(text)}")
+    if relation.of and parameter.place.is_variance and relation.factor <= 0:
         raise ValueError(f"a variance must be a positive multiple, but got {short_repr(text)}")
     if relation.ends and not relation.ends[0] < relation.ends[1]:
         raise ValueError(f"a range must be LOW..HIGH with LOW below HIGH, but got {short_repr(text)}")
@@ -111,9 +113,9 @@ def _check(one: Parameter, relation: Relation, text: str) -> None:
 
 def obeying(choice, parameters: Sequence[Parameter]):
     """The choice with the same free parameters, within their ranges, and the dependent and fixed ones set."""
-    for one in parameters:
-        if (value := one.get(choice)) is not None:
-            choice = one.set(choice, min(max(value, one.low), one.high))
+    for parameter in parameters:
+        if (value := parameter.get(choice)) is not None:
+            choice = parameter.set(choice, min(max(value, parameter.low), parameter.high))
     return choice
 
 
@@ -157,12 +159,12 @@ def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]
     """
     n = len(variances)
     lower, deviations = _lower(n, correlations), np.sqrt(np.asarray(variances, dtype=np.float64))
-    slopes, given, k = np.zeros((len(correlations), n, n)), list(correlations), 0
+    slopes, values, k = np.zeros((len(correlations), n, n)), list(correlations), 0
     for i in range(n):
         for j in range(i):
             by = np.zeros(n)
             by[j] = np.sqrt(max(1.0 - float(lower[i, :j] @ lower[i, :j]), 0.0))
-            by[j + 1 :] = -given[k] / (1.0 - given[k] ** 2) * lower[i, j + 1 :]
+            by[j + 1 :] = -values[k] / (1.0 - values[k] ** 2) * lower[i, j + 1 :]
             row = deviations[i] * deviations * (lower @ by)
             row[i] = 0.0  # the variance stays
             slopes[k, i], slopes[k, :, i] = row, row
@@ -172,10 +174,10 @@ def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]
 
 def _lower(n: int, correlations: Sequence[float]) -> np.ndarray:
     """The Cholesky factor L of the correlations."""
-    lower, given = np.zeros((n, n)), iter(correlations)
+    lower, remaining = np.zeros((n, n)), iter(correlations)
     for i, row in enumerate(lower):
         for j in range(i):
-            row[j] = next(given) * np.sqrt(max(1.0 - float(row[:j] @ row[:j]), 0.0))
+            row[j] = next(remaining) * np.sqrt(max(1.0 - float(row[:j] @ row[:j]), 0.0))
         row[i] = np.sqrt(max(1.0 - float(row[:i] @ row[:i]), 0.0))
     return lower
 
@@ -188,13 +190,13 @@ def correlations_of(cov: np.ndarray) -> list[float]:
     deviations = np.sqrt(np.diag(cov))
     scale = np.where(deviations > 0, deviations, 1.0)
     wanted = np.asarray(cov) / np.outer(scale, scale)
-    lower, found = np.zeros(wanted.shape), []
+    lower, correlations = np.zeros(wanted.shape), []
     for i, row in enumerate(lower):
         for j in range(i):
             rest, pivot = np.sqrt(max(1.0 - row[:j] @ row[:j], 0.0)), lower[j, j]
             partial = wanted[i, j] - row[:j] @ lower[j, :j]
             row[j] = np.clip(partial / pivot, -rest, rest) if pivot > 0 and rest > ROUNDING else 0.0
-            found.append(float(row[j] / rest) if rest > ROUNDING else 0.0)
+            correlations.append(float(row[j] / rest) if rest > ROUNDING else 0.0)
         left = wanted[i, i] - row[:i] @ row[:i]
         row[i] = np.sqrt(left) if left > ROUNDING else 0.0
-    return found
+    return correlations

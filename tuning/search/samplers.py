@@ -43,14 +43,16 @@ def box(
         first: the part of a range in which the search begins, by name, for those that have one.
         best: parameters of the best trial; empty before there is one.
     """
-    found = dict(space)
+    limited = dict(space)
     for name, (low, high) in first.items():
-        one = space.get(name)
-        if isinstance(one, FloatDistribution):
+        distribution = space.get(name)
+        if isinstance(distribution, FloatDistribution):
             if name in best:
                 low, high = min(low, best[name] / MARGIN), max(high, best[name] * MARGIN)
-            found[name] = FloatDistribution(max(low, one.low), min(high, one.high), log=one.log)
-    return found
+            limited[name] = FloatDistribution(
+                max(low, distribution.low), min(high, distribution.high), log=distribution.log
+            )
+    return limited
 
 
 class InBox:
@@ -173,7 +175,7 @@ def make_sampler(
     if package and importlib.util.find_spec(package) is None:
         raise ValueError(f"the sampler {name!r} needs {package}, which is not installed: {to_install(extra)}")
     if name in WITHOUT_FILTER_TYPES and FILTER_TYPE in distributions:
-        able = ", ".join(one for one in SAMPLERS if one not in WITHOUT_FILTER_TYPES)
+        able = ", ".join(sampler for sampler in SAMPLERS if sampler not in WITHOUT_FILTER_TYPES)
         raise ValueError(f"a sampler that chooses among filters must be one of {able}, but got {name!r}")
     if name == "grid":  # its order, and so its seed, has to be the same in every process
         values = {key: _grid(distribution) for key, distribution in distributions.items()}
@@ -202,15 +204,15 @@ def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.Base
         make: makes the sampler of an index.
         present: number of trials in the study before this process added any.
     """
-    first, own = make(0), set()
+    first, own_numbers = make(0), set()
     proceed = first.before_trial
 
     def look(_: optuna.Study, trial: FrozenTrial) -> None:
-        own.add(trial.number)
+        own_numbers.add(trial.number)
         if "fixed_params" not in trial.system_attrs:  # nothing is sampled in an enqueued trial
             first.before_trial = proceed  # type: ignore[method-assign]  # of this sampler alone
             begun = (t.number for t in study.get_trials(deepcopy=False)[present:] if t.state != TrialState.WAITING)
-            if any(number < trial.number and number not in own for number in begun):
+            if any(number < trial.number and number not in own_numbers for number in begun):
                 study.sampler = make(trial.number)
         (proceed if study.sampler is first else study.sampler.before_trial)(study, trial)
 
@@ -254,17 +256,23 @@ def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, numbe
     Source: Beyer, Schwefel (2002), "Evolution strategies, a comprehensive introduction", Natural Computing 1.
     """
     generator = derived_generator(plan.seed, LOCAL_TRIALS, number)
-    size, found = 10.0 ** generator.uniform(-DECADES, 0.0), dict(best)
+    size, neighbour = 10.0 ** generator.uniform(-DECADES, 0.0), dict(best)
     names = [name for name in best if isinstance(space.get(name), FloatDistribution | IntDistribution)]
-    moved = generator.random(len(names)) < MOVED
-    if names and not moved.any():
-        moved[generator.integers(len(names))] = True
-    for name, step in zip(names, np.where(moved, size * generator.standard_normal(len(names)), 0.0), strict=True):
-        one, value = space[name], best[name]
-        assert isinstance(one, FloatDistribution | IntDistribution)
+    is_changed = generator.random(len(names)) < MOVED
+    if names and not is_changed.any():
+        is_changed[generator.integers(len(names))] = True
+    for name, step in zip(
+        names, np.where(is_changed, size * generator.standard_normal(len(names)), 0.0), strict=True
+    ):
+        distribution, value = space[name], best[name]
+        assert isinstance(distribution, FloatDistribution | IntDistribution)
         if step == 0.0:
             continue
-        value = value * 10.0**step if one.log else value + LARGEST * step * (one.high - one.low)
-        value = float(np.clip(value, one.low, one.high))
-        found[name] = round(value) if isinstance(one, IntDistribution) else value
-    return found
+        value = (
+            value * 10.0**step
+            if distribution.log
+            else value + LARGEST * step * (distribution.high - distribution.low)
+        )
+        value = float(np.clip(value, distribution.low, distribution.high))
+        neighbour[name] = round(value) if isinstance(distribution, IntDistribution) else value
+    return neighbour

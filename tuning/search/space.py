@@ -84,13 +84,13 @@ def parameters(name: str, problem: Problem, **options: Any) -> list[Parameter]:
         **options: of `model_parameters`, what of the model is chosen.
     """
     kind = filter_type(name)
-    found = model_parameters(problem, **options) if kind.has_covariance else []
-    return found + filter_parameters(kind, has_process_noise(problem))
+    of_model = model_parameters(problem, **options) if kind.has_covariance else []
+    return of_model + filter_parameters(kind, has_process_noise(problem))
 
 
 def distributions(name: str, problem: Problem, **options) -> dict[str, BaseDistribution]:
     """The ranges of `parameters` by name, as Optuna takes them."""
-    return {one.name: one.distribution for one in parameters(name, problem, **options)}
+    return {parameter.name: parameter.distribution for parameter in parameters(name, problem, **options)}
 
 
 def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, Parameter]:
@@ -99,21 +99,22 @@ def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -
     Parameters of the model (Q, R, P_0) are shared by all filter types. The parameters of one type, such as
     "enkf N", are chosen only in trials of that type. For a single type these are its `parameters`.
     """
-    found = {}
+    by_name = {}
     for name in filter_types:
-        for one in parameters(name, problem, **options):
-            of_filter = isinstance(one.place, FilterParameter) and len(filter_types) > 1
-            found[f"{name} {one.name}" if of_filter else one.name] = one
-    return found
+        for parameter in parameters(name, problem, **options):
+            of_filter = isinstance(parameter.place, FilterParameter) and len(filter_types) > 1
+            by_name[f"{name} {parameter.name}" if of_filter else parameter.name] = parameter
+    return by_name
 
 
 def joint_distributions(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, BaseDistribution]:
     """The ranges of `joint_parameters`, as Optuna takes them; of several filter types, "filter" comes first."""
-    found: dict[str, BaseDistribution] = {}
+    space: dict[str, BaseDistribution] = {}
     if len(filter_types) > 1:
-        found[FILTER_TYPE] = CategoricalDistribution(filter_types)
-    return found | {
-        key: one.distribution for key, one in joint_parameters(filter_types, problem, **options).items()
+        space[FILTER_TYPE] = CategoricalDistribution(filter_types)
+    return space | {
+        key: parameter.distribution
+        for key, parameter in joint_parameters(filter_types, problem, **options).items()
     }
 
 
@@ -153,13 +154,13 @@ def ends_of(distribution: BaseDistribution) -> tuple[float, float]:
 
 def within_ranges(parameters: Mapping, space: Mapping[str, BaseDistribution]) -> dict:
     """The parameters of a trial, those that are numbers moved into their ranges."""
-    found = {}
+    clipped = {}
     for name, value in parameters.items():
         if isinstance(value, Real):
             low, high = ends_of(space[name])
             value = min(max(value, low), high)
-        found[name] = value
-    return found
+        clipped[name] = value
+    return clipped
 
 
 def choice_of(
@@ -177,9 +178,9 @@ def choice_of(
     choice = untuned_choice(name, problem)
     if "N" not in values:
         choice.numbers.pop("ensemble_size", None)
-    for one in parameters(name, problem, **everything_of(problem), where=where):
-        if one.name in values:
-            choice = one.set(choice, values[one.name])
+    for parameter in parameters(name, problem, **everything_of(problem), where=where):
+        if parameter.name in values:
+            choice = parameter.set(choice, values[parameter.name])
     return choice
 
 
@@ -209,11 +210,12 @@ def parameters_of(choice: Choice) -> dict[str, float | int]:
 
     Correlations and P0 are among them where the choice has a full Q or R and a factor on P_0.
     """
-    places = places_in(choice) | {
-        one.name: one.place for one in filter_parameters(filter_type(choice.name), process_noise=False)
+    locations = places_in(choice) | {
+        parameter.name: parameter.place
+        for parameter in filter_parameters(filter_type(choice.name), process_noise=False)
     }
-    found = {name: place.get(choice) for name, place in places.items()}
-    return {name: value for name, value in found.items() if value is not None}
+    values = {name: location.get(choice) for name, location in locations.items()}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def neutral(parameter: str) -> float | None:
@@ -223,15 +225,15 @@ def neutral(parameter: str) -> float | None:
 
 def trial_parameters(choice: Choice, space: Mapping[str, BaseDistribution]) -> dict[str, float | int | str]:
     """The parameters of a trial in a `joint_distributions` space that make a choice."""
-    own = parameters_of(choice)
-    found: dict[str, float | int | str] = {}
+    of_choice = parameters_of(choice)
+    values: dict[str, float | int | str] = {}
     for key in space:
         if key == FILTER_TYPE:
-            found[key] = choice.name
+            values[key] = choice.name
         elif _is_of(choice.name, key):
             short = key.removeprefix(f"{choice.name} ")
-            value = own.get(short, neutral(short))
+            value = of_choice.get(short, neutral(short))
             if value is None:
                 raise ValueError(f"a trial must have a value of {key}, but the choice has none")
-            found[key] = value
-    return found
+            values[key] = value
+    return values

@@ -54,8 +54,8 @@ def public_url(storage: str) -> str:
         return storage if misspelt is None else f"{misspelt[0]}{HIDDEN}"
     if not _SCHEME.fullmatch(scheme):
         return HIDDEN
-    place = _place(rest)
-    return f"{scheme}://{HIDDEN if place is None else place}"
+    address = _place(rest)
+    return f"{scheme}://{HIDDEN if address is None else address}"
 
 
 def is_misspelt(storage: str) -> bool:
@@ -70,28 +70,30 @@ def _place(rest: str) -> str | None:
     before, at, after = rest.rpartition("@")
     if at and re.search(r"[?#]", before):
         return None
-    place = re.split(r"[?#]", after, maxsplit=1)[0]
-    return place if _PLACE.fullmatch(place) else None
+    address = re.split(r"[?#]", after, maxsplit=1)[0]
+    return address if _PLACE.fullmatch(address) else None
 
 
 def without_secrets(text: str, storage: str) -> str:
     """A message of a database or its driver without the hidden parts of the storage's URL."""
-    shown = public_url(storage)
-    if shown == storage:
+    public = public_url(storage)
+    if public == storage:
         return text
     rest = storage.partition("://")[2]
     if rest.startswith("/"):
-        login, place = "", rest
-    elif shown.endswith(HIDDEN):  # any part may be a password
-        place = storage if shown == HIDDEN else storage.partition(":")[2]
-        login = f":{place}"
+        login, address = "", rest
+    elif public.endswith(HIDDEN):  # any part may be a password
+        address = storage if public == HIDDEN else storage.partition(":")[2]
+        login = f":{address}"
     else:
-        login, _, place = rest.rpartition("@")
-    options = [option.partition("=")[2] for option in re.split(r"[?#&;]", place)[1:]]
-    secrets = {part for one in (login.partition(":")[2], *options) for part in (one, unquote_plus(one))}
+        login, _, address = rest.rpartition("@")
+    options = [option.partition("=")[2] for option in re.split(r"[?#&;]", address)[1:]]
+    secrets = {
+        part for candidate in (login.partition(":")[2], *options) for part in (candidate, unquote_plus(candidate))
+    }
     # A driver that reads the URL in another way may name a part of a password, as that before its slash.
-    secrets |= {word for secret in secrets for word in _MARKS.split(secret)} - {*_MARKS.split(shown)}
-    text = text.replace(storage, shown)
+    secrets |= {word for secret in secrets for word in _MARKS.split(secret)} - {*_MARKS.split(public)}
+    text = text.replace(storage, public)
     for secret in sorted(secrets - {""}, key=len, reverse=True):
         text = re.sub(rf"(?<!\w){re.escape(secret)}(?!\w)", HIDDEN, text)
     return text
@@ -369,10 +371,10 @@ def cut_unfinished_line(path: Path) -> None:
     lines = content.splitlines(keepends=True)
     for number, line in enumerate(lines, start=1):
         try:
-            whole = line.endswith(b"\n") and isinstance(json.loads(line), dict)
+            is_entry = line.endswith(b"\n") and isinstance(json.loads(line), dict)
         except ValueError:
-            whole = False
-        if whole:
+            is_entry = False
+        if is_entry:
             continue
         if number < len(lines):
             raise ValueError(f"line {number} is no journal entry")

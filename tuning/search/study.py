@@ -133,11 +133,11 @@ def open_study(
     return study
 
 
-def _check_identity(name: str, wanted: dict, found: dict) -> None:
+def _check_identity(name: str, wanted: dict, stored: dict) -> None:
     """Raise ValueError, with the differences, unless a study has the wanted identity."""
-    if found != wanted:
-        differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
-        wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
+    if stored != wanted:
+        differing = [key for key in {**wanted, **stored} if wanted.get(key) != stored.get(key)]
+        wanted, stored = ({key: part.get(key) for key in differing} for part in (wanted, stored))
         if differing == ["scenario_digests"]:  # its numbers would tell nobody anything
             raise ValueError(
                 f"a study must be for one model and its data, but {name!r} exists here for another model or other "
@@ -148,7 +148,9 @@ def _check_identity(name: str, wanted: dict, found: dict) -> None:
                 f"a study must be of one estimator, but the code of {', '.join(wanted['estimators'])} is not what "
                 f"{name!r} was made with: give it another name (--study NAME)"
             )
-        raise ValueError(f"study {name!r} must be for {wanted}, but it was made for {found}: give it another name")
+        raise ValueError(
+            f"study {name!r} must be for {wanted}, but it was made for {stored}: give it another name"
+        )
 
 
 def finished_trials(study: optuna.Study) -> int:
@@ -257,18 +259,18 @@ def _forgetting(validation: Validation, plan: Plan) -> Validation:
     """A validation whose chosen filter has a Q by which its own gain forgets in time."""
     chosen = validation.named(validation.chosen)
     raised = chosen._replace(choice=plan.forgetting(chosen.choice, exact=True))
-    return validation._replace(met=tuple(raised if one is chosen else one for one in validation.met))
+    return validation._replace(met=tuple(raised if met is chosen else met for met in validation.met))
 
 
 def _begun(study: optuna.Study) -> list[FrozenTrial]:
-    return [one for one in study.get_trials(deepcopy=False) if one.state != TrialState.WAITING]
+    return [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
 
 
 def chosen_of(study: optuna.Study) -> dict | None:
     """The validation of a study's best trials, or None if there have been trials since."""
-    found = study.user_attrs.get(CHOSEN)
-    same = isinstance(found, dict) and found.get("trials") == len(_begun(study))
-    return found if same else None
+    validation = study.user_attrs.get(CHOSEN)
+    same = isinstance(validation, dict) and validation.get("trials") == len(_begun(study))
+    return validation if same else None
 
 
 def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
@@ -318,10 +320,10 @@ def run_trials(
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
         _note_best(study, trial)
         nonlocal beside_others
-        finished, others = finished_trials(study), _in_state(study, TrialState.RUNNING)
-        beside_others |= others > 0
-        waiting = _in_state(study, TrialState.WAITING) if others else 0
-        if finished + others + waiting < trials:
+        finished, running = finished_trials(study), _in_state(study, TrialState.RUNNING)
+        beside_others |= running > 0
+        waiting = _in_state(study, TrialState.WAITING) if running else 0
+        if finished + running + waiting < trials:
             enqueue_after(study, plan, trial)
         on_trial(study, finished)
         if finished >= trials or interrupted() or stop():

@@ -90,7 +90,7 @@ def run_trial(
 def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
     """Cost of a choice [us/step], on the scenario where it is largest."""
     pairs = zip(plan.scenarios, data, strict=True)
-    return max(microseconds_a_step(choice.filter(scenario), one) for scenario, one in pairs)
+    return max(microseconds_a_step(choice.filter(scenario), problem_data) for scenario, problem_data in pairs)
 
 
 def measure(
@@ -104,26 +104,28 @@ def measure(
     The NEES and errors of outputs are computed if an objective needs them, intervals never.
     """
     objectives = plan.found_objectives()
-    needs = {need for one in objectives for need in one.needs}
-    nees, outputs = NEES in needs, any(one.output for one in objectives)
+    needs = {need for objective in objectives for need in objective.needs}
+    nees, outputs = NEES in needs, any(objective.output for objective in objectives)
     scales = [scenario.scale if LOG_SCORES in needs else None for scenario in plan.scenarios]
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
-    count = min(len(one.seeds) for one in data)
+    count = min(len(problem_data.seeds) for problem_data in data)
     size = count if trial is None else BLOCK
-    ends = [shares(len(one.seeds), count) for one in data]
+    ends = [shares(len(problem_data.seeds), count) for problem_data in data]
     parts: list[list[RunMetrics]] = [[] for _ in filters]
     for first in range(0, count, size):
         last = min(first + size, count)
-        for runs, filter_, one, places, scale in zip(parts, filters, data, ends, scales, strict=True):
-            runs.append(metrics_of_all(filter_, one.slice(places[first], places[last]), nees, outputs, scale))
+        for runs, filter_, problem_data, bounds, scale in zip(parts, filters, data, ends, scales, strict=True):
+            runs.append(
+                metrics_of_all(filter_, problem_data.slice(bounds[first], bounds[last]), nees, outputs, scale)
+            )
         if trial is not None:
             _report(trial, first, last, [runs[-1] for runs in parts], ends, plan)
             if last < count and trial.should_prune():
                 raise optuna.TrialPruned
     rows = zip(filters, map(joined, parts), data, plan.scenarios, strict=True)
     return [
-        compute_metrics(filter_, runs, one, scenario.scale, False, VARIANCES in needs)
-        for filter_, runs, one, scenario in rows
+        compute_metrics(filter_, runs, problem_data, scenario.scale, False, VARIANCES in needs)
+        for filter_, runs, problem_data, scenario in rows
     ]
 
 
@@ -137,12 +139,12 @@ def _report(
 ) -> None:
     """Report the mean over problems of the scores of their shares `first` up to, without, `last`."""
     scores = []
-    for runs, scenario, places in zip(parts, plan.scenarios, ends, strict=True):
-        begin = np.subtract(places[first:last], places[first])
-        sizes = np.diff(places[first : last + 1])
+    for runs, scenario, bounds in zip(parts, plan.scenarios, ends, strict=True):
+        begin = np.subtract(bounds[first:last], bounds[first])
+        sizes = np.diff(bounds[first : last + 1])
         scores.append(np.add.reduceat(run_scores(runs, scenario.scale), begin) / sizes)
-    for place, score in enumerate(np.mean(scores, axis=0)):
-        trial.report(float(score), first + place)
+    for index, score in enumerate(np.mean(scores, axis=0)):
+        trial.report(float(score), first + index)
 
 
 # The outcome of trials: constraints, and the best trial.

@@ -102,7 +102,7 @@ class Validation(NamedTuple):
 
     def named(self, name: str) -> Met:
         """One of those that met."""
-        return next(one for one in self.met if one.name == name)
+        return next(met for met in self.met if met.name == name)
 
     @property
     def ratio(self) -> Interval:
@@ -158,27 +158,29 @@ def validate(
     finalists = {
         name: choice
         for name, choice in finalists.items()
-        if not any(same_filter(choice, one) for one in before.values())
+        if not any(same_filter(choice, other) for other in before.values())
     }
     if rescales:
         finalists |= _rescaled(finalists, plan, training)
     everyone, data = {**before, **finalists}, plan.validation_data()
-    found = {name: measured(one, plan, data) for name, one in everyone.items()}
-    choosing = Choosing(plan, {name: found[name] for name in before}, {name: found[name] for name in finalists})
+    results = {name: measured(choice, plan, data) for name, choice in everyone.items()}
+    choosing = Choosing(
+        plan, {name: results[name] for name in before}, {name: results[name] for name in finalists}
+    )
     candidate = next(filter(choosing.wins, choosing.order()), choosing.best)
     wins = bool(candidate) and choosing.wins(candidate)
     met = tuple(choosing.met(name, choice) for name, choice in everyone.items())
     seeds, baseline = data[0].seeds, choosing.baseline
-    own = not set(seeds) & set(training[0].seeds)
+    has_own_seeds = not set(seeds) & set(training[0].seeds)
     validation = Validation(
-        seeds, own, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
+        seeds, has_own_seeds, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
     )
     chosen = validation.chosen
-    if choosing.ratio and plan.consistent and found[chosen].log_scores:
-        decided = {name: found[name] for name in (*before, *([candidate] if candidate else []))}
+    if choosing.ratio and plan.consistent and results[chosen].log_scores:
+        decided = {name: results[name] for name in (*before, *([candidate] if candidate else []))}
         validation = validation._replace(chosen=_by_log_score(decided, chosen, baseline), by_error=chosen)
-    full = _better_with_full_noise(plan, found[validation.chosen], first, training)
-    return _with_failures(validation._replace(full=full), plan, training, found, data)
+    full = _better_with_full_noise(plan, results[validation.chosen], first, training)
+    return _with_failures(validation._replace(full=full), plan, training, results, data)
 
 
 def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, training: Sequence[Data]) -> Met | None:
@@ -189,27 +191,32 @@ def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, trainin
     for name, choice in _full_noise(plan, first.name, baseline_size(first)).items():
         if plan.budget is not None and cost_of(choice, plan, training) > plan.budget:
             continue
-        one = measured(choice, plan, data)
-        gained = over(one, chosen, ratio=ratio)
+        result = measured(choice, plan, data)
+        gained = over(result, chosen, ratio=ratio)
         if gained.high < (1.0 if ratio else 0.0) and not (ratio and slightly(gained)):
-            nis = max(one.nis, key=lambda part: abs(part - 1.0))
-            better.append(Met(name, choice, one.value, gained, one.proper, nis, _is_consistent(one, plan)))
-    return min(better, key=lambda one: one.value, default=None)
+            nis = max(result.nis, key=lambda part: abs(part - 1.0))
+            better.append(
+                Met(name, choice, result.value, gained, result.proper, nis, _is_consistent(result, plan))
+            )
+    return min(better, key=lambda met: met.value, default=None)
 
 
 def _full_noise(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, Choice]:
     """Noise estimation of own parameters with a full Q, and with a full Q and R, by name."""
     problem = plan.scenarios[0]
-    if not filter_type(kind).has_covariance or len({(one.model().n, one.model().m) for one in plan.scenarios}) > 1:
+    if (
+        not filter_type(kind).has_covariance
+        or len({(scenario.model().n, scenario.model().m) for scenario in plan.scenarios}) > 1
+    ):
         return {}
-    found = {
+    choices = {
         FULL_Q: full_noise(kind, problem, plan.seed),
         FULL_QR: full_noise(kind, problem, plan.seed, with_r=True),
     }
     return {
-        name: one if ensemble_size is None else one.with_size(ensemble_size)
-        for name, one in found.items()
-        if one is not None
+        name: choice if ensemble_size is None else choice.with_size(ensemble_size)
+        for name, choice in choices.items()
+        if choice is not None
     }
 
 
@@ -236,31 +243,31 @@ class Choosing:
         """The best trial, then of the others those that can be taken, the best first."""
         if self.best:
             yield self.best
-        others = {name: one for name, one in self.trials.items() if name != self.best and self.wins(name)}
-        while others:
-            best, _ = _best_of(self.plan, others, self.ratio)
+        remaining = {name: result for name, result in self.trials.items() if name != self.best and self.wins(name)}
+        while remaining:
+            best, _ = _best_of(self.plan, remaining, self.ratio)
             yield str(best)
-            del others[str(best)]
+            del remaining[str(best)]
 
     def met(self, name: str, choice: Choice) -> Met:
         """A filter beside the best baseline."""
-        one, other = {**self.baselines, **self.trials}[name], self.baselines[self.baseline]
-        nis = max(one.nis, key=lambda part: abs(part - 1.0))
+        result, other = {**self.baselines, **self.trials}[name], self.baselines[self.baseline]
+        nis = max(result.nis, key=lambda part: abs(part - 1.0))
         lost = [
             self.plan.scenarios[problem].log_names[log]
-            for problem, log in logs_with_loss(one, other, ratio=self.ratio)
+            for problem, log in logs_with_loss(result, other, ratio=self.ratio)
         ]
         return Met(
             name,
             choice,
-            one.value,
-            over(one, other, ratio=self.ratio),
-            one.proper,
+            result.value,
+            over(result, other, ratio=self.ratio),
+            result.proper,
             nis,
-            _is_consistent(one, self.plan),
-            one.nees,
-            one.state_nees,
-            signed_rank(one, other, ratio=self.ratio),
+            _is_consistent(result, self.plan),
+            result.nees,
+            result.state_nees,
+            signed_rank(result, other, ratio=self.ratio),
             tuple(lost),
         )
 
@@ -271,25 +278,25 @@ class Choosing:
 
 
 def _with_failures(
-    found: Validation, plan: Plan, training: Sequence[Data], met: Mapping[str, Measured], data: Sequence[Data]
+    validation: Validation, plan: Plan, training: Sequence[Data], met: Mapping[str, Measured], data: Sequence[Data]
 ) -> Validation:
     """With the runs in which what was given fails, or the best baseline where nothing was given."""
     from scipy.special import chdtrc
 
-    tested = found.named(GIVEN if GIVEN in met else found.baseline)
-    pair, failures, count = (tested, found.named(found.candidate)), [], 0
-    sets = [(training, [measured(one.choice, plan, training).runs for one in pair])] if found.own else []
-    for some, (ours, theirs) in [*sets, (data, [met[one.name].runs for one in pair])]:
-        for problem, part, a, b in zip(plan.scenarios, some, ours, theirs, strict=True):
+    tested = validation.named(GIVEN if GIVEN in met else validation.baseline)
+    pair, failures, count = (tested, validation.named(validation.candidate)), [], 0
+    sets = [(training, [measured(entry.choice, plan, training).runs for entry in pair])] if validation.own else []
+    for datasets, (ours, theirs) in [*sets, (data, [met[entry.name].runs for entry in pair])]:
+        for problem, part, a, b in zip(plan.scenarios, datasets, ours, theirs, strict=True):
             count += len(part.seeds)
-            nis, other = (one.nis / np.maximum(one.channels, 1) for one in (a, b))
+            nis, other = (runs.nis / np.maximum(runs.channels, 1) for runs in (a, b))
             fails = (nis > FAILS) & (chdtrc(np.maximum(a.channels, 1), a.nis) < RARE)
             failures += [
                 Failure(problem.run_label(part.seeds[i]), float(nis[i]), float(other[i]))
                 for i in np.flatnonzero(fails).tolist()
             ]
-    worst = sorted(failures, key=lambda one: -one.nis)[:WORST]
-    return found._replace(tested=tested.name, failures=tuple(worst), failed=len(failures), runs=count)
+    worst = sorted(failures, key=lambda failure: -failure.nis)[:WORST]
+    return validation._replace(tested=tested.name, failures=tuple(worst), failed=len(failures), runs=count)
 
 
 def finalists_of(
@@ -307,8 +314,8 @@ def finalists_of(
     complete.sort(key=lambda trial: trial.values[0])
     best = best_trial(complete)
     first = [] if best is None else [best]
-    consistent = [one for one in complete if is_consistent(one)][:BY_CONSISTENCY]
-    likely = [one for one in complete if MAXIMUM_LIKELIHOOD in one.user_attrs]
+    consistent = [trial for trial in complete if is_consistent(trial)][:BY_CONSISTENCY]
+    likely = [trial for trial in complete if MAXIMUM_LIKELIHOOD in trial.user_attrs]
     finalists: dict[str, Choice] = {}
     sizes: dict[str, int] = {}
     for trial in (*first, *complete[:BY_SCORE], *consistent, *likely):
@@ -329,8 +336,12 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
     this one has the best log score. Without truth those of an ensemble, which may have got another size, are
     multiplied by their mean NIS over m, and others, of which the likelihood has found the factor, are not.
     """
-    found: dict[str, Choice] = {}
-    parameters = [one for one in model_parameters(plan.scenarios[0], **plan.options) if one.place.is_variance]
+    rescaled: dict[str, Choice] = {}
+    parameters = [
+        parameter
+        for parameter in model_parameters(plan.scenarios[0], **plan.options)
+        if parameter.place.is_variance
+    ]
     for name in list(finalists)[:BY_CONSISTENCY] if plan.rescales else ():
         choice, before = finalists[name], measured(finalists[name], plan, training)
         factor = before.nees
@@ -338,12 +349,12 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
             factor = geometric_mean(before.nis) if min(before.nis) > 0.0 else nan
         if not 0.0 < factor < LARGEST:
             continue
-        for one in parameters:
-            value = one.get(choice)
+        for parameter in parameters:
+            value = parameter.get(choice)
             if value is not None:
-                choice = one.set(choice, min(max(factor * value, one.low), one.high))
-        found[f"{name} rescaled"] = plan.forgetting(choice)
-    return found
+                choice = parameter.set(choice, min(max(factor * value, parameter.low), parameter.high))
+        rescaled[f"{name} rescaled"] = plan.forgetting(choice)
+    return rescaled
 
 
 def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
@@ -352,20 +363,23 @@ def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[s
     An ensemble has `baseline_size` members, or, over the budget, the fewer of the finalist's and the usual ones.
     """
     size, budget = baseline_size(first), plan.budget
-    found = _competing(plan, first.name, size)
+    baselines = _competing(plan, first.name, size)
     if budget is None:
-        return found
-    pairs = {name: [one] for name, one in found.items()}
+        return baselines
+    pairs = {name: [choice] for name, choice in baselines.items()}
     if size is not None:
         least = min(first.numbers.get("ensemble_size", size), ensemble_sizes_of(filter_type(first.name)).untuned)
-        for name, one in _competing(plan, first.name, least).items():
-            pairs.setdefault(name, []).append(one)
+        for name, choice in _competing(plan, first.name, least).items():
+            pairs.setdefault(name, []).append(choice)
     within = (
-        (name, one) for name, some in pairs.items() for one in some if cost_of(one, plan, training) <= budget
+        (name, choice)
+        for name, choices in pairs.items()
+        for choice in choices
+        if cost_of(choice, plan, training) <= budget
     )
     affordable: dict[str, Choice] = {}
-    for name, one in within:
-        affordable.setdefault(name, one)
+    for name, choice in within:
+        affordable.setdefault(name, choice)
     return affordable
 
 
@@ -375,56 +389,66 @@ def _competing(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, Ch
     Where R is held none of them changes it, and relations among numbers hold for all but what was given.
     """
     problem = plan.scenarios[0]
-    found = competing_baselines(kind, problem, plan.seed, ensemble_size)
+    baselines = competing_baselines(kind, problem, plan.seed, ensemble_size)
     if plan.hold_r and filter_type(kind).has_covariance:
-        held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
-        found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
+        held_noise = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
+        baselines = {
+            name: choice._replace(model={**choice.model, **held_noise}) for name, choice in baselines.items()
+        }
     if plan.where:
         free = model_parameters(problem, **plan.options)
-        found = {name: one if name == GIVEN else obeying(one, free) for name, one in found.items()}
-    sizes = {(one.model().n, one.model().m) for one in plan.scenarios}
+        baselines = {
+            name: choice if name == GIVEN else obeying(choice, free) for name, choice in baselines.items()
+        }
+    sizes = {(scenario.model().n, scenario.model().m) for scenario in plan.scenarios}
     if len(sizes) > 1:  # a Q or R fits problems of one size alone
-        found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}
+        baselines = {
+            name: choice for name, choice in baselines.items() if not set(NOISE_ARGUMENTS) & set(choice.model)
+        }
     if plan.full_q and problem.parameters is not None:
         full = _full_noise(plan, kind, ensemble_size)
-        found |= {name: one for name, one in full.items() if plan.full_r or name == FULL_Q}
-    return {name: plan.forgetting(one) for name, one in found.items()}
+        baselines |= {name: choice for name, choice in full.items() if plan.full_r or name == FULL_Q}
+    return {name: plan.forgetting(choice) for name, choice in baselines.items()}
 
 
 def _best_of(
-    plan: Plan, found: dict[str, Measured], ratio: bool, baseline: Measured | None = None
+    plan: Plan, results: dict[str, Measured], ratio: bool, baseline: Measured | None = None
 ) -> tuple[str | None, float | None]:
     """The name of the best trial, and what a mean NIS within its band costs; None where there is none."""
-    if not found:
+    if not results:
         return None, None
-    free = min(found, key=lambda name: found[name].value)
-    near = [name for name, one in found.items() if one.value <= (1.0 + MOST_PRICE) * found[free].value]
-    better = [] if baseline is None else [name for name in near if is_better(found[name], baseline, ratio=ratio)]
-    inside = [name for name, one in found.items() if _is_consistent(one, plan)]
-    best = min(inside, key=lambda name: found[name].value, default=free)
-    price = found[best].value / found[free].value - 1.0 if ratio and plan.is_constrained and inside else None
-    if ratio and plan.consistent and found[free].log_scores:
-        return max(better or near, key=lambda name: found[name].proper), price
+    free = min(results, key=lambda name: results[name].value)
+    near = [name for name, result in results.items() if result.value <= (1.0 + MOST_PRICE) * results[free].value]
+    better = [] if baseline is None else [name for name in near if is_better(results[name], baseline, ratio=ratio)]
+    inside = [name for name, result in results.items() if _is_consistent(result, plan)]
+    best = min(inside, key=lambda name: results[name].value, default=free)
+    price = results[best].value / results[free].value - 1.0 if ratio and plan.is_constrained and inside else None
+    if ratio and plan.consistent and results[free].log_scores:
+        return max(better or near, key=lambda name: results[name].proper), price
     if not plan.is_constrained or not inside:
         return free, None
     if price is None:  # the objective is a proper score itself
-        return (best if over(found[best], found[free], ratio=False).low <= 0 else free), None
-    return (best if price <= MOST_PRICE else max(near, key=lambda name: found[name].proper)), price
+        return (best if over(results[best], results[free], ratio=False).low <= 0 else free), None
+    return (best if price <= MOST_PRICE else max(near, key=lambda name: results[name].proper)), price
 
 
-def _by_log_score(found: Mapping[str, Measured], chosen: str, baseline: str) -> str:
+def _by_log_score(results: Mapping[str, Measured], chosen: str, baseline: str) -> str:
     """Of the filters within 5 % of the least error, the one with the best log score of the true states.
 
     It replaces the choice by error if its log score is significantly better, or better where the NEES of that
     choice, joint or of a state, is more than a factor of three off. A filter that is significantly worse in error
     than the best baseline, by 0.5 % or more, is not taken.
     """
-    most = (1.0 + MOST_PRICE) * min(one.value for one in found.values())
-    ratios = {name: over(one, found[baseline], ratio=True) for name, one in found.items() if one.value <= most}
+    most = (1.0 + MOST_PRICE) * min(result.value for result in results.values())
+    ratios = {
+        name: over(result, results[baseline], ratio=True)
+        for name, result in results.items()
+        if result.value <= most
+    }
     near = [name for name, ratio in ratios.items() if ratio.low <= 1.0 or slightly(ratio)]
-    best = max(near, key=lambda name: found[name].proper, default=chosen)
-    gained = log_score_gain(found[best], found[chosen])
-    wrong = any(is_beyond(one) for one in (found[chosen].nees, found[chosen].state_nees))
+    best = max(near, key=lambda name: results[name].proper, default=chosen)
+    gained = log_score_gain(results[best], results[chosen])
+    wrong = any(is_beyond(nees) for nees in (results[chosen].nees, results[chosen].state_nees))
     return best if gained.low > 0.0 or (wrong and gained.value > 0.0) else chosen
 
 
@@ -440,39 +464,39 @@ def _wins(candidate: Met, baseline: Met, plan: Plan, ratio: bool) -> bool:
     return least or (by_ranks and candidate.over.value < 1.0)
 
 
-def _is_consistent(found: Measured, plan: Plan) -> bool:
+def _is_consistent(result: Measured, plan: Plan) -> bool:
     """Whether the mean NIS is in its band on all problems; true without a band."""
-    return not plan.is_constrained or all(NIS_BAND[0] <= one <= NIS_BAND[1] for one in found.nis)
+    return not plan.is_constrained or all(NIS_BAND[0] <= nis <= NIS_BAND[1] for nis in result.nis)
 
 
-def as_data(found: Validation | None) -> dict | None:
+def as_data(validation: Validation | None) -> dict | None:
     """The meeting as plain data, for a tuned file and JSON."""
-    if found is None:
+    if validation is None:
         return None
     return {
-        "chosen": found.chosen,
-        "candidate": found.candidate,
-        "baseline": found.baseline,
-        "gave_way": found.gave_way,
-        "seeds": [found.seeds[0], found.seeds[-1] + 1],
-        "own_seeds": found.own,
-        "price": found.price,
-        "by_error": found.by_error,
-        "met": list(map(_met_as_data, found.met)),
-        "full": found.full and _met_as_data(found.full),
-        "tested": found.tested,
-        "failures": [one._asdict() for one in found.failures],
-        "failed_runs": [found.failed, found.runs],
+        "chosen": validation.chosen,
+        "candidate": validation.candidate,
+        "baseline": validation.baseline,
+        "gave_way": validation.gave_way,
+        "seeds": [validation.seeds[0], validation.seeds[-1] + 1],
+        "own_seeds": validation.own,
+        "price": validation.price,
+        "by_error": validation.by_error,
+        "met": list(map(_met_as_data, validation.met)),
+        "full": validation.full and _met_as_data(validation.full),
+        "tested": validation.tested,
+        "failures": [failure._asdict() for failure in validation.failures],
+        "failed_runs": [validation.failed, validation.runs],
     }
 
 
-def _met_as_data(one: Met) -> dict:
+def _met_as_data(met: Met) -> dict:
     nees = {
         name: value if isfinite(value) else None
-        for name, value in zip(NEES, (one.nees, one.state_nees), strict=True)
+        for name, value in zip(NEES, (met.nees, met.state_nees), strict=True)
     }
-    lists = {"over": list(one.over), "worse_in": list(one.worse_in)}
-    return {**one._asdict(), **nees, **lists, "choice": one.choice._asdict()}
+    lists = {"over": list(met.over), "worse_in": list(met.worse_in)}
+    return {**met._asdict(), **nees, **lists, "choice": met.choice._asdict()}
 
 
 def choice_from(data: Mapping) -> Choice:

@@ -44,18 +44,20 @@ def orders_of(plan: Plan) -> dict[str, Any]:
     return {
         "plan": {**plan._asdict(), "scenarios": [scenario.name for scenario in plan.scenarios]},
         "digests": [scenario.digest for scenario in plan.scenarios],
-        "logs": {one.name: _packed(one) for one in plan.scenarios if isinstance(within(one), LogProblem)},
+        "logs": {
+            problem.name: _packed(problem) for problem in plan.scenarios if isinstance(within(problem), LogProblem)
+        },
     }
 
 
 def plan_of(orders: dict[str, Any]) -> Plan:
     """The plan in such orders; ValueError if a problem is not found, or is another one."""
-    given = orders["plan"]
+    arguments = orders["plan"]
     logs = {name: _unpacked(text) for name, text in orders["logs"].items()}
-    pairs = zip(given["scenarios"], orders["digests"], strict=True)
+    pairs = zip(arguments["scenarios"], orders["digests"], strict=True)
     scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
-    several = {name: tuple(given[name]) for name in ("objectives", "where")}
-    return Plan(**{**given, **several, "scenarios": scenarios})
+    several = {name: tuple(arguments[name]) for name in ("objectives", "where")}
+    return Plan(**{**arguments, **several, "scenarios": scenarios})
 
 
 def _packed(problem: Problem) -> str:
@@ -166,7 +168,7 @@ def run_in_workers(
 def _watch(
     study: optuna.Study, processes: dict[int, subprocess.Popen], on_trial: OnTrial, interrupted: Callable[[], bool]
 ) -> None:
-    living, shown = dict(processes), finished_trials(study)
+    living, reported = dict(processes), finished_trials(study)
     while living:
         time.sleep(POLL_SECONDS)
         if interrupted():
@@ -181,8 +183,8 @@ def _watch(
                     )
                     retry_orphans(study)
         finished = finished_trials(study)
-        if finished > shown:
-            shown = finished
+        if finished > reported:
+            reported = finished
             on_trial(study, finished)
 
 
