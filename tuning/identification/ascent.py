@@ -30,10 +30,10 @@ def climb(
     low: np.ndarray,
     high: np.ndarray,
     *,
-    held: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
     iterations: int = ITERATIONS,
     stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[np.ndarray, Evaluation], None] = lambda at, found: None,
+    progress: Callable[[np.ndarray, Evaluation], None] = lambda at, evaluation: None,
 ) -> Ascent:
     """Maximise a log-likelihood by steps d of (J + lambda diag J) d = g, Fisher information J and gradient g.
 
@@ -45,7 +45,7 @@ def climb(
         start: coordinates (p,) where the search begins.
         low: the smallest coordinates.
         high: the largest ones.
-        held: which parameters are held, (p,) bool.
+        fixed: which parameters are held, (p,) bool.
         iterations: largest number of iterations.
         stop: called before each iteration; True ends the search.
         progress: called with coordinates and evaluation after each rise.
@@ -53,46 +53,48 @@ def climb(
     Source: Osborne (1992), "Fisher's method of scoring", International Statistical Review 60(1); Marquardt (1963).
     """
     at, damping = np.clip(start, low, high), 1e-3
-    found = evaluate(at)
-    held = np.zeros(len(at), dtype=bool) if held is None else held
+    here = evaluate(at)
+    fixed = np.zeros(len(at), dtype=bool) if fixed is None else fixed
     quiet = 0
     for number in range(iterations):
-        if stop() or not _usable(found):
-            return Ascent(at, found, number, False)
-        progress(at, found)
-        outward = ((at <= low) & (found.gradient < 0)) | ((at >= high) & (found.gradient > 0))
-        moving = ~(held | outward)
+        if stop() or not _usable(here):
+            return Ascent(at, here, number, False)
+        progress(at, here)
+        outward = ((at <= low) & (here.gradient < 0)) | ((at >= high) & (here.gradient > 0))
+        moving = ~(fixed | outward)
         if not moving.any():
-            return Ascent(at, found, number, True)
-        g, j = found.gradient[moving], found.information[np.ix_(moving, moving)]
+            return Ascent(at, here, number, True)
+        g, j = here.gradient[moving], here.information[np.ix_(moving, moving)]
         curvature = np.maximum(np.diag(j), LEAST_CURVATURE * max(np.diag(j).max(), 1e-300))
         while True:
             step = np.zeros(len(at))
             matrix = _positive(j) + np.diag(damping * curvature + LEAST_CURVATURE * curvature.max())
             step[moving] = np.linalg.solve(matrix, g)
             step *= min(1.0, LONGEST / max(np.abs(step).max(), 1e-300))
-            there = np.clip(at + step, low, high)
-            promised = found.gradient @ (there - at) * 0.5
+            trial = np.clip(at + step, low, high)
+            promised = here.gradient @ (trial - at) * 0.5
             if promised < ENOUGH or damping > 1e10:
-                return Ascent(at, found, number, True)
-            next_one = evaluate(there)
-            rise = next_one.value - found.value if _usable(next_one) else -np.inf
+                return Ascent(at, here, number, True)
+            next_one = evaluate(trial)
+            rise = next_one.value - here.value if _usable(next_one) else -np.inf
             if rise > 0.05 * promised:
                 break
             damping = max(10.0 * damping, 1e-3)
             if stop():
-                return Ascent(at, found, number, False)
+                return Ascent(at, here, number, False)
         damping = damping / 5.0 if rise > 0.5 * promised else damping
         quiet = quiet + 1 if rise < 20 * ENOUGH else 0
-        at, found = there, next_one
+        at, here = trial, next_one
         if quiet > 3:
-            return Ascent(at, found, number + 1, True)
-    return Ascent(at, found, iterations, False)
+            return Ascent(at, here, number + 1, True)
+    return Ascent(at, here, iterations, False)
 
 
-def _usable(found: Evaluation) -> bool:
+def _usable(evaluation: Evaluation) -> bool:
     return bool(
-        np.isfinite(found.value) and np.isfinite(found.gradient).all() and np.isfinite(found.information).all()
+        np.isfinite(evaluation.value)
+        and np.isfinite(evaluation.gradient).all()
+        and np.isfinite(evaluation.information).all()
     )
 
 

@@ -63,7 +63,7 @@ class ModelFamily:
                 f"a model must be a StateSpaceModel, but {short_repr(make)} makes {short_repr(self.base)}"
             )
         constants = self.base.constants
-        self._fields = [one for one in getattr(constants, "_fields", ()) if one not in self._arguments]
+        self._fields = [name for name in getattr(constants, "_fields", ()) if name not in self._arguments]
         self._noise = self._variances()
         names = list(dict.fromkeys([*free, *(self._noise if noise else ())]))
         known = self.known
@@ -75,14 +75,14 @@ class ModelFamily:
     @property
     def known(self) -> dict[str, Parameter]:
         """Every parameter that may be free, with its range about its start."""
-        starts = dict(self._arguments) | {one: getattr(self.base.constants, one) for one in self._fields}
-        found = {name: about(name, float(value)) for name, value in starts.items()}
-        units = [one.unit for one in (*self.base.states, *self.base.measurements)]
-        for name, (_, place, variance) in self._noise.items():
-            unit = squared(units[place + (0 if name.startswith("Q") else self.base.n)])
+        starts = dict(self._arguments) | {name: getattr(self.base.constants, name) for name in self._fields}
+        parameters = {name: about(name, float(value)) for name, value in starts.items()}
+        units = [quantity.unit for quantity in (*self.base.states, *self.base.measurements)]
+        for name, (_, index, variance) in self._noise.items():
+            unit = squared(units[index + (0 if name.startswith("Q") else self.base.n)])
             ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
-            found.setdefault(name, Parameter(name, *ends, unit, default=variance))
-        return found
+            parameters.setdefault(name, Parameter(name, *ends, unit, default=variance))
+        return parameters
 
     @property
     def variances_of_q(self) -> tuple[str, ...]:
@@ -91,31 +91,31 @@ class ModelFamily:
 
     def model(self, **values: float) -> StateSpaceModel:
         """The model for values of some parameters; the others stay."""
-        given = {name: value for name, value in values.items() if name in self._arguments}
-        model = self._make(**given) if given else self.base
+        arguments = {name: value for name, value in values.items() if name in self._arguments}
+        model = self._make(**arguments) if arguments else self.base
         fields = {name: value for name, value in values.items() if name in self._fields}
         constants: Any = model.constants  # a NamedTuple, if it has fields
         changes: dict[str, Any] = {"constants": constants._replace(**fields)} if fields else {}
         for name in ("process_noise_cov", "measurement_noise_cov"):
             cov = getattr(model, name).copy()
-            for one, value in values.items():
-                kind, place, _ = self._noise.get(one, (None, 0, 0.0))
-                if kind == name and one not in self._arguments:
-                    factor = np.sqrt(value / cov[place, place])
-                    cov[place] *= factor
-                    cov[:, place] *= factor
+            for key, value in values.items():
+                kind, index, _ = self._noise.get(key, (None, 0, 0.0))
+                if kind == name and key not in self._arguments:
+                    factor = np.sqrt(value / cov[index, index])
+                    cov[index] *= factor
+                    cov[:, index] *= factor
                     changes[name] = cov
         return model.replace(**changes) if changes else model
 
     def _variances(self) -> dict[str, tuple[str, int, float]]:
         """The covariance of each variance, its index, and its value."""
-        found = {}
+        variances = {}
         for i, variance in enumerate(np.diag(self.base.process_noise_cov).tolist()):
             if variance > 0:
-                found[f"Q{i + 1}{i + 1}"] = ("process_noise_cov", i, variance)
+                variances[f"Q{i + 1}{i + 1}"] = ("process_noise_cov", i, variance)
         for i, variance in enumerate(np.diag(self.base.measurement_noise_cov).tolist()):
-            found[r_name(i, self.base.m)] = ("measurement_noise_cov", i, variance)
-        return found
+            variances[r_name(i, self.base.m)] = ("measurement_noise_cov", i, variance)
+        return variances
 
 
 def _same(model: StateSpaceModel) -> StateSpaceModel:
@@ -138,29 +138,39 @@ def with_ranges(
     Raises:
         ValueError: for a name that is not free, an empty range, or a start outside its range.
     """
-    names = [one.name for one in free]
+    names = [parameter.name for parameter in free]
     for name in (*ranges, *start):
         if name not in names:
             raise ValueError(f"ranges and starts must be of free parameters, {', '.join(names)}, but got {name}")
-    found = []
-    for one in free:
-        low, high = ranges.get(one.name, (one.low, one.high))
-        at = finite(f"the start of {one.name}", start.get(one.name, one.start))
+    parameters = []
+    for parameter in free:
+        low, high = ranges.get(parameter.name, (parameter.low, parameter.high))
+        at = finite(f"the start of {parameter.name}", start.get(parameter.name, parameter.start))
         if not low < high:
-            raise ValueError(f"the range of {one.name} must be from low to high, but got {low:g} and {high:g}")
+            raise ValueError(
+                f"the range of {parameter.name} must be from low to high, but got {low:g} and {high:g}"
+            )
         if not low <= at <= high:
-            raise ValueError(f"the start of {one.name} must be within {low:g} and {high:g}, but got {at:g}")
-        found.append(replace(one, low=low, high=high, log=low > 0 and (one.log or one.name in ranges), default=at))
-    return tuple(found)
+            raise ValueError(f"the start of {parameter.name} must be within {low:g} and {high:g}, but got {at:g}")
+        parameters.append(
+            replace(
+                parameter,
+                low=low,
+                high=high,
+                log=low > 0 and (parameter.log or parameter.name in ranges),
+                default=at,
+            )
+        )
+    return tuple(parameters)
 
 
 def _numbers_of(function: Callable) -> dict[str, float]:
     """The arguments of a function that have a number for a default."""
     arguments = inspect.signature(function).parameters.values()
     return {
-        one.name: float(one.default)
-        for one in arguments
-        if isinstance(one.default, (int, float)) and not isinstance(one.default, bool)
+        argument.name: float(argument.default)
+        for argument in arguments
+        if isinstance(argument.default, (int, float)) and not isinstance(argument.default, bool)
     }
 
 
@@ -190,15 +200,15 @@ class WithConstants:
 
     def __call__(self, *arguments):
         """What the function returns; constants may be Numbers."""
-        *given, constants = arguments
+        *variables, constants = arguments
         numbers: list[Any] = list(captured_numbers(self.function))
-        for i, place in enumerate(self.places):
-            numbers[place] = constants[self.first + i]
+        for i, index in enumerate(self.places):
+            numbers[index] = constants[self.first + i]
         function = with_numbers(self.function, numbers)
-        if any(isinstance(one, Number) for one in constants):
+        if any(isinstance(constant, Number) for constant in constants):
             function = traced(function)
-        own = tuple(constants[i] for i in range(self.own))
-        return function(*given, own if self.form is None else self.form(*own))
+        own_constants = tuple(constants[i] for i in range(self.own))
+        return function(*variables, own_constants if self.form is None else self.form(*own_constants))
 
 
 class CapturedConstants(NamedTuple):
@@ -211,22 +221,22 @@ class CapturedConstants(NamedTuple):
     def of(cls, models: Sequence[StateSpaceModel]) -> CapturedConstants | None:
         """Those of some models; None if functions are equal, differ in more, or cannot be traced."""
         functions = _functions_of(models[0])
-        places: dict[str, set[int]] = {name: set() for name in FUNCTIONS}
+        indices: dict[str, set[int]] = {name: set() for name in FUNCTIONS}
         for model in models[1:]:
             for name, function in _functions_of(model).items():
                 numbers = _pairs_of_numbers(functions[name], function)
                 if numbers is None:
                     return None
-                places[name] |= {i for i, (a, b) in enumerate(numbers) if a != b}
-        found = cls(functions, {name: tuple(sorted(some)) for name, some in places.items()})
-        if not any(found.places.values()):
+                indices[name] |= {i for i, (a, b) in enumerate(numbers) if a != b}
+        captured = cls(functions, {name: tuple(sorted(differing)) for name, differing in indices.items()})
+        if not any(captured.places.values()):
             return None
         try:
-            lifted = found.with_constants(models[0])
+            lifted = captured.with_constants(models[0])
             traced_model(lifted.functions, lifted.shape)
         except Exception:  # whatever a user's function raises of numbers that it does not know
             return None
-        return found
+        return captured
 
     def with_constants(self, model: StateSpaceModel) -> StateSpaceModel:
         """The model with the numbers in which functions differ behind its constants.
@@ -250,8 +260,8 @@ class CapturedConstants(NamedTuple):
                 changes[name] = WithConstants(first, moving, len(constants), form, count)
                 constants += [numbers[i][1] for i in moving]
         names = getattr(model.constants, "_fields", None)
-        given = tuple(constants) if names is None else _form(form, len(constants) - count)(*constants)
-        return model.replace(**changes, constants=given)
+        values = tuple(constants) if names is None else _form(form, len(constants) - count)(*constants)
+        return model.replace(**changes, constants=values)
 
 
 @functools.lru_cache(maxsize=64)
@@ -263,14 +273,17 @@ def _form(form: Any, count: int) -> Any:
 
 def _functions_of(model: StateSpaceModel) -> dict[str, Callable | None]:
     plain = model.plain if isinstance(model, AnyStepModel) else model
-    found = {name: bound_call(getattr(plain, name)) for name in FUNCTIONS}
-    return {name: None if one is not None and by_complex_step(one) else one for name, one in found.items()}
+    calls = {name: bound_call(getattr(plain, name)) for name in FUNCTIONS}
+    return {
+        name: None if function is not None and by_complex_step(function) else function
+        for name, function in calls.items()
+    }
 
 
-def _pairs_of_numbers(one: Callable | None, other: Callable | None) -> list[tuple[float, float]] | None:
+def _pairs_of_numbers(first: Callable | None, other: Callable | None) -> list[tuple[float, float]] | None:
     """The numbers of two functions, in pairs; None if these differ in more."""
-    if one is None or other is None:
-        return [] if one is other else None
-    if not differ_in_numbers_alone(one, other):
+    if first is None or other is None:
+        return [] if first is other else None
+    if not differ_in_numbers_alone(first, other):
         return None
-    return list(zip(captured_numbers(one), captured_numbers(other), strict=True))
+    return list(zip(captured_numbers(first), captured_numbers(other), strict=True))

@@ -23,9 +23,9 @@ def lost_information(gate: float) -> float:
 
     That of a constant, 1/kappa^2 with kappa the `kept_variance`, is smaller.
     """
-    kept = kept_variance(gate)
-    fourth = 3.0 * kept - (_edge(gate) * gate**2 if gate < math.inf else 0.0)
-    return 2.0 / (fourth - kept**2)
+    variance = kept_variance(gate)
+    fourth = 3.0 * variance - (_edge(gate) * gate**2 if gate < math.inf else 0.0)
+    return 2.0 / (fourth - variance**2)
 
 
 def _edge(gate: float) -> float:

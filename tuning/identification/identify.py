@@ -108,9 +108,9 @@ def identify(
     points = [first, *_others(coordinates, first, starts, seed)]
     with stop_on_interrupt() as asked:
 
-        def tell(at, found, number=0):
+        def tell(at, evaluation, number=0):
             if progress is not None:
-                progress(number, found.value, coordinates.named(at))
+                progress(number, evaluation.value, coordinates.named(at))
 
         objective = _with_starts(objective, first, simulation_first, asked, tell)
         ascents = []
@@ -120,19 +120,23 @@ def identify(
             ascents.append(_climb_from(objective, point, simulation_first, asked, tell_of))
             if asked():
                 break
-        if not any(math.isfinite(one.found.value) for one in ascents):
+        if not any(math.isfinite(ascent.found.value) for ascent in ascents):
             raise ValueError(
                 "the filter must stay finite on all runs from at least one start, but it does from none of "
                 f"{short_repr([coordinates.named(point) for point in points[: len(ascents)]])}"
             )
         optima = tuple(
             Optimum(
-                coordinates.named(point), coordinates.named(one.at), one.found.value, one.iterations, one.converged
+                coordinates.named(point),
+                coordinates.named(ascent.at),
+                ascent.found.value,
+                ascent.iterations,
+                ascent.converged,
             )
-            for point, one in zip(points, ascents, strict=False)
+            for point, ascent in zip(points, ascents, strict=False)
         )
         plain = from_nothing(objective, first, asked, tell) if against and not asked() else None
-        best = max([*ascents, *([] if plain is None else [plain])], key=lambda one: one.found.value)
+        best = max([*ascents, *([] if plain is None else [plain])], key=lambda ascent: ascent.found.value)
         objective, best = _checked_starts(objective, best, asked, tell)
         if gate < math.inf:
             objective, best = _gated(objective, best, gate, asked, tell)
@@ -155,8 +159,8 @@ def _with_starts(objective: Objective, first: np.ndarray, simulation_first: bool
     if not _starts_at(objective, first).free.any():
         return objective
     free = objective.with_changes(starts=_starts_at(objective, first))
-    found = _climb_from(free, first, simulation_first, stop, tell)
-    at = found.at if math.isfinite(found.found.value) else first
+    ascent = _climb_from(free, first, simulation_first, stop, tell)
+    at = ascent.at if math.isfinite(ascent.found.value) else first
     return _spent(objective, free, objective.with_changes(starts=_starts_at(objective, at)))
 
 
@@ -165,18 +169,18 @@ def _checked_starts(objective: Objective, best: Ascent, stop, tell) -> tuple[Obj
     if objective.moves_prior(best.at):
         return objective, best
     for _ in range(START_ROUNDS):
-        found, before = _starts_at(objective, best.at), objective.starts
-        known = np.zeros_like(found.free) if before is None else before.free
-        if stop() or not (found.free & ~known).any():
+        further_starts, before = _starts_at(objective, best.at), objective.starts
+        known = np.zeros_like(further_starts.free) if before is None else before.free
+        if stop() or not (further_starts.free & ~known).any():
             break
         if before is not None:
-            found = Starts(
-                found.free | before.free,
-                np.where(before.free[:, None], before.means, found.means),
-                np.where(before.free[:, None, None], before.covs, found.covs),
-                np.where(before.free, before.leads, found.leads),
+            further_starts = Starts(
+                further_starts.free | before.free,
+                np.where(before.free[:, None], before.means, further_starts.means),
+                np.where(before.free[:, None, None], before.covs, further_starts.covs),
+                np.where(before.free, before.leads, further_starts.leads),
             )
-        further = objective.with_changes(starts=found)
+        further = objective.with_changes(starts=further_starts)
         best = climb(further, best.at, *_bounds(objective), stop=stop, progress=tell)
         objective = _spent(objective, further)
     return objective, best
@@ -188,7 +192,7 @@ def _starts_at(objective: Objective, at: np.ndarray) -> Starts:
 
 def _spent(*objectives: Objective) -> Objective:
     """The last objective, with the evaluations of all."""
-    objectives[-1].evaluations = sum(one.evaluations for one in objectives)
+    objectives[-1].evaluations = sum(objective.evaluations for objective in objectives)
     return objectives[-1]
 
 
@@ -198,13 +202,13 @@ def _bounds(objective: Objective) -> tuple[np.ndarray, np.ndarray]:
 
 def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple[Objective, Ascent]:
     """The objective without outliers, and its maximum: repeated until the outliers stay the same."""
-    whole, left_out, spent = objective, None, objective.evaluations
+    ungated, left_out, spent = objective, None, objective.evaluations
     for _ in range(ROUNDS):
-        found = outliers_of(whole.model_at(best.at), whole.data_at(best.at), gate, whole.starts)
-        if stop() or (left_out is not None and np.array_equal(found, left_out)):
+        outliers = outliers_of(ungated.model_at(best.at), ungated.data_at(best.at), gate, ungated.starts)
+        if stop() or (left_out is not None and np.array_equal(outliers, left_out)):
             break
-        left_out, objective = found, without_outliers(whole, found, gate)
-        best = climb(objective, best.at, *_bounds(whole), stop=stop, progress=tell)
+        left_out, objective = outliers, without_outliers(ungated, outliers, gate)
+        best = climb(objective, best.at, *_bounds(ungated), stop=stop, progress=tell)
         spent += objective.evaluations
     objective.evaluations = spent
     return objective, best
@@ -233,7 +237,7 @@ def _finite_start(objective: Objective, point: np.ndarray, first: np.ndarray) ->
 def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> list[np.ndarray]:
     """The starts after the first: given, or drawn."""
     if not isinstance(starts, (int, np.integer)):
-        return [coordinates.start(dict(one)) for one in starts]
+        return [coordinates.start(dict(start)) for start in starts]
     rng, width = derived_generator(seed, START_POINTS), REACH * (coordinates.high - coordinates.low)
     drawn = [
         first + width * rng.uniform(-1, 1, len(first))

@@ -31,11 +31,11 @@ class NullTest(NamedTuple):
         return "< 0.001" if self.p < 1e-3 else f"{self.p:.2g}"
 
 
-def null_of(coordinates: Coordinates, place: int, start: np.ndarray) -> tuple[float, bool]:
+def null_of(coordinates: Coordinates, index: int, start: np.ndarray) -> tuple[float, bool]:
     """The coordinate at which a parameter is left out, and whether that is zero; otherwise it is the start."""
-    one = coordinates.free[place]
-    is_zero = not one.log and one.low <= 0.0 <= one.high
-    return (0.0 if is_zero else float(start[place])), is_zero
+    parameter = coordinates.free[index]
+    is_zero = not parameter.log and parameter.low <= 0.0 <= parameter.high
+    return (0.0 if is_zero else float(start[index])), is_zero
 
 
 def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent | None:
@@ -44,13 +44,13 @@ def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent 
     So a further parameter never lowers the log-likelihood.
     """
     coordinates = objective.coordinates
-    nulls = [null_of(coordinates, place, start) for place in range(len(start))]
-    held = np.array([is_zero for _, is_zero in nulls])
-    if not held.any() or held.all():
+    nulls = [null_of(coordinates, index, start) for index in range(len(start))]
+    fixed = np.array([is_zero for _, is_zero in nulls])
+    if not fixed.any() or fixed.all():
         return None
-    at = np.where(held, [null for null, _ in nulls], start)
+    at = np.where(fixed, [null for null, _ in nulls], start)
     bounds = coordinates.low, coordinates.high
-    without = climb(objective, at, *bounds, held=held, stop=stop)
+    without = climb(objective, at, *bounds, fixed=fixed, stop=stop)
     return climb(objective, without.at, *bounds, stop=stop, progress=tell)
 
 
@@ -85,35 +85,35 @@ def null_tests(
     coordinates = objective.coordinates
     for _ in range(ROUNDS):
         cov, naive = errors_of(best)
-        made: dict[str, NullTest] = {}
-        for place, name in enumerate(coordinates.names):
+        tests: dict[str, NullTest] = {}
+        for index, name in enumerate(coordinates.names):
             if stop():
                 return best, {}
-            null, is_zero = null_of(coordinates, place, start)
-            held = _held_at(objective, best, place, null, cov, stop)
-            if held.found.value > best.found.value + BETTER:
-                further = climb(objective, held.at, coordinates.low, coordinates.high, stop=stop)
-                best = further if further.found.value > held.found.value else held
+            null, is_zero = null_of(coordinates, index, start)
+            restricted = _held_at(objective, best, index, null, cov, stop)
+            if restricted.found.value > best.found.value + BETTER:
+                further = climb(objective, restricted.at, coordinates.low, coordinates.high, stop=stop)
+                best = further if further.found.value > restricted.found.value else restricted
                 break
-            inflation = max(cov[place, place] / naive[place, place], 1.0)
-            fall = max(best.found.value - held.found.value, 0.0)
+            inflation = max(cov[index, index] / naive[index, index], 1.0)
+            fall = max(best.found.value - restricted.found.value, 0.0)
             p = math.erfc(math.sqrt(fall / inflation))  # of 2 fall/inflation
-            at_end = null <= coordinates.low[place] or null >= coordinates.high[place]
-            value = float(coordinates.values(held.at)[place])
-            made[name] = NullTest(value, is_zero, held.found.value, p / 2 if at_end and fall > 0 else p)
+            at_end = null <= coordinates.low[index] or null >= coordinates.high[index]
+            value = float(coordinates.values(restricted.at)[index])
+            tests[name] = NullTest(value, is_zero, restricted.found.value, p / 2 if at_end and fall > 0 else p)
         else:
-            return best, made
-    return best, made
+            return best, tests
+    return best, tests
 
 
-def _held_at(objective: Objective, best: Ascent, place: int, null: float, cov: np.ndarray, stop) -> Ascent:
+def _held_at(objective: Objective, best: Ascent, index: int, null: float, cov: np.ndarray, stop) -> Ascent:
     """The maximum with a parameter held; the others begin in the direction of their correlation with it."""
     coordinates = objective.coordinates
     bounds = coordinates.low, coordinates.high
-    held = np.arange(len(best.at)) == place
-    along = best.at + cov[:, place] / cov[place, place] * (null - best.at[place])
+    fixed = np.arange(len(best.at)) == index
+    along = best.at + cov[:, index] / cov[index, index] * (null - best.at[index])
     starts = [np.clip(along, *bounds), np.array(best.at)]
     for at in starts:
-        at[place] = null
+        at[index] = null
     at = max(starts, key=objective.value)
-    return climb(objective, at, *bounds, held=held, iterations=LEGS, stop=stop)
+    return climb(objective, at, *bounds, fixed=fixed, iterations=LEGS, stop=stop)

@@ -103,14 +103,14 @@ class Objective:
     def with_changes(self, **changes) -> Objective:
         """The same with other data, filter, degrees, simulation, starts or gate."""
         names = "filter", "degrees", "predicted", "simulation", "starts", "gate"
-        kept = {name: getattr(self, name) for name in names}
+        settings = {name: getattr(self, name) for name in names}
         data = changes.pop("data", self.data)
-        return Objective(data, self._model, self.coordinates, **{**kept, **changes})
+        return Objective(data, self._model, self.coordinates, **{**settings, **changes})
 
     def model_at(self, at: np.ndarray) -> StateSpaceModel:
         """The model at coordinates, as the filter runs on it."""
-        given = self._given_model(at)
-        model = given if self._captured is None else self._captured.with_constants(given)
+        plain = self._given_model(at)
+        model = plain if self._captured is None else self._captured.with_constants(plain)
         model = make_filter(self.filter, model).kernel_model
         if self._noise_factors_of is not None:
             roots = np.sqrt(self._noise_factors(at, model))
@@ -165,7 +165,7 @@ class Objective:
         """Factors on R of each channel (m,)."""
         of_data, named = self._noise_factors_of, self.coordinates.named(at)
         factors = {} if of_data is None else of_data(**{name: named[name] for name in self._of_data})
-        return np.array([factors.get(one.symbol, 1.0) for one in model.measurements])
+        return np.array([factors.get(channel.symbol, 1.0) for channel in model.measurements])
 
     def value(self, at: np.ndarray) -> float:
         """Log-likelihood of all runs; minus infinity where it is not finite."""
@@ -196,15 +196,15 @@ class Objective:
             information[j, i] = information[i, j] = (apart - both - 2 * here.value) / (2 * LARGE_STEP**2)
         return here._replace(gradient=gradient, information=information, scores=scores)
 
-    def _smooth_part(self, at: np.ndarray, places: Sequence[int]) -> Evaluation:
+    def _smooth_part(self, at: np.ndarray, indices: Sequence[int]) -> Evaluation:
         self.evaluations += 1
-        model, slopes = self.model_at(at), self._slopes(at, places)
-        runs, starts, kept = self.data_at(at), self.starts, kept_variance(self.gate)
-        if kept < 1.0:  # a common factor on Q, R and P moves no estimate
-            model = model.replace(**{name: kept * getattr(model, name) for name in COVARIANCES})
-            slopes = slopes._replace(**{name: kept * getattr(slopes, name) for name in COVARIANCES})
-            starts = None if starts is None else starts._replace(covs=kept * starts.covs)
-        found = sensitivity(
+        model, slopes = self.model_at(at), self._slopes(at, indices)
+        runs, starts, variance = self.data_at(at), self.starts, kept_variance(self.gate)
+        if variance < 1.0:  # a common factor on Q, R and P moves no estimate
+            model = model.replace(**{name: variance * getattr(model, name) for name in COVARIANCES})
+            slopes = slopes._replace(**{name: variance * getattr(slopes, name) for name in COVARIANCES})
+            starts = None if starts is None else starts._replace(covs=variance * starts.covs)
+        result = sensitivity(
             model,
             runs.inputs,
             runs.measurements,
@@ -214,49 +214,49 @@ class Objective:
             predicted=self.unseen,
             starts=starts,
         )
-        scores, counts = np.concatenate(found.block_gradients), self._counted(runs)
+        scores, counts = np.concatenate(result.block_gradients), self._counted(runs)
 
         def of_samples(values, counts):  # densities of all samples, not of those within the gate or of averages
-            if kept < 1.0:
-                values = values + 0.5 * math.log(kept) * counts.sum(axis=-1)
+            if variance < 1.0:
+                values = values + 0.5 * math.log(variance) * counts.sum(axis=-1)
             if self._noise_factors_of is not None:
                 values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
             return values
 
-        value = float(of_samples(found.values, counts.sum(axis=1)).sum())
+        value = float(of_samples(result.values, counts.sum(axis=1)).sum())
         value = value if math.isfinite(value) else -math.inf
-        part_values = of_samples(found.block_values, counts).ravel()
-        return Evaluation(value, scores.sum(axis=0), found.information.sum(axis=0), scores, part_values)
+        part_values = of_samples(result.block_values, counts).ravel()
+        return Evaluation(value, scores.sum(axis=0), result.information.sum(axis=0), scores, part_values)
 
     def moves_prior(self, at: np.ndarray) -> bool:
         """Whether some free parameter moves the prior of the first state, which is then what it says."""
-        found = self._slopes(at, self._smooth)
+        slopes = self._slopes(at, self._smooth)
         rough = [self._pair(at, j) for j in self.rough]
         apart = [
             np.abs(a.prior_mean - b.prior_mean).sum() + np.abs(a.prior_cov - b.prior_cov).sum() for a, b in rough
         ]
-        return bool(found.prior_mean.any() or found.prior_cov.any() or np.any(apart))
+        return bool(slopes.prior_mean.any() or slopes.prior_cov.any() or np.any(apart))
 
     def _counted(self, runs: Data) -> np.ndarray:
         """Number of samples of each run, block and channel that count, (B, blocks, m)."""
         count, rows, channels = runs.measurements.shape
-        there = ~np.isnan(runs.measurements)
+        counted = ~np.isnan(runs.measurements)
         if self.starts is not None:
-            there &= (np.arange(rows) >= self.starts.counted_from[:, None])[..., None]
-        found = np.zeros((count, self.blocks, channels), dtype=np.int64)
+            counted &= (np.arange(rows) >= self.starts.counted_from[:, None])[..., None]
+        counts = np.zeros((count, self.blocks, channels), dtype=np.int64)
         for block, rows_of in enumerate(np.arange(rows) * self.blocks // rows == np.arange(self.blocks)[:, None]):
-            found[:, block] = there[:, rows_of].sum(axis=1)
-        return found
+            counts[:, block] = counted[:, rows_of].sum(axis=1)
+        return counts
 
-    def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
-        pairs = [self._pair(at, j) for j in places]
+    def _slopes(self, at: np.ndarray, indices: Sequence[int]) -> ModelSlopes:
+        pairs = [self._pair(at, j) for j in indices]
         if not pairs:
             return ModelSlopes.of(self.model_at(at), 0)
         return ModelSlopes.between(pairs, 2 * STEP)
 
-    def _pair(self, at: np.ndarray, place: int) -> tuple[StateSpaceModel, StateSpaceModel]:
+    def _pair(self, at: np.ndarray, index: int) -> tuple[StateSpaceModel, StateSpaceModel]:
         """Models one step above and below."""
-        above, below = self.coordinates.neighbours(at, place, STEP)
+        above, below = self.coordinates.neighbours(at, index, STEP)
         return self.model_at(above), self.model_at(below)
 
 
@@ -280,7 +280,9 @@ def _check_runs(run: Data, model: StateSpaceModel) -> None:
         )
     empty = np.isnan(run.measurements).all(axis=(0, 1))
     if empty.any():
-        missing = ", ".join(one.symbol for one, none in zip(model.measurements, empty, strict=True) if none)
+        missing = ", ".join(
+            channel.symbol for channel, none in zip(model.measurements, empty, strict=True) if none
+        )
         raise ValueError(f"data must have measurements of each channel, but have none of {missing}")
 
 

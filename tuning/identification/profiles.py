@@ -64,57 +64,57 @@ def profiles(
     Source: Raue et al. (2009), "Structural and practical identifiability analysis of partially observed dynamical
     models by exploiting the profile likelihood", Bioinformatics 25(15).
     """
-    made = []
+    curves = []
     with stop_on_interrupt() as asked:
         for name in found.names if names is None else names:
-            place = found.names.index(one_of("a parameter", name, found.names))
+            index = found.names.index(one_of("a parameter", name, found.names))
             progress(name)
-            points = [(found.at[place], found.log_likelihood)]
+            points = [(found.at[index], found.log_likelihood)]
             for sign in (1.0, -1.0):
-                points += _side(found, place, [sign * part for part in reach], asked)
+                points += _side(found, index, [sign * part for part in reach], asked)
             if asked():
                 break
             at, values = np.array(sorted(points)).T
-            whole = np.tile(found.at, (len(at), 1))
-            whole[:, place] = at
-            natural = np.array([found.objective.coordinates.values(row)[place] for row in whole])
-            made.append(Profile(name, natural, values))
-    return made
+            points_at = np.tile(found.at, (len(at), 1))
+            points_at[:, index] = at
+            natural = np.array([found.objective.coordinates.values(row)[index] for row in points_at])
+            curves.append(Profile(name, natural, values))
+    return curves
 
 
-def _side(found: Identification, place: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
+def _side(found: Identification, index: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
     """Points outwards; the other parameters start in the direction of their correlation with this one."""
-    coordinates, error = found.objective.coordinates, np.sqrt(found.cov[place, place])
-    slope = found.cov[:, place] / found.cov[place, place]
+    coordinates, error = found.objective.coordinates, np.sqrt(found.cov[index, index])
+    slope = found.cov[:, index] / found.cov[index, index]
     points: list[tuple[float, float]] = []
-    held = np.arange(len(found.at)) == place
+    fixed = np.arange(len(found.at)) == index
     for part in reach:
         move = part * error
         at = np.clip(found.at + slope * move, coordinates.low, coordinates.high)
-        if asked() or at[place] in [point for point, _ in points] or at[place] == found.at[place]:
+        if asked() or at[index] in [point for point, _ in points] or at[index] == found.at[index]:
             break
-        there = climb(
-            found.objective, at, coordinates.low, coordinates.high, held=held, iterations=LEGS, stop=asked
+        maximum = climb(
+            found.objective, at, coordinates.low, coordinates.high, fixed=fixed, iterations=LEGS, stop=asked
         )
-        points.append((float(at[place]), there.found.value))
+        points.append((float(at[index]), maximum.found.value))
     return points
 
 
-def profile_figure(found: Identification, made: Sequence[Profile]):
+def profile_figure(found: Identification, curves: Sequence[Profile]):
     """A panel for each profile: how far log L falls, the 95 % line, and the parabola of the standard error."""
-    figure, axes = panels(len(made), 3, (3.0, 2.2), 0.2)
-    for axis, one in zip(axes, made, strict=True):
-        falls = one.log_likelihoods - found.log_likelihood
-        parameter = found.objective.coordinates.free[found.names.index(one.name)]
-        best, error = found.values[one.name], found.standard_errors[one.name]
-        grid = np.linspace(one.values[0], one.values[-1], 100)
+    figure, axes = panels(len(curves), 3, (3.0, 2.2), 0.2)
+    for axis, profile in zip(axes, curves, strict=True):
+        falls = profile.log_likelihoods - found.log_likelihood
+        parameter = found.objective.coordinates.free[found.names.index(profile.name)]
+        best, error = found.values[profile.name], found.standard_errors[profile.name]
+        grid = np.linspace(profile.values[0], profile.values[-1], 100)
         axis.plot(grid, -0.5 * ((grid - best) / error) ** 2, color=RUST, linewidth=1, label="standard error")
-        axis.plot(one.values, falls, "o-", color=BLUE, linewidth=1.2, markersize=3, label="profile")
+        axis.plot(profile.values, falls, "o-", color=BLUE, linewidth=1.2, markersize=3, label="profile")
         axis.axhline(-SIGNIFICANT, color=DARK, linewidth=0.8, linestyle=":")
-        if parameter.log and one.values[-1] > WIDE * one.values[0]:
+        if parameter.log and profile.values[-1] > WIDE * profile.values[0]:
             axis.set_xscale("log")
         axis.set_ylim(min(-4.0, falls.min() * 1.05), 0.3)
-        axis.set_xlabel(verbatim(one.name + (f" [{parameter.unit}]" if parameter.unit else "")))
+        axis.set_xlabel(verbatim(profile.name + (f" [{parameter.unit}]" if parameter.unit else "")))
         axis.set_ylabel("fall in log L")
     axes[0].legend(fontsize=7, frameon=False)
     return figure

@@ -64,12 +64,12 @@ class Identification(NamedTuple):
     def agreement(self) -> int:
         """Number of starts that led to the best maximum, by log L or by all determined parameters."""
         coordinates, scale, near = self.objective.coordinates, np.sqrt(np.diag(self.cov)), 0
-        best = max(self.optima, key=lambda one: one.log_likelihood)
+        best = max(self.optima, key=lambda optimum: optimum.log_likelihood)
         known = np.array([self.determined[name] for name in self.names])
         top = coordinates.of(list(best.values.values()))
-        for one in self.optima:
-            apart = np.abs(coordinates.of(list(one.values.values())) - top)
-            close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
+        for optimum in self.optima:
+            apart = np.abs(coordinates.of(list(optimum.values.values())) - top)
+            close = best.log_likelihood - optimum.log_likelihood < EQUAL_VALUES
             near += bool(close or (known.any() and (apart < EQUAL * scale)[known].all()))
         return near
 
@@ -92,9 +92,9 @@ class Identification(NamedTuple):
     @property
     def traded(self) -> list[tuple[str, str, float]]:
         """Pairs of parameters that trade off, with their correlation."""
-        found = self.correlations
-        pairs = [(i, j) for i in range(len(found)) for j in range(i) if abs(found[i, j]) >= TRADED]
-        return [(self.names[j], self.names[i], float(found[i, j])) for i, j in pairs]
+        correlations = self.correlations
+        pairs = [(i, j) for i in range(len(correlations)) for j in range(i) if abs(correlations[i, j]) >= TRADED]
+        return [(self.names[j], self.names[i], float(correlations[i, j])) for i, j in pairs]
 
     @property
     def least_determined(self) -> dict[str, float]:
@@ -110,71 +110,81 @@ class Identification(NamedTuple):
 
     def _end_sentences(self) -> list[str]:
         """Which values are at an end of their range; an end at zero, as of a dead band's width, is separate."""
-        said, free = [], [one for one in self.objective.coordinates.free if self.at_end[one.name]]
+        sentences, free = (
+            [],
+            [parameter for parameter in self.objective.coordinates.free if self.at_end[parameter.name]],
+        )
         gone = [
-            one.name
-            for one in free
-            if 0.0 in (one.low, one.high) and abs(self.values[one.name]) <= 1e-5 * (one.high - one.low)
+            parameter.name
+            for parameter in free
+            if 0.0 in (parameter.low, parameter.high)
+            and abs(self.values[parameter.name]) <= 1e-5 * (parameter.high - parameter.low)
         ]
-        others = [one.name for one in free if one.name not in gone]
+        elsewhere = [parameter.name for parameter in free if parameter.name not in gone]
         if gone:
-            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data require none of them.")
-        if others:
-            said.append(f"At an end of the range: {', '.join(others)}. A wider one may fit better.")
-        return said
+            sentences.append(f"At zero, where the range ends: {', '.join(gone)}. The data require none of them.")
+        if elsewhere:
+            sentences.append(f"At an end of the range: {', '.join(elsewhere)}. A wider one may fit better.")
+        return sentences
 
     def _needless(self) -> list[str]:
         """The effects that the data do not require, by the tests."""
         tests = self.null_tests.items()
-        some = [f"{name} (p = {one.p:.2g})" for name, one in tests if one.is_zero and one.p > LEVEL]
-        if not some:
+        needless = [f"{name} (p = {test.p:.2g})" for name, test in tests if test.is_zero and test.p > LEVEL]
+        if not needless:
             return []
         return [
-            f"The data are as likely without {', '.join(some)}: leave them out unless you know that they are "
+            f"The data are as likely without {', '.join(needless)}: leave them out unless you know that they are "
             "present."
         ]
 
     def _starts_sentence(self) -> str:
         """Which runs do not begin as the prior says."""
-        places, starts = self.begun_elsewhere, self.objective.starts
+        indices, starts = self.begun_elsewhere, self.objective.starts
         leads = () if starts is None else starts.leads
-        some = ", ".join(str(place + 1) for place in places[:MOST_RUNS])
-        some += ", ..." if len(places) > MOST_RUNS else ""
-        rows = sorted({int(leads[place]) for place in places})
+        numbers = ", ".join(str(index + 1) for index in indices[:MOST_RUNS])
+        numbers += ", ..." if len(indices) > MOST_RUNS else ""
+        rows = sorted({int(leads[index]) for index in indices})
         count = f"{rows[0]}" if len(rows) == 1 else f"{rows[0]} to {rows[-1]}"
-        which = f"Run {some} does" if len(places) == 1 else f"{len(places)} of {len(leads)} runs ({some}) do"
-        said = f"the first {count} rows only determine the initial state and are not scored"
-        return f"{which} not begin as the model's prior says: {said}."
+        which = (
+            f"Run {numbers} does" if len(indices) == 1 else f"{len(indices)} of {len(leads)} runs ({numbers}) do"
+        )
+        consequence = f"the first {count} rows only determine the initial state and are not scored"
+        return f"{which} not begin as the model's prior says: {consequence}."
 
     def sentences(self) -> list[str]:
         """Sentences on which parameters the data determine."""
-        said = []
+        sentences = []
         ends = [name for name in self.names if self.at_end[name]]
         loose = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
         wide = [name for name in loose if not self.narrow[name]]
         zero = [name for name in loose if self.narrow[name]]
         if not ends and not loose:
-            said.append("The data determine every free parameter.")
+            sentences.append("The data determine every free parameter.")
         if wide:
             rule = "a 95 % interval is as wide as a factor of ten, or as half the range"
-            said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
+            sentences.append(f"The data do not determine {', '.join(wide)}: {rule}.")
         if zero:
-            said.append(f"The data do not distinguish {', '.join(zero)} from zero, which lies in a 95 % interval.")
-        said += self._end_sentences() + self._needless()
-        for one, other, correlation in self.traded:
-            said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
+            sentences.append(
+                f"The data do not distinguish {', '.join(zero)} from zero, which lies in a 95 % interval."
+            )
+        sentences += self._end_sentences() + self._needless()
+        for first, second, correlation in self.traded:
+            sentences.append(f"{first} and {second} trade off (correlation {correlation:.3f}).")
         if len(self.least_determined) > 1 and wide:
             parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.least_determined.items())
-            said.append(f"Least determined is a change of several together (as fractions of the ranges): {parts}.")
+            sentences.append(
+                f"Least determined is a change of several together (as fractions of the ranges): {parts}."
+            )
         if len(self.optima) > 1:
-            said.append(f"{self.agreement} of {len(self.optima)} starts reached this maximum.")
+            sentences.append(f"{self.agreement} of {len(self.optima)} starts reached this maximum.")
         if self.begun_elsewhere:
-            said.append(self._starts_sentence())
+            sentences.append(self._starts_sentence())
         if self.left_out:
-            said.append(f"{self.left_out} samples beyond the gate were left out.")
+            sentences.append(f"{self.left_out} samples beyond the gate were left out.")
         if self.interrupted:
-            said.append("Interrupted: the best so far.")
-        return said
+            sentences.append("Interrupted: the best so far.")
+        return sentences
 
 
 def identification_of(

@@ -30,9 +30,9 @@ def outliers_of(model: StateSpaceModel, runs: Data, gate: float, starts: Starts 
         gate: number of standard deviations.
         starts: of the runs, if some do not begin as the prior says.
     """
-    found = estimates_of(model, runs, starts, RobustExtendedKalmanFilter)
-    spread = np.sqrt(np.einsum("bkii->bki", found.innovation_covs))
-    return np.abs(found.innovations) > gate * spread
+    estimates = estimates_of(model, runs, starts, RobustExtendedKalmanFilter)
+    spread = np.sqrt(np.einsum("bkii->bki", estimates.innovation_covs))
+    return np.abs(estimates.innovations) > gate * spread
 
 
 class WithoutOutliers:
@@ -74,8 +74,8 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
     levels = [np.ptp(log.inputs, axis=0) for log in logs]
     if any(level.any() for level in levels):
         return
-    coordinates, found = objective.coordinates, objective(start)
-    cov = covariance(found.information, found.scores[:0], coordinates.high - coordinates.low)
+    coordinates, evaluation = objective.coordinates, objective(start)
+    cov = covariance(evaluation.information, evaluation.scores[:0], coordinates.high - coordinates.low)
     narrow = is_narrow(cov, coordinates)
     loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
     if loose:

@@ -52,20 +52,20 @@ def starts_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None 
     that are diffuse or unknown constants.
     """
     count = len(runs.measurements)
-    found = as_the_prior_says(model, count)
-    seen = np.where(np.zeros(model.m, dtype=bool) if unseen is None else unseen, np.nan, runs.measurements)
-    found.leads[:] = [_lead(one) for one in seen]
-    rows = max(int(found.leads.max()), 1)
-    seen, inputs = seen[:, :rows], runs.inputs[:, : rows - 1]
-    seen = np.where((np.arange(rows) < found.leads[:, None])[..., None], seen, np.nan)
+    starts = as_the_prior_says(model, count)
+    measured = np.where(np.zeros(model.m, dtype=bool) if unseen is None else unseen, np.nan, runs.measurements)
+    starts.leads[:] = [_lead(run_measurements) for run_measurements in measured]
+    rows = max(int(starts.leads.max()), 1)
+    measured, inputs = measured[:, :rows], runs.inputs[:, : rows - 1]
+    measured = np.where((np.arange(rows) < starts.leads[:, None])[..., None], measured, np.nan)
     wide, guesses = _wide_and_guess(model, runs)
-    best = [_first_states(model, wide, inputs, seen, guess) for guess in guesses]
-    likeliest = np.argmax([one[2] for one in best], axis=0)
-    for place, (choice, lead) in enumerate(zip(likeliest, found.leads, strict=True)):
-        mean, cov, value = (part[place] for part in best[choice])
+    best = [_first_states(model, wide, inputs, measured, guess) for guess in guesses]
+    likeliest = np.argmax([estimate[2] for estimate in best], axis=0)
+    for index, (choice, lead) in enumerate(zip(likeliest, starts.leads, strict=True)):
+        mean, cov, value = (part[index] for part in best[choice])
         if lead > 0 and np.isfinite(value) and _is_elsewhere(model, mean, cov):
-            found.free[place], found.means[place], found.covs[place] = True, mean, wide
-    return found
+            starts.free[index], starts.means[index], starts.covs[index] = True, mean, wide
+    return starts
 
 
 def estimates_of(
@@ -81,12 +81,12 @@ def estimates_of(
     """
     if starts is None or not starts.free.any():
         return run(kind(model=model), runs.filter_keys, runs.inputs, runs.measurements)
-    some = [runs.slice(place, place + 1) for place in range(len(runs.measurements))]
+    single_runs = [runs.slice(index, index + 1) for index in range(len(runs.measurements))]
     parts = [
-        run(kind(model=starts.model(model, place)), one.filter_keys, one.inputs, one.measurements)
-        for place, one in enumerate(some)
+        run(kind(model=starts.model(model, index)), single.filter_keys, single.inputs, single.measurements)
+        for index, single in enumerate(single_runs)
     ]
-    return Estimates(*(np.concatenate([getattr(one, name) for one in parts]) for name in Estimates._fields))
+    return Estimates(*(np.concatenate([getattr(part, name) for part in parts]) for name in Estimates._fields))
 
 
 def _wide_and_guess(model: StateSpaceModel, runs: Data) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -111,9 +111,9 @@ def _wide_and_guess(model: StateSpaceModel, runs: Data) -> tuple[np.ndarray, lis
 
 def _lead(measured: np.ndarray) -> int:
     """Rows of the lead-in of a run with measurements (K + 1, m); 0 for a run with too few."""
-    there = np.flatnonzero(~np.isnan(measured).all(axis=1))
-    wanted = min(LEAD, len(there) // PART)
-    return int(there[wanted - 1]) + 1 if wanted > 0 else 0
+    rows = np.flatnonzero(~np.isnan(measured).all(axis=1))
+    wanted = min(LEAD, len(rows) // PART)
+    return int(rows[wanted - 1]) + 1 if wanted > 0 else 0
 
 
 def _first_states(
@@ -127,13 +127,13 @@ def _first_states(
 
     def at(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         begun = Starts(np.ones(count, dtype=bool), means, np.zeros((count, n, n)), np.zeros(count, dtype=np.int64))
-        found = sensitivity(model, inputs, measured, slopes, starts=begun._replace(held=False))
-        parts = found.gradients, found.information
-        fine = np.isfinite(found.values) & np.all(
-            [np.isfinite(one).reshape(count, -1).all(axis=1) for one in parts], 0
+        result = sensitivity(model, inputs, measured, slopes, starts=begun._replace(held=False))
+        parts = result.gradients, result.information
+        fine = np.isfinite(result.values) & np.all(
+            [np.isfinite(part).reshape(count, -1).all(axis=1) for part in parts], 0
         )
-        return np.where(fine, found.values, -np.inf), *(
-            np.nan_to_num(one, posinf=0.0, neginf=0.0) for one in parts
+        return np.where(fine, result.values, -np.inf), *(
+            np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in parts
         )
 
     means, damping = np.array(guess), np.ones(count)
@@ -161,16 +161,18 @@ def _first_states(
 
 def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> bool:
     """Whether a first state, known with a covariance, does not belong to the model's prior."""
-    apart, whole = difference(mean, model.prior_mean, model.shape.state_angles), cov + model.prior_cov
-    scale = np.sqrt(np.diag(whole))
-    some = scale > 0  # a state that is known exactly stays where it is
-    if not some.any():
+    apart, total_cov = difference(mean, model.prior_mean, model.shape.state_angles), cov + model.prior_cov
+    scale = np.sqrt(np.diag(total_cov))
+    uncertain = scale > 0  # a state that is known exactly stays where it is
+    if not uncertain.any():
         return False
-    scaled = apart[some] / scale[some]
-    values, axes = np.linalg.eigh(whole[np.ix_(some, some)] / np.outer(scale[some], scale[some]))
+    scaled = apart[uncertain] / scale[uncertain]
+    values, axes = np.linalg.eigh(
+        total_cov[np.ix_(uncertain, uncertain)] / np.outer(scale[uncertain], scale[uncertain])
+    )
     along = scaled @ axes
     distance = (along**2 / np.maximum(values, 1e-10)).sum()
-    return bool(distance > chi2.isf(LEVEL, int(some.sum())))
+    return bool(distance > chi2.isf(LEVEL, int(uncertain.sum())))
 
 
 # Recorded runs as one batch: runs of different lengths are padded with steps in which nothing is measured.
@@ -184,20 +186,20 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     Raises:
         ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.
     """
-    given = _listed(data)
-    if not given or not all(isinstance(one, Data | Log) for one in given):
+    parts = _listed(data)
+    if not parts or not all(isinstance(part, Data | Log) for part in parts):
         raise ValueError(f"data must be some of Log or Data, but got {short_repr(data)}")
-    if len(given) == 1 and isinstance(given[0], Data):
-        return given[0].seen
-    check_times([one for one in given if isinstance(one, Log)])
+    if len(parts) == 1 and isinstance(parts[0], Data):
+        return parts[0].seen
+    check_times([part for part in parts if isinstance(part, Log)])
     inputs: list[np.ndarray] = []
     measurements: list[np.ndarray] = []
-    for one in given:
-        if isinstance(one, Log):
-            u, z = (one.inputs, one.measurements) if one.stamps is None else in_steps(one)
+    for source in parts:
+        if isinstance(source, Log):
+            u, z = (source.inputs, source.measurements) if source.stamps is None else in_steps(source)
             inputs, measurements = [*inputs, u], [*measurements, z]
             continue
-        for part in map(one.one, range(len(one.seeds))):
+        for part in map(source.one, range(len(source.seeds))):
             inputs += list(part.inputs)
             measurements += list(part.measurements)
     lengths = list(map(len, measurements))

@@ -45,27 +45,27 @@ def validation_of(
         unseen: (m,) which channels the filter only predicts: their errors are those of the estimate.
         starts: of the runs; None if all begin as the model's prior says.
     """
-    symbols = [one.symbol for one in model.measurements]
+    symbols = [channel.symbol for channel in model.measurements]
     hidden = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
     starts = as_the_prior_says(model, len(runs.measurements)) if starts is None else starts
     counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
-    there = ~np.isnan(runs.measurements) & counted[..., None]
-    shown = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
-    estimates, nothing = estimates_of(model, shown, starts), np.zeros((model.n, model.n))
+    scored = ~np.isnan(runs.measurements) & counted[..., None]
+    visible = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
+    estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.n, model.n))
     known = starts._replace(covs=np.zeros_like(starts.covs))
-    simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), shown, known)
+    simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), visible, known)
 
-    def rmse(found: Estimates) -> np.ndarray:
-        errors = np.where(hidden, _less_predicted(model, runs, found, hidden), found.innovations)
-        return np.sqrt((np.where(there, errors, 0.0) ** 2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
+    def rmse(estimates: Estimates) -> np.ndarray:
+        errors = np.where(hidden, _less_predicted(model, runs, estimates, hidden), estimates.innovations)
+        return np.sqrt((np.where(scored, errors, 0.0) ** 2).sum(axis=(0, 1)) / scored.sum(axis=(0, 1)))
 
     one_step, simulation = rmse(estimates), rmse(simulated)
-    rows = np.where(there, runs.measurements, np.nan).reshape(-1, model.m)
+    rows = np.where(scored, runs.measurements, np.nan).reshape(-1, model.m)
     rows = on_one_branch(rows, model.shape.measurement_angles)
     spread = np.array([rows[~np.isnan(rows[:, i]), i].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
-    nis = (weighted * estimates.innovations)[counted].sum() / there[..., ~hidden].sum()
+    nis = (weighted * estimates.innovations)[counted].sum() / scored[..., ~hidden].sum()
 
     def by_symbol(values: np.ndarray) -> dict[str, float]:
         return dict(zip(symbols, map(float, values), strict=True))
@@ -93,8 +93,10 @@ def validate(
     }
     unseen, starts = objective.unseen, objective.starts
     if data is not None:
-        kept = objective.moves_prior(found.at)
-        starts = None if kept else starts_of(objective.model_at(found.at), objective.data_at(found.at), unseen)
+        prior_moves = objective.moves_prior(found.at)
+        starts = (
+            None if prior_moves else starts_of(objective.model_at(found.at), objective.data_at(found.at), unseen)
+        )
     return {
         name: validation_of(objective.model_at(at), objective.data_at(at), unseen, starts)
         for name, at in points.items()

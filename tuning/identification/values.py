@@ -72,18 +72,18 @@ def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[
             it for another sample time of a model that does not take one.
     """
     values, of = read_values(path), _dt_of(path)
-    made = partial(_at_dt, make, values, of, str(path))
+    model_at = partial(_at_dt, make, values, of, str(path))
     try:
-        made(1.0 if of is None else of)
+        model_at(1.0 if of is None else of)
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
-    return made
+    return model_at
 
 
 def _dt_of(path: str | Path) -> float | None:
     """The sample time of the logs that values were found on [s]; None in a file that does not say."""
-    found = read_toml(path, "a file of values").get("identified")
-    dt = found.get("dt") if isinstance(found, dict) else None
+    table = read_toml(path, "a file of values").get("identified")
+    dt = table.get("dt") if isinstance(table, dict) else None
     return None if dt is None else positive(f"dt in {path}", dt)
 
 
@@ -97,8 +97,8 @@ def _at_dt(
             raise ValueError(
                 f"the dt of a log must be that of {path}, {of:g} s, for a model that takes no dt, but is {dt:g} s"
             )
-        own = ModelFamily(make, (), noise=False, dt=dt).variances_of_q
-        values = {n: float(noise_for_dt(v, of, dt)) if n in own else v for n, v in values.items()}
+        q_variances = ModelFamily(make, (), noise=False, dt=dt).variances_of_q
+        values = {n: float(noise_for_dt(v, of, dt)) if n in q_variances else v for n, v in values.items()}
     return valued(make, values, dt)
 
 

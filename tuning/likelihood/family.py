@@ -42,7 +42,7 @@ class TunedCovariance:
         base: the covariance before.
         name: of the covariance, as places of correlations have it.
         variance: the kind of places that its variances are.
-        moved: of each of p parameters the places that it sets, and by which factors.
+        settings: for each of p parameters the places that it sets, and by which factors.
     """
 
     def __init__(
@@ -50,18 +50,20 @@ class TunedCovariance:
         base: np.ndarray,
         name: str,
         variance: type[ProcessVariance | MeasurementVariance],
-        moved: Sequence[Sequence[tuple[Any, float]]],
+        settings: Sequence[Sequence[tuple[Any, float]]],
     ):
         """Find the parameters of this covariance."""
-        self._base, self._count = base, len(moved)
+        self._base, self._count = base, len(settings)
         all_places: list[tuple[int, Any, float]] = [
-            (i, place, factor) for i, places in enumerate(moved) for place, factor in places
+            (i, position, factor) for i, positions in enumerate(settings) for position, factor in positions
         ]
-        self._variances = [(i, one.index, by) for i, one, by in all_places if isinstance(one, variance)]
+        self._variances = [
+            (i, position.index, by) for i, position, by in all_places if isinstance(position, variance)
+        ]
         self._correlations = [
-            (i, one.index, by)
-            for i, one, by in all_places
-            if isinstance(one, Correlation) and one.covariance == name
+            (i, position.index, by)
+            for i, position, by in all_places
+            if isinstance(position, Correlation) and position.covariance == name
         ]
 
     def at(self, values: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,11 +74,11 @@ class TunedCovariance:
             variances[at] = factor * values[i]
         slopes = np.zeros((self._count, n, n))
         if self._correlations:
-            given = np.clip(correlations_of(self._base), *CORRELATIONS)
+            correlations = np.clip(correlations_of(self._base), *CORRELATIONS)
             for i, k, factor in self._correlations:
-                given[k] = factor * values[i]
-            cov = full_covariance(variances.tolist(), given.tolist())
-            by_correlations = correlation_slopes(variances.tolist(), given.tolist())
+                correlations[k] = factor * values[i]
+            cov = full_covariance(variances.tolist(), correlations.tolist())
+            by_correlations = correlation_slopes(variances.tolist(), correlations.tolist())
             for i, k, factor in self._correlations:
                 slopes[i] += factor * units[i] * by_correlations[k]
         else:
@@ -126,15 +128,15 @@ class Family:
     def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter]):
         """Find out whether all parameters are of Q and R, of which derivatives are known."""
         self.coordinates, self._choice, self._problem = Coordinates(parameters), choice, problem
-        if any(one.tied or one.held for one in parameters):
+        if any(parameter.tied or parameter.held for parameter in parameters):
             self._choice = choice = obeying(choice, parameters)
         self._filter = make_filter(choice.name, self._model(choice), **choice.numbers)
         self._base, self._noise = self._filter.model, None
-        moved = [((one.place, 1.0), *one.tied) for one in parameters]  # by each parameter
+        settings = [((parameter.place, 1.0), *parameter.tied) for parameter in parameters]  # by each parameter
         kinds = ProcessVariance, MeasurementVariance, Correlation
-        if all(isinstance(place, kinds) for places in moved for place, _ in places):
-            q = TunedCovariance(self._base.process_noise_cov, Q, ProcessVariance, moved)
-            self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, MeasurementVariance, moved)
+        if all(isinstance(position, kinds) for positions in settings for position, _ in positions):
+            q = TunedCovariance(self._base.process_noise_cov, Q, ProcessVariance, settings)
+            self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, MeasurementVariance, settings)
         else:
             self._check_functions()
 
@@ -147,7 +149,7 @@ class Family:
         """The model at coordinates, and its derivatives by them: exact of Q and R, else central differences."""
         if self._noise is not None:
             values, units = self.coordinates.values(point), self.coordinates.units
-            (q, by_q), (r, by_r) = (one.at(values, units) for one in self._noise)
+            (q, by_q), (r, by_r) = (noise.at(values, units) for noise in self._noise)
             model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
             return model, ModelSlopes.of(model, len(point), process_noise_cov=by_q, measurement_noise_cov=by_r)
         return self._model_at(point), ModelSlopes.between(self._pairs(point), 2 * STEP)
@@ -179,11 +181,13 @@ class Family:
         still = np.zeros((len(r), model.n, model.n)), np.zeros((len(q), model.m, model.m))
         moves = {"process_noise_cov": np.concatenate([q, still[0]])}
         moves["measurement_noise_cov"] = np.concatenate([still[1], r])
-        found, _ = self._along(model, ModelSlopes.of(model, len(q) + len(r), **moves), data, score, False, truth)
-        total = found[:, 1:].sum(axis=0)
-        halves = [np.tensordot(one, unit, 1) for one, unit in ((total[: len(q)], q), (total[len(q) :], r))]
-        by_q, by_r = (0.5 * (one + np.diag(np.diag(one))) for one in halves)
-        return found[:, 0], by_q, by_r
+        scores, _ = self._along(model, ModelSlopes.of(model, len(q) + len(r), **moves), data, score, False, truth)
+        total = scores[:, 1:].sum(axis=0)
+        halves = [
+            np.tensordot(gradient, unit, 1) for gradient, unit in ((total[: len(q)], q), (total[len(q) :], r))
+        ]
+        by_q, by_r = (0.5 * (half + np.diag(np.diag(half))) for half in halves)
+        return scores[:, 0], by_q, by_r
 
     def _along(
         self, model: StateSpaceModel, slopes: ModelSlopes, data: Data, score: str, information: bool, truth
@@ -191,29 +195,29 @@ class Family:
         """What `derivatives` returns, of a model with its slopes."""
         wanted = Wanted(information, constants=bool(slopes.constants.any()), tails=False, score=score)
 
-        def of(some: Data) -> tuple[np.ndarray, np.ndarray]:
-            arguments = model, some.seen.inputs, some.seen.measurements, slopes, wanted
-            out, told = derivatives(*arguments, truth=truth, used=self._filter)
-            return out[:, 0], told
+        def of(runs: Data) -> tuple[np.ndarray, np.ndarray]:
+            arguments = model, runs.seen.inputs, runs.seen.measurements, slopes, wanted
+            out, information_of_runs = derivatives(*arguments, truth=truth, used=self._filter)
+            return out[:, 0], information_of_runs
 
-        found = of(data)
+        result = of(data)
         if truth is not None or not (self._problem.leads_in and data.first_scored):
-            return found
+            return result
         before = of(data.beginning)
-        return found[0] - before[0], found[1] - before[1]
+        return result[0] - before[0], result[1] - before[1]
 
     def choice_at(self, point: np.ndarray) -> Choice:
         """The choice at coordinates."""
         changed = self._choice
-        for one, value in zip(self.coordinates.free, self.coordinates.values(point).tolist(), strict=True):
-            changed = one.set(changed, value)
+        for parameter, value in zip(self.coordinates.free, self.coordinates.values(point).tolist(), strict=True):
+            changed = parameter.set(changed, value)
         return changed
 
     def _check_functions(self) -> None:
         """Raise ValueError if a parameter changes functions of the model."""
         start = self.coordinates.start()
-        for place, name in enumerate(self.coordinates.names):
-            above, below = self.coordinates.neighbours(start, place, STEP)
+        for index, name in enumerate(self.coordinates.names):
+            above, below = self.coordinates.neighbours(start, index, STEP)
             model = self._model_at(above)
             functions = model.functions
             if not same_functions(model, self._model_at(below)) or model.functions != functions:
@@ -224,7 +228,7 @@ class Family:
 
     def _pairs(self, point: np.ndarray) -> list[tuple[StateSpaceModel, StateSpaceModel]]:
         """Models a step above and below along each parameter."""
-        sides = (self.coordinates.neighbours(point, place, STEP) for place in range(len(point)))
+        sides = (self.coordinates.neighbours(point, index, STEP) for index in range(len(point)))
         return [(self._model_at(above), self._model_at(below)) for above, below in sides]
 
     def _model_at(self, point: np.ndarray) -> StateSpaceModel:
@@ -237,10 +241,10 @@ class Family:
 def symmetric_units(size: int) -> np.ndarray:
     """The symmetric matrices with one entry, or two mirrored ones, of 1: (n (n + 1) / 2, n, n)."""
     pairs = [(i, j) for i in range(size) for j in range(i + 1)]
-    found = np.zeros((len(pairs), size, size))
-    for one, (i, j) in zip(found, pairs, strict=True):
-        one[i, j] = one[j, i] = 1.0
-    return found
+    units = np.zeros((len(pairs), size, size))
+    for unit, (i, j) in zip(units, pairs, strict=True):
+        unit[i, j] = unit[j, i] = 1.0
+    return units
 
 
 def known_information(
@@ -266,15 +270,15 @@ def known_information(
     """
     if not has_gradient(choice.name) or len(names) < LEAST_NUMBERS:
         return None
-    found = []
-    for scenario, one in zip(scenarios, data, strict=True):
+    matrices = []
+    for scenario, runs in zip(scenarios, data, strict=True):
         free = model_parameters(scenario, where=where)
         known = {parameter.name: parameter for parameter in free if parameter.log}
         if not set(names) <= set(known):
             return None
         try:
             family = Family(choice, scenario, [known[name] for name in names])
-            found.append(family.derivatives(np.log(values), one, information=True)[1])
+            matrices.append(family.derivatives(np.log(values), runs, information=True)[1])
         except ValueError:  # more than numbers changes
             return None
-    return np.concatenate(found)
+    return np.concatenate(matrices)

@@ -56,7 +56,7 @@ class Goal:
         data: Sequence[Data],
         parameters: Sequence[Parameter],
         objective: str = LIKELIHOOD,
-        watch: Callable[[Goal, np.ndarray, Likelihood], None] = lambda goal, point, found: None,
+        watch: Callable[[Goal, np.ndarray, Likelihood], None] = lambda goal, point, likelihood: None,
     ):
         """Find the truth that counts."""
         self._watch = watch
@@ -65,19 +65,19 @@ class Goal:
         self._families = [Family(choice, problem, parameters) for problem in problems]
         self._truths = [self._truth(*those) for those in zip(problems, data, self._families, strict=True)]
         self.coordinates = self._families[0].coordinates
-        self.steps = sum(int(one.scored_counts.sum()) for one in data)
+        self.steps = sum(int(runs.scored_counts.sum()) for runs in data)
 
     def __call__(self, point: np.ndarray) -> Likelihood:
         """Values of all runs, (B,), and their gradients, (B, p), at coordinates."""
-        found = []
+        blocks = []
         parts = zip(self._problems, self._data, self._families, self._truths, strict=True)
         for problem, data, family, truth in parts:
             score = OF_STATES.get(self.objective, recursion.LIKELIHOOD)
             if truth is not None and self.objective == SCORE:
                 truth = truth._replace(weights=self._of_score(point, problem, data, family))
             out, _ = family.derivatives(point, data, score=score, truth=truth)
-            found.append(out * self._weight(data))
-        runs = np.concatenate(found)
+            blocks.append(out * self._weight(data))
+        runs = np.concatenate(blocks)
         if self.objective == SCORE:
             runs[:, 1:] *= 0.5
         likelihood = Likelihood(runs[:, 0], runs[:, 1:])
@@ -94,15 +94,15 @@ class Goal:
         score, parts = OF_STATES.get(self.objective, recursion.LIKELIHOOD), []
         for data, family, truth in zip(self._data, self._families, self._truths, strict=True):
             values, by_q, by_r = family.by_noise(choice, data, score=score, truth=truth)
-            parts.append([self._weight(data) * one for one in (values.sum(), by_q, by_r)])
+            parts.append([self._weight(data) * term for term in (values.sum(), by_q, by_r)])
         value, by_q, by_r = (np.sum(np.array(of_all), axis=0) for of_all in zip(*parts, strict=True))
         return float(value), by_q, by_r
 
     def information(self, point: np.ndarray) -> np.ndarray:
         """Fisher's information on the coordinates in the innovations of all runs, (p, p)."""
         pairs = zip(self._families, self._data, strict=True)
-        found = [family.derivatives(point, data, information=True)[1] for family, data in pairs]
-        return np.concatenate(found).sum(axis=0)
+        matrices = [family.derivatives(point, data, information=True)[1] for family, data in pairs]
+        return np.concatenate(matrices).sum(axis=0)
 
     def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
         """The model of the first problem at coordinates, and its derivatives by them."""
@@ -110,7 +110,7 @@ class Goal:
 
     def of_few(self, runs: int) -> Goal:
         """The same of the first runs of each problem."""
-        few = [one.slice(0, runs) for one in self._data]
+        few = [data.slice(0, runs) for data in self._data]
         return Goal(self._choice, self._problems, few, self.coordinates.free, self.objective, self._watch)
 
     def of(self, objective: str) -> Goal:
@@ -129,7 +129,7 @@ class Goal:
     @property
     def untuned(self) -> np.ndarray:
         """The parameters of the choice that the goal was made of, (p,)."""
-        values = [(one.get(self._choice), neutral(one.name)) for one in self.coordinates.free]
+        values = [(parameter.get(self._choice), neutral(parameter.name)) for parameter in self.coordinates.free]
         return np.array([other if value is None else value for value, other in values], dtype=np.float64)
 
     @property
@@ -140,7 +140,7 @@ class Goal:
     @property
     def runs(self) -> int:
         """The most runs of a problem."""
-        return max(len(one.measurements) for one in self._data)
+        return max(len(runs.measurements) for runs in self._data)
 
     def level(self, value: float) -> float:
         """Log L of all runs for their sum; of other objectives their value, as a study has it."""
@@ -150,7 +150,7 @@ class Goal:
         """In what information is counted at an optimum: in a log density, or in the mean square that remains."""
         if not self.is_of_squares:
             return 1.0
-        counted = sum(int(np.isfinite(one.states).sum()) for one in self._truths if one is not None)
+        counted = sum(int(np.isfinite(truth.states).sum()) for truth in self._truths if truth is not None)
         return (-2.0 if self.objective == MSE else -1.0) * value / counted
 
     def _weight(self, data: Data) -> float:

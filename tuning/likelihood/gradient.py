@@ -57,7 +57,7 @@ class GradientResult(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return tuple(one.name for one in self.free)
+        return tuple(parameter.name for parameter in self.free)
 
 
 def tune_by_gradient(
@@ -99,20 +99,20 @@ def tune_by_gradient(
     begin = time.perf_counter()
     goal = goal_of(filter_name, problems, data, objective, options)
     free, coordinates = goal.coordinates.free, goal.coordinates
-    given = [_factors(start, len(free)) for start in (starts_of(free) if starts is None else starts)]
-    optima = [optimum(goal, start_at(goal, start)) for start in given]
+    factors = [_factors(start, len(free)) for start in (starts_of(free) if starts is None else starts)]
+    optima = [optimum(goal, start_at(goal, start)) for start in factors]
     best = max(optima, key=lambda optimum: optimum.value)
     point = coordinates.of(best.parameters)
     errors = _standard_errors(goal, point, goal.unit(best.value))
     inside = (coordinates.low < point) & (point < coordinates.high)
     identified = inside & (errors * TWO_SIDED < np.where(coordinates.log, KNOWN_WITHIN, LINEAR_WITHIN))
-    apart = [abs(coordinates.of(one.parameters) - point)[identified] for one in optima]
-    levels = [abs(one.level - best.level) <= SAME_LEVEL * max(abs(best.level), 1.0) for one in optima]
+    apart = [abs(coordinates.of(reached.parameters) - point)[identified] for reached in optima]
+    levels = [abs(reached.level - best.level) <= SAME_LEVEL * max(abs(best.level), 1.0) for reached in optima]
     return GradientResult(
         choice=goal.choice_at(point),
         free=free,
         best=best,
-        starts=tuple(given),
+        starts=tuple(factors),
         optima=tuple(optima),
         standard_errors=errors * coordinates.units,
         identified=identified,
@@ -130,10 +130,10 @@ def goal_of(
     options: Mapping[str, Any] | None = None,
 ) -> Goal:
     """What `tune_by_gradient` maximises, with the parameters of the first problem; arguments are its."""
-    given = [problems] if isinstance(problems, Problem) else list(problems)
+    listed = [problems] if isinstance(problems, Problem) else list(problems)
     runs = [data] if isinstance(data, Data) else list(data)
-    parameters = model_parameters(given[0], **(options or {}))
-    return Goal(untuned_choice(filter_name, given[0]), given, runs, parameters, objective)
+    parameters = model_parameters(listed[0], **(options or {}))
+    return Goal(untuned_choice(filter_name, listed[0]), listed, runs, parameters, objective)
 
 
 def start_at(goal: Goal, factors: Sequence[float]) -> np.ndarray:
@@ -162,11 +162,11 @@ def optimum(goal: Goal, start: np.ndarray) -> Optimum:
         start = first.coordinates.of(optimum(first, start).parameters)
         prior = goal.unit(goal(start).values.sum()) / KNOWN_WITHIN**2
     point, large, evaluations = start, goal.is_large, 0
-    for one in (goal.of_few(FEW_RUNS), goal) if large and goal.runs > FEW_RUNS else (goal,):
-        found = _minimum(one, point, large, prior * (one.steps / goal.steps), start)
-        point, evaluations = found.x, evaluations + found.nfev
-    value = float(goal(point).values.sum()) if prior else -float(found.fun)
-    return Optimum(goal.coordinates.values(point), value, goal.level(value), evaluations, bool(found.success))
+    for part in (goal.of_few(FEW_RUNS), goal) if large and goal.runs > FEW_RUNS else (goal,):
+        minimum = _minimum(part, point, large, prior * (part.steps / goal.steps), start)
+        point, evaluations = minimum.x, evaluations + minimum.nfev
+    value = float(goal(point).values.sum()) if prior else -float(minimum.fun)
+    return Optimum(goal.coordinates.values(point), value, goal.level(value), evaluations, bool(minimum.success))
 
 
 def _factors(start: Sequence[float] | float, count: int) -> tuple[float, ...]:
@@ -196,8 +196,10 @@ def _minimum(goal: Goal, first: np.ndarray, large: bool, prior: float, centre: n
     """The minimum of minus the sum over all runs and of a prior about a centre, from a start."""
 
     def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
-        away, found = point - centre, goal(point)
-        return 0.5 * prior * (away @ away) - found.values.sum(), prior * away - found.gradients.sum(axis=0)
+        away, likelihood = point - centre, goal(point)
+        return 0.5 * prior * (away @ away) - likelihood.values.sum(), prior * away - likelihood.gradients.sum(
+            axis=0
+        )
 
     options = {"ftol": COARSE, "maxcor": 2 * len(first)} if large else {}
     return minimum_within(goal.coordinates, negative, first, **options)

@@ -77,26 +77,32 @@ def identify(
         space: distributions of the tuned parameters, `Plan.space`.
         where: relations among the model's numbers.
     """
-    own = parameters_of(choice)
+    parameters = parameters_of(choice)
     names = _names(choice, space)
     if not 0 < len(names) <= MOST_NUMBERS:
         return None
 
     def log_likelihoods(logarithms: np.ndarray) -> np.ndarray:
-        moved = {**own, **{name: float(value) for name, value in zip(names, np.exp(logarithms), strict=True)}}
+        values = {
+            **parameters,
+            **{name: float(value) for name, value in zip(names, np.exp(logarithms), strict=True)},
+        }
         parts = []
-        for scenario, one in zip(scenarios, data, strict=True):
-            filter_ = choice_of(choice.name, moved, scenario, where).filter(scenario)
-            some = estimates_in_parts(filter_, one)
-            first = one.first_scored if scenario.leads_in else 0
-            parts += [_in_run(part, estimates.log_likelihoods)[:, first:].sum(axis=1) for part, estimates in some]
-        found = np.concatenate(parts)
-        return np.where(np.isfinite(found), found, LEAST)
+        for scenario, runs in zip(scenarios, data, strict=True):
+            filter_ = choice_of(choice.name, values, scenario, where).filter(scenario)
+            parts_of_runs = estimates_in_parts(filter_, runs)
+            first = runs.first_scored if scenario.leads_in else 0
+            parts += [
+                _in_run(part, estimates.log_likelihoods)[:, first:].sum(axis=1)
+                for part, estimates in parts_of_runs
+            ]
+        totals = np.concatenate(parts)
+        return np.where(np.isfinite(totals), totals, LEAST)
 
-    tuned = np.array([own[name] for name in names])
+    tuned = np.array([parameters[name] for name in names])
     bounds = np.log([ends_of(space[name]) for name in names])
     untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
-    starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
+    starts = np.log(tuned), np.log([untuned.get(name, parameters[name]) for name in names])
     best = maximum(log_likelihoods, starts, bounds)
     known = known_information(choice, scenarios, data, names, np.exp(best), where)
     cov = covariance(curvatures(log_likelihoods, best) if known is None else known)
@@ -127,10 +133,10 @@ def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, 
     """
     if not filter_type(choice.name).has_covariance:
         return ()
-    places, own = places_in(choice), parameters_of(choice)
+    positions, parameters = places_in(choice), parameters_of(choice)
     without = [name for name in choice.model if set(NOISE) & set(choice.model)]
-    logarithmic = [name for name, range_ in space.items() if name in places and getattr(range_, "log", False)]
-    return tuple(name for name in logarithmic if name not in without and own[name] > 0)
+    logarithmic = [name for name, range_ in space.items() if name in positions and getattr(range_, "log", False)]
+    return tuple(name for name in logarithmic if name not in without and parameters[name] > 0)
 
 
 def maximum(
@@ -150,14 +156,14 @@ def maximum(
     def negative(logarithms: np.ndarray) -> float:
         return -log_likelihoods(logarithms).sum()
 
-    found = minimize(
+    minimum = minimize(
         negative,
         min((np.clip(start, *bounds.T) for start in starts), key=negative),
         method="COBYQA",
         bounds=bounds,
         options={"initial_tr_radius": STEP, "final_tr_radius": CLOSE, "maxfev": EVALUATIONS},
     )
-    return found.x
+    return minimum.x
 
 
 def curvatures(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
@@ -170,14 +176,14 @@ def curvatures(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarr
     count, steps = len(at), STEP * np.eye(len(at))
     here = log_likelihoods(at)
     above, below = (np.array([log_likelihoods(at + sign * step) - here for step in steps]) for sign in (1, -1))
-    found = np.empty((len(here), count, count))
+    matrices = np.empty((len(here), count, count))
     for i in range(count):
-        found[:, i, i] = -(above[i] + below[i]) / STEP**2
+        matrices[:, i, i] = -(above[i] + below[i]) / STEP**2
         for j in range(i):
             both = sum(log_likelihoods(at + sign * (steps[i] + steps[j])) - here for sign in (1, -1))
             mixed = both - above[i] - below[i] - above[j] - below[j]
-            found[:, i, j] = found[:, j, i] = -mixed / (2.0 * STEP**2)
-    return found
+            matrices[:, i, j] = matrices[:, j, i] = -mixed / (2.0 * STEP**2)
+    return matrices
 
 
 def covariance(curvatures: np.ndarray) -> np.ndarray:
@@ -234,25 +240,25 @@ def is_identified(
     return narrow & inside & (np.array(falls) > SIGNIFICANT).all(axis=1)
 
 
-def sentences(found: Identifiability) -> list[str]:
+def sentences(result: Identifiability) -> list[str]:
     """Sentences on which parameters the innovations determine."""
-    rows = list(zip(found.names, found.identified, found.factors, strict=True))
+    rows = list(zip(result.names, result.identified, result.factors, strict=True))
     known = [f"{name} within a factor of {factor:.3g}" for name, known, factor in rows if known]
     loose = [name for name, known, _ in rows if not known]
-    said = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
+    lines = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
     if loose:
-        parts = [f"{name} x {factor:.2g}" for name, factor in found.least_determined.items()]
+        parts = [f"{name} x {factor:.2g}" for name, factor in result.least_determined.items()]
         trade = f" Least determined is a change of several together: {_listed(parts)}." if len(parts) > 1 else ""
-        said.append(
+        lines.append(
             f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
             f"the maximum of the likelihood lies at the end of the range.{trade}"
         )
-    return list(map(index_pairs, said))
+    return list(map(index_pairs, lines))
 
 
-def as_data(found: Identifiability) -> dict:
+def as_data(result: Identifiability) -> dict:
     """The result as plain data, by parameter."""
-    columns = found.names, found.most_likely.tolist(), found.factors.tolist(), found.identified.tolist()
+    columns = result.names, result.most_likely.tolist(), result.factors.tolist(), result.identified.tolist()
     return {
         name: {"most_likely": best, "known_within_a_factor_of": factor, "determined": known}
         for name, best, factor, known in zip(*columns, strict=True)

@@ -26,20 +26,20 @@ def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
     def follow(task: Task) -> None:
         model = task.model(task.start)
         q, r = model.process_noise_cov, model.measurement_noise_cov
-        found: list[tuple[np.ndarray, np.ndarray]] = []
-        for place, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        estimates: list[tuple[np.ndarray, np.ndarray]] = []
+        for i, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
             for index in range(len(data.seeds)):
                 try:
-                    model = task.model(task.start, place).replace(process_noise_cov=q, measurement_noise_cov=r)
+                    model = task.model(task.start, i).replace(process_noise_cov=q, measurement_noise_cov=r)
                     q, r = _means(make_filter(name, model, **numbers), data.one(index))
                 except ValueError:  # a belief that is none
                     raise ValueError(
-                        f"way {name!r} failed: its Q or R is no covariance after {len(found)} runs"
+                        f"way {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
                     ) from None
                 task.charge(1)
-                found.append((q, r))
-                half = found[len(found) // 2 :]
-                means = (np.mean([one[side] for one in half], axis=0) for side in (0, 1))
+                estimates.append((q, r))
+                half = estimates[len(estimates) // 2 :]
+                means = (np.mean([estimate[side] for estimate in half], axis=0) for side in (0, 1))
                 task.keep(with_covariances(task.start, *_diagonals(task, *means)))
 
     return follow
@@ -92,10 +92,14 @@ def anderson(task: Task) -> None:
     Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
     Tellus A 59, with a lambda for all states alike; Anderson (2009), Tellus A 61.
     """
-    one, found, start = FILTER_PARAMETERS[INFLATION], [], 1.0 + 1e-9  # so that there is one to change
+    parameter, levels_of_runs, start = (
+        FILTER_PARAMETERS[INFLATION],
+        [],
+        1.0 + 1e-9,
+    )  # so that there is one to change
     choice = task.start._replace(numbers={**task.start.numbers, INFLATION: start})
-    for place, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
-        filter_, variances = choice.filter(problem), np.diag(task.model(choice, place).measurement_noise_cov)
+    for i, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        filter_, variances = choice.filter(problem), np.diag(task.model(choice, i).measurement_noise_cov)
         for run in range(len(data.seeds)):
             session, level, spread = Session(filter_), 1.0, DEVIATION
             inputs, z = data.seen.inputs[run], data.seen.measurements[run]
@@ -110,8 +114,8 @@ def anderson(task: Task) -> None:
                         level, spread = updated(level, spread, d * d, p, r)
                 levels.append(level)
             task.charge(1)
-            found += levels[int(SETTLED * len(levels)) :]
-    mean = float(np.clip(np.sqrt(found).mean(), one.low, one.high))
+            levels_of_runs += levels[int(SETTLED * len(levels)) :]
+    mean = float(np.clip(np.sqrt(levels_of_runs).mean(), parameter.low, parameter.high))
     task.keep(task.start._replace(numbers={**task.start.numbers, INFLATION: mean}))
 
 

@@ -68,19 +68,19 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
     for _ in range(ITERATIONS):
         model, slopes = family.at(point)
         each = np.exp(point)
-        units = [one / each[:, None, None] for one in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
+        units = [slope / each[:, None, None] for slope in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
         of_model = model.process_noise_cov, model.measurement_noise_cov
-        q, r = (of - np.tensordot(each, one, 1) for of, one in zip(of_model, units, strict=True))
-        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip((q, r), of_model, strict=True)):
+        q, r = (of - np.tensordot(each, unit, 1) for of, unit in zip(of_model, units, strict=True))
+        if any(abs(rest).max() > LINEAR * abs(of).max() for rest, of in zip((q, r), of_model, strict=True)):
             if not task.options.get("hold_r"):
                 raise ValueError(
                     f"way {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
                 )
-        gain, seen = observed(task, linear, *of_model)
-        design, wanted = equations(linear, gain, seen, Noise(units[0], units[1], (q, r)))
+        gain, measured = observed(task, linear, *of_model)
+        design, wanted = equations(linear, gain, measured, Noise(units[0], units[1], (q, r)))
         scale = np.maximum(abs(design).max(axis=0), 1e-300)
-        found, _ = nnls(design / scale, wanted)
-        values = np.maximum(found / scale, np.exp(coordinates.low))
+        solution, _ = nnls(design / scale, wanted)
+        values = np.maximum(solution / scale, np.exp(coordinates.low))
         point = np.clip(coordinates.of(values), coordinates.low, coordinates.high)
         task.keep(family.choice_at(point))
 
@@ -88,25 +88,26 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
 def observed(task: Task, linear: Stationary, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The gain (n, m) of a Q and R, and its innovations' lagged covariances (lags, m, m) on all runs: one pass."""
     gain, first = steady_gain(linear, q, r), task.model(task.start).prior_mean
-    lags = min(LAGS, *(max(2, int(one.rows.min()) // 4) for one in task.data))
-    seen = autocovariances([_innovations(linear, gain, one, first) for one in task.data], lags)
+    lags = min(LAGS, *(max(2, int(runs.rows.min()) // 4) for runs in task.data))
+    measured = autocovariances([_innovations(linear, gain, runs, first) for runs in task.data], lags)
     task.charge(task.passes)
-    return gain, seen
+    return gain, measured
 
 
 def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
     """The matrices of a linear model; ValueError for another one."""
     about = np.zeros(model.n), np.zeros(model.inputs)
     away = np.ones(model.n) * model.scales, np.ones(model.inputs)
-    found, other = (linearize(model, *one).matrices() for one in (about, away))
-    pairs = zip(found, other, strict=True)
+    matrices, other = (linearize(model, *point).matrices() for point in (about, away))
+    pairs = zip(matrices, other, strict=True)
     if not all(
-        np.allclose(one, two, rtol=ALIKE, atol=ALIKE * max(abs(one).max(initial=0), 1.0)) for one, two in pairs
+        np.allclose(first, two, rtol=ALIKE, atol=ALIKE * max(abs(first).max(initial=0), 1.0))
+        for first, two in pairs
     ):
         raise ValueError(
             f"way {way!r} needs a linear model, such as that of the filter kf, but {name} has another one"
         )
-    return Stationary(*found)
+    return Stationary(*matrices)
 
 
 def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -142,28 +143,28 @@ def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, l
 
 def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: np.ndarray) -> list[np.ndarray]:
     """The innovations of each run, (rows, m), without those of the beginning."""
-    seen, measurements = data.seen, data.measurements
+    runs, measurements = data.seen, data.measurements
     times = measurements.shape[1]
-    means, found = np.tile(prior_mean, (len(measurements), 1)), np.empty(measurements.shape)
+    means, innovations = np.tile(prior_mean, (len(measurements), 1)), np.empty(measurements.shape)
     for k in range(times):
-        found[:, k] = measurements[:, k] - means @ linear.c.T - linear.zero
+        innovations[:, k] = measurements[:, k] - means @ linear.c.T - linear.zero
         if k < times - 1:
-            after = means + np.nan_to_num(found[:, k]) @ gain.T
-            means = after @ linear.a.T + seen.inputs[:, k] @ linear.b.T + linear.offset
-    return [run[min(DROPPED, rows // 5) : rows] for run, rows in zip(found, data.rows.tolist(), strict=True)]
+            after = means + np.nan_to_num(innovations[:, k]) @ gain.T
+            means = after @ linear.a.T + runs.inputs[:, k] @ linear.b.T + linear.offset
+    return [run[min(DROPPED, rows // 5) : rows] for run, rows in zip(innovations, data.rows.tolist(), strict=True)]
 
 
 def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
     """Means of e_{k+j} e_k' over all times at which both were measured, (lags, m, m)."""
     runs = [run for part in parts for run in part]
-    found = []
+    means = []
     for j in range(lags):
         pairs = [(run[j:], run[: len(run) - j]) for run in runs if len(run) > j]
         ahead, behind = (np.concatenate(side) for side in zip(*pairs, strict=True))
-        there = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
+        present = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
         products = np.nan_to_num(ahead)[:, :, None] * np.nan_to_num(behind)[:, None, :]
-        found.append(products.sum(axis=0) / np.maximum(there.sum(axis=0), 1))
-    return np.array(found)
+        means.append(products.sum(axis=0) / np.maximum(present.sum(axis=0), 1))
+    return np.array(means)
 
 
 # Autocovariance least squares: Q and R from how the innovations of a fixed gain go together over time.
@@ -188,12 +189,12 @@ def als(task: Task) -> None:
     covariances", Automatica 42(2); Rajamani, Rawlings (2009), Automatica 45(1).
     """
 
-    def equations(linear: Stationary, gain: np.ndarray, seen: np.ndarray, noise: Noise):
-        lags = len(seen)
+    def equations(linear: Stationary, gain: np.ndarray, measured: np.ndarray, noise: Noise):
+        lags = len(measured)
         design = [lagged(linear, gain, q, r, lags).ravel() for q, r in zip(noise.q, noise.r, strict=True)]
-        return np.column_stack(design), (seen - lagged(linear, gain, *noise.rest, lags)).ravel()
+        return np.column_stack(design), (measured - lagged(linear, gain, *noise.rest, lags)).ravel()
 
-    wanted = [bool(task.options.get(one)) for one in ("full_q", "full_r")]
+    wanted = [bool(task.options.get(option)) for option in ("full_q", "full_r")]
     if any(wanted) and set(NOISE) <= set(task.start.model):
         _matrices(task, *wanted)
     else:
@@ -202,20 +203,20 @@ def als(task: Task) -> None:
 
 def _matrices(task: Task, full_q: bool, full_r: bool) -> None:
     """The same of Q, R or both in full; of what is not full the diagonal is found."""
-    model, held = task.model(task.start), bool(task.options.get("hold_r"))
+    model, holds_r = task.model(task.start), bool(task.options.get("hold_r"))
     linear = stationary(model, task.problems[0].name, "als")
     first = q, r = model.process_noise_cov, model.measurement_noise_cov
-    free = _free(q, full_q), _free(r, full_r) & (not held)
+    free = _free(q, full_q), _free(r, full_r) & (not holds_r)
     for _ in range(ITERATIONS):
-        gain, seen = observed(task, linear, q, r)
-        q, r = semidefinite(linear, gain, seen, first, free)
-        task.keep(with_covariances(task.start, q, None if held else r))
+        gain, measured = observed(task, linear, q, r)
+        q, r = semidefinite(linear, gain, measured, first, free)
+        task.keep(with_covariances(task.start, q, None if holds_r else r))
 
 
 def semidefinite(
     linear: Stationary,
     gain: np.ndarray,
-    seen: np.ndarray,
+    measured: np.ndarray,
     first: tuple[np.ndarray, np.ndarray],
     free: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +229,7 @@ def semidefinite(
     Args:
         linear: the model.
         gain: L (n, m).
-        seen: lagged covariances of its innovations, (lags, m, m).
+        measured: lagged covariances of its innovations, (lags, m, m).
         first: Q (n, n) and R (m, m), at whose diagonals the search begins; what has no free entry stays.
         free: which entries of their roots are free, (n, n) and (m, m) bool.
 
@@ -238,48 +239,50 @@ def semidefinite(
     from scipy.optimize import least_squares
 
     pairs = list(zip(first, free, strict=True))
-    roots = [np.sqrt(np.diag(np.diag(one))) if mask.any() else np.linalg.cholesky(one) for one, mask in pairs]
-    parts = [one[mask] for one, mask in zip(roots, free, strict=True)]
-    by = [_responses(linear, gain, len(seen), side, len(one)) for side, one in enumerate(first)]
-    wanted, end = seen.ravel(), len(parts[0])
+    roots = [np.sqrt(np.diag(np.diag(cov))) if mask.any() else np.linalg.cholesky(cov) for cov, mask in pairs]
+    parts = [root[mask] for root, mask in zip(roots, free, strict=True)]
+    by = [_responses(linear, gain, len(measured), side, len(cov)) for side, cov in enumerate(first)]
+    wanted, end = measured.ravel(), len(parts[0])
 
     def filled(point: np.ndarray) -> list[np.ndarray]:
-        for root, mask, some in zip(roots, free, (point[:end], point[end:]), strict=True):
-            root[mask] = some
+        for root, mask, entries in zip(roots, free, (point[:end], point[end:]), strict=True):
+            root[mask] = entries
         return roots
 
     def left(point: np.ndarray) -> np.ndarray:
-        expected = [np.tensordot(one, root @ root.T) for one, root in zip(by, filled(point), strict=True)]
+        expected = [
+            np.tensordot(response, root @ root.T) for response, root in zip(by, filled(point), strict=True)
+        ]
         return expected[0] + expected[1] - wanted
 
     def slopes(point: np.ndarray) -> np.ndarray:
         pairs = zip(by, filled(point), free, strict=True)
-        return np.concatenate([2.0 * (one @ root)[:, mask] for one, root, mask in pairs], axis=1)
+        return np.concatenate([2.0 * (response @ root)[:, mask] for response, root, mask in pairs], axis=1)
 
     ends = {"ftol": PRECISE, "xtol": PRECISE, "gtol": None, "max_nfev": MOST}
-    found = least_squares(left, np.concatenate(parts), slopes, x_scale="jac", **ends)
-    floors = (LEAST * np.diag(np.diag(one)) for one in first)
-    q, r = (root @ root.T + floor for root, floor in zip(filled(found.x), floors, strict=True))
+    solution = least_squares(left, np.concatenate(parts), slopes, x_scale="jac", **ends)
+    floors = (LEAST * np.diag(np.diag(cov)) for cov in first)
+    q, r = (root @ root.T + floor for root, floor in zip(filled(solution.x), floors, strict=True))
     return q, r
 
 
 def _free(cov: np.ndarray, full: bool) -> np.ndarray:
     """Which entries of a root are free, (n, n) bool: none of a state without noise."""
-    there = np.diag(cov) > 0.0
-    return np.tril(np.outer(there, there)) if full else np.diag(there)
+    noisy = np.diag(cov) > 0.0
+    return np.tril(np.outer(noisy, noisy)) if full else np.diag(noisy)
 
 
 def _responses(linear: Stationary, gain: np.ndarray, lags: int, side: int, size: int) -> np.ndarray:
     """Lagged covariances by each entry of Q, side 0, or of R, (lags m m, size, size), symmetric in the entries."""
     n, m = gain.shape
-    found = np.empty((lags * m * m, size, size))
+    responses = np.empty((lags * m * m, size, size))
     for i in range(size):
         for j in range(i + 1):
             noise = np.zeros((n, n)), np.zeros((m, m))
             noise[side][i, j] += 0.5
             noise[side][j, i] += 0.5
-            found[:, i, j] = found[:, j, i] = lagged(linear, gain, *noise, lags).ravel()
-    return found
+            responses[:, i, j] = responses[:, j, i] = lagged(linear, gain, *noise, lags).ravel()
+    return responses
 
 
 # Mehra's covariance matching: P H', R and Q, one after the other, from lagged covariances of innovations.
@@ -297,7 +300,7 @@ def mehra(task: Task) -> None:
 
 
 def mehra_equations(
-    linear: Stationary, gain: np.ndarray, seen: np.ndarray, noise: Noise
+    linear: Stationary, gain: np.ndarray, measured: np.ndarray, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray]:
     """The matrix (rows, p) and the right side of equations in the numbers of Q and R.
 
@@ -310,34 +313,36 @@ def mehra_equations(
     Args:
         linear: the model.
         gain: L (n, m).
-        seen: lagged covariances of its innovations, (lags, m, m).
+        measured: lagged covariances of its innovations, (lags, m, m).
         noise: Q and R by the numbers.
 
     Raises:
         ValueError: if A has no inverse, or there are fewer lags than states.
     """
     a, c, n = linear.a, linear.c, len(linear.a)
-    if len(seen) <= n or np.linalg.matrix_rank(a) < n:
+    if len(measured) <= n or np.linalg.matrix_rank(a) < n:
         raise ValueError(f"way 'mehra' needs an A with an inverse and {n} lags, but one of them is missing")
     closed, power, rows = a - a @ gain @ c, np.eye(n), []
     for _ in range(n):
         rows.append(c @ power @ a)
         power = closed @ power
-    crossed = gain @ seen[0] + np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(seen[1 : n + 1])  # P C'
-    middle = gain @ seen[0] @ gain.T - gain @ crossed.T - crossed @ gain.T
+    crossed = gain @ measured[0] + np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(
+        measured[1 : n + 1]
+    )  # P C'
+    middle = gain @ measured[0] @ gain.T - gain @ crossed.T - crossed @ gain.T
     known = noise.rest[0] + a @ middle @ a.T
     forward = [np.linalg.matrix_power(a, k) for k in range(n + 1)]
-    back = [np.linalg.solve(one, np.eye(n)) for one in forward]
+    back = [np.linalg.solve(power, np.eye(n)) for power in forward]
 
-    def moved(q: np.ndarray) -> np.ndarray:
+    def lagged_sums(q: np.ndarray) -> np.ndarray:
         sums = [sum(c @ forward[j] @ q @ back[k - j].T @ c.T for j in range(k)) for k in range(1, n + 1)]
         return np.ravel(sums)
 
     ends = [crossed.T @ back[k].T @ c.T - c @ forward[k] @ crossed for k in range(1, n + 1)]
-    of_r = np.column_stack([one.ravel() for one in noise.r])
-    of_q = np.column_stack([moved(one) for one in noise.q])
-    r = seen[0] - c @ crossed - noise.rest[1]
-    return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - moved(known)])
+    of_r = np.column_stack([unit.ravel() for unit in noise.r])
+    of_q = np.column_stack([lagged_sums(unit) for unit in noise.q])
+    r = measured[0] - c @ crossed - noise.rest[1]
+    return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - lagged_sums(known)])
 
 
 # R and one factor on Q from innovations before and after updates, as Desroziers has it.
@@ -383,14 +388,14 @@ def _moments(task: Task, choice: Choice) -> tuple[np.ndarray, float, float] | No
     """Means over scored steps of (R S^-1 d d')_jj, (m,), d'd and tr(H P H'); None unless these are finite."""
     left: list[np.ndarray] = []
     totals: Sequence[list[np.ndarray]] = ([], [])
-    for place, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
-        r = task.model(choice, place).measurement_noise_cov
-        for some, found in estimates_in_parts(choice.filter(problem), data):
-            there = some.scored & (~np.isnan(some.seen.measurements)).all(axis=-1)
-            d, s = found.innovations[there], found.innovation_covs[there]
+    for i, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        r = task.model(choice, i).measurement_noise_cov
+        for part, estimates in estimates_in_parts(choice.filter(problem), data):
+            counted = part.scored & (~np.isnan(part.seen.measurements)).all(axis=-1)
+            d, s = estimates.innovations[counted], estimates.innovation_covs[counted]
             whitened = np.linalg.solve(s, d[..., None])[..., 0]
             left.append((whitened @ r) * d)
             totals[0].append((d**2).sum(axis=-1))
             totals[1].append(np.trace(s - r, axis1=1, axis2=2))
-    means = np.concatenate(left).mean(axis=0), *(float(np.concatenate(one).mean()) for one in totals)
-    return means if all(np.isfinite(one).all() for one in means) and means[2] > 0 else None
+    means = np.concatenate(left).mean(axis=0), *(float(np.concatenate(values).mean()) for values in totals)
+    return means if all(np.isfinite(mean).all() for mean in means) and means[2] > 0 else None

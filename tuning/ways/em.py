@@ -73,14 +73,14 @@ def _start(task: Task, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of the start, and of how many terms each variance is the mean, (p,)."""
     transitions, measured = counts_of(task)
     counts: list[float] = []
-    for one in goal.coordinates.free:
-        if isinstance(one.place, ProcessVariance):
+    for parameter in goal.coordinates.free:
+        if isinstance(parameter.place, ProcessVariance):
             counts.append(transitions)
-        elif isinstance(one.place, MeasurementVariance):
-            counts.append(measured[one.place.index])
+        elif isinstance(parameter.place, MeasurementVariance):
+            counts.append(measured[parameter.place.index])
         else:
             raise ValueError(
-                f"EM tunes only variances in Q and R, but {one.name} is tuned, too{way_out(one.name)}"
+                f"EM tunes only variances in Q and R, but {parameter.name} is tuned, too{way_out(parameter.name)}"
             )
     first = np.clip(goal.coordinates.of(goal.untuned), goal.coordinates.low, goal.coordinates.high)
     return first, np.array(counts, dtype=np.float64)
@@ -98,11 +98,11 @@ def counts_of(task: Task) -> tuple[int, np.ndarray]:
 
 def _step(goal: Goal, point: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, float]:
     """Coordinates after a step, which are logarithms, and log L before it; a variance of no terms stays."""
-    found = goal(point)
-    slopes = found.gradients.sum(axis=0)
+    likelihood = goal(point)
+    slopes = likelihood.gradients.sum(axis=0)
     factors = 1.0 + np.divide(2.0 * slopes, counts, out=np.zeros_like(slopes), where=counts > 0)
     after = point + np.log(np.maximum(factors, LEAST))
-    return np.clip(after, goal.coordinates.low, goal.coordinates.high), float(found.values.sum())
+    return np.clip(after, goal.coordinates.low, goal.coordinates.high), float(likelihood.values.sum())
 
 
 def _full(task: Task, goal: Goal) -> None:
@@ -142,8 +142,8 @@ def _change(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _times_measured(task: Task) -> int:
-    found = 0
+    count = 0
     for problem, data in zip(task.problems, task.data, strict=True):
         first = data.first_scored if problem.leads_in else 0
-        found += int((~np.isnan(data.seen.measurements[:, first:])).any(axis=-1).sum())
-    return found
+        count += int((~np.isnan(data.seen.measurements[:, first:])).any(axis=-1).sum())
+    return count

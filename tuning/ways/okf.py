@@ -37,11 +37,13 @@ def okf(task: Task) -> None:
     NeurIPS; settings of their package. Kingma, Ba (2015), "Adam: a method for stochastic optimization", ICLR.
     """
     noise_estimation(task)
-    order = [task.generator.permutation(len(one.seeds)) for one in task.data]
-    kept = [max(1, round(VALIDATION * len(one))) if len(one) > 1 else 0 for one in order]
-    validation = [_picked(data, one[:count]) for data, one, count in zip(task.data, order, kept, strict=True)]
-    validation = [some if some.seeds else data for some, data in zip(validation, task.data, strict=True)]
-    learn = [one[count:] for one, count in zip(order, kept, strict=True)]
+    order = [task.generator.permutation(len(runs.seeds)) for runs in task.data]
+    held_out = [max(1, round(VALIDATION * len(indices))) if len(indices) > 1 else 0 for indices in order]
+    validation = [
+        _picked(data, indices[:count]) for data, indices, count in zip(task.data, order, held_out, strict=True)
+    ]
+    validation = [picked if picked.seeds else data for picked, data in zip(validation, task.data, strict=True)]
+    learn = [indices[count:] for indices, count in zip(order, held_out, strict=True)]
     held_r = bool(task.options.get("hold_r"))
     few = task.goal(MSE, keeps=False).of_few(FEW)
     price = task.price("slopes of squares by Q and R", lambda: few.by_noise(task.best))
@@ -49,7 +51,7 @@ def okf(task: Task) -> None:
     for step, (choice, done) in enumerate(_adam(task, learn, held_r, price)):
         if step % LOOKED_EVERY == 0 or done:
             value = -_goal(task, choice, validation).by_noise(choice)[0]
-            task.charge(price * sum(len(one.seeds) for one in validation))
+            task.charge(price * sum(len(runs.seeds) for runs in validation))
             waited = waited + 1
             if value < least:
                 least, waited = value, 0
@@ -68,12 +70,12 @@ def _adam(task: Task, learn: Sequence[np.ndarray], held_r: bool, price: float):
         q, r = factors.matrices(point)
         choice = with_covariances(task.best if step else task.start, q, None if held_r else r)
         yield choice, step == MOST
-        queue = [_filled(some, all_, task.generator) for some, all_ in zip(queue, learn, strict=True)]
-        batch = [_picked(data, some[:BATCH]) for data, some in zip(task.data, queue, strict=True)]
-        queue = [some[BATCH:] for some in queue]
+        queue = [_filled(left, all_, task.generator) for left, all_ in zip(queue, learn, strict=True)]
+        batch = [_picked(data, indices[:BATCH]) for data, indices in zip(task.data, queue, strict=True)]
+        queue = [indices[BATCH:] for indices in queue]
         goal = _goal(task, choice, batch)
         _, by_q, by_r = goal.by_noise(choice)
-        task.charge(price * sum(len(one.seeds) for one in batch))
+        task.charge(price * sum(len(runs.seeds) for runs in batch))
         slope = -factors.slopes(point, by_q, np.zeros_like(by_r) if held_r else by_r) / goal.steps
         norm = float(np.linalg.norm(slope))
         if not np.isfinite(norm):
@@ -92,7 +94,7 @@ class Factors:
         """Begin at some Q and R."""
         self._sizes = len(q), len(r)
         self.first = np.concatenate(
-            [_entries(np.linalg.cholesky(one + RIDGE * np.eye(len(one)))) for one in (q, r)]
+            [_entries(np.linalg.cholesky(cov + RIDGE * np.eye(len(cov)))) for cov in (q, r)]
         )
 
     def matrices(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,39 +112,39 @@ class Factors:
         return np.concatenate(parts)
 
     def _factors(self, point: np.ndarray) -> list[np.ndarray]:
-        found, first = [], 0
+        factors, first = [], 0
         for size in self._sizes:
             factor, count = np.zeros((size, size)), size * (size + 1) // 2
             factor[np.tril_indices(size)] = point[first : first + count]
             np.fill_diagonal(factor, np.exp(np.diag(factor)))
-            found.append(factor)
+            factors.append(factor)
             first += count
-        return found
+        return factors
 
 
 def _entries(factor: np.ndarray) -> np.ndarray:
-    found = factor.copy()
-    np.fill_diagonal(found, np.log(np.diag(factor)))
-    return found[np.tril_indices(len(factor))]
+    entries = factor.copy()
+    np.fill_diagonal(entries, np.log(np.diag(factor)))
+    return entries[np.tril_indices(len(factor))]
 
 
 def _goal(task: Task, choice: Choice, data: Sequence[Data]) -> Goal:
     return Goal(choice, task.problems, data, task.free, MSE)
 
 
-def _filled(some: np.ndarray, all_: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    return some if len(some) else generator.permutation(all_)
+def _filled(indices: np.ndarray, all_: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    return indices if len(indices) else generator.permutation(all_)
 
 
-def _picked(data: Data, places: np.ndarray) -> Data:
+def _picked(data: Data, indices: np.ndarray) -> Data:
     """Some runs of data."""
 
     def of(array: np.ndarray | None) -> np.ndarray | None:
-        return None if array is None else array[places]
+        return None if array is None else array[indices]
 
     pick: Callable = of
     return data._replace(
-        seeds=tuple(data.seeds[place] for place in places.tolist()),
+        seeds=tuple(data.seeds[i] for i in indices.tolist()),
         inputs=pick(data.inputs),
         measurements=pick(data.measurements),
         filter_keys=pick(data.filter_keys),
@@ -168,11 +170,11 @@ def masked(task: Task) -> None:
     Source: Barratt, Boyd (2020), "Fitting a Kalman smoother to data", American Control Conference, where a
     smoother takes the place of the filter.
     """
-    hidden = [task.generator.random(one.measurements.shape[:2]) < PART for one in task.data]
+    hidden = [task.generator.random(runs.measurements.shape[:2]) < PART for runs in task.data]
     scales: list[np.ndarray] = []
 
     def error(choice: Choice) -> float:
-        squares = np.mean([_squares(task, choice, place, one) for place, one in enumerate(hidden)], axis=0)
+        squares = np.mean([_squares(task, choice, i, mask) for i, mask in enumerate(hidden)], axis=0)
         task.charge(task.passes)
         if not scales:
             scales.append(np.where(squares > 0, squares, 1.0))
@@ -184,16 +186,16 @@ def masked(task: Task) -> None:
     nelder_mead(task, error)
 
 
-def _squares(task: Task, choice: Choice, place: int, hidden: np.ndarray) -> np.ndarray:
+def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.ndarray:
     """Mean squares (m,) of predicted measurements at scored times that are hidden."""
-    problem, data = task.problems[place], task.data[place]
-    filter_, model = choice.filter(problem), task.model(choice, place)
+    problem, data = task.problems[index], task.data[index]
+    filter_, model = choice.filter(problem), task.model(choice, index)
     blind = data._replace(measurements=np.where(hidden[..., None], np.nan, data.measurements))
     totals, counts, first = 0.0, 0, 0
-    for some, found in estimates_in_parts(filter_, blind):
-        last = first + len(some.seeds)
-        _, expected = predicted(model, found.means, some.seen.inputs)
-        z = some.late_scored(data.measurements[first:last])
+    for part, estimates in estimates_in_parts(filter_, blind):
+        last = first + len(part.seeds)
+        _, expected = predicted(model, estimates.means, part.seen.inputs)
+        z = part.late_scored(data.measurements[first:last])
         left = difference(z, expected[:, data.late], model.shape.measurement_angles)
         left = np.where(hidden[first:last, data.late, None], left, np.nan)
         totals = totals + np.nansum(left**2, axis=(0, 1))

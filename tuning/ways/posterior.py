@@ -51,10 +51,10 @@ def posterior(task: Task) -> None:
     for step in range(WARM_UP + DRAWS):
         root = np.linalg.cholesky(spread + 1e-12 * np.eye(p))
         other = point + size * root @ generator.standard_normal(p)
-        there = density(other)
-        chance = math.exp(min(there - here, 0.0))
+        proposed = density(other)
+        chance = math.exp(min(proposed - here, 0.0))
         if generator.random() < chance:
-            point, here = other, there
+            point, here = other, proposed
         draws.append(point)
         if step < WARM_UP:
             size *= math.exp((chance - aim) / math.sqrt(step + 1.0))
@@ -88,8 +88,8 @@ def maximum_a_posteriori(task: Task) -> None:
 
     def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal best
-        found = goal(point)
-        value, gradient = found.values.sum(), found.gradients.sum(axis=0)
+        likelihood = goal(point)
+        value, gradient = likelihood.values.sum(), likelihood.gradients.sum(axis=0)
         model, slopes = goal.model_at(point)
         for name, option in matrices:
             prior, by = _log_prior(first, model, getattr(slopes, name), name, bool(task.options.get(option)))
@@ -110,16 +110,16 @@ def _log_prior(
     centre, cov = getattr(first, name), getattr(model, name)
     if not full:
         variances, before = np.diag(cov), np.diag(centre)
-        there = variances > 0  # a state without noise has no prior
-        v, c, by = variances[there], before[there], np.diagonal(slopes, axis1=1, axis2=2)[:, there]
+        noisy = variances > 0  # a state without noise has no prior
+        v, c, by = variances[noisy], before[noisy], np.diagonal(slopes, axis1=1, axis2=2)[:, noisy]
         power = (1 + WEAK) + 1 + 1
         return float(-0.5 * (power * np.log(v) + c / v).sum()), by @ (-0.5 * (power / v - c / v**2))
     power = (len(cov) + WEAK) + len(cov) + 1
-    whole = np.linalg.solve(cov, centre)
-    value = -0.5 * power * np.linalg.slogdet(cov)[1] - 0.5 * np.trace(whole)
+    ratio = np.linalg.solve(cov, centre)
+    value = -0.5 * power * np.linalg.slogdet(cov)[1] - 0.5 * np.trace(ratio)
     relative = np.linalg.solve(cov, slopes)
     gradient = -0.5 * power * np.trace(relative, axis1=1, axis2=2)
-    return float(value), gradient + 0.5 * np.einsum("pij,ji->p", relative, whole)
+    return float(value), gradient + 0.5 * np.einsum("pij,ji->p", relative, ratio)
 
 
 # The posterior of a model's numbers by the no-U-turn sampler, along the exact gradient of the likelihood.
@@ -159,13 +159,17 @@ def nuts(task: Task) -> None:
         point, s = point_at(y)
         try:
             task.check()
-            found, away = goal(point), (point - centre) / DEVIATION**2
+            likelihood, away = goal(point), (point - centre) / DEVIATION**2
         except Spent:  # an exception would end the process: the other draws are of something cheap, and not kept
             return -0.5 * float(y @ y), -y
         except ValueError:  # the filter diverges
             return -DIVERGED, np.zeros(p)
-        value = found.values.sum() - 0.5 * (point - centre) @ away + np.log(np.maximum(s * (1.0 - s), LEAST)).sum()
-        by_point = found.gradients.sum(axis=0) - away
+        value = (
+            likelihood.values.sum()
+            - 0.5 * (point - centre) @ away
+            + np.log(np.maximum(s * (1.0 - s), LEAST)).sum()
+        )
+        by_point = likelihood.gradients.sum(axis=0) - away
         slope = by_point * (high - low) * s * (1.0 - s) + 1.0 - 2.0 * s
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return -DIVERGED, np.zeros(p)

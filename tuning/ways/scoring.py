@@ -27,8 +27,8 @@ def scoring(task: Task) -> None:
     goal = task.goal(LIKELIHOOD)
     low, high = goal.coordinates.low, goal.coordinates.high
     point, damping = np.clip(goal.coordinates.of(goal.untuned), low, high), DAMPING
-    some = goal.of_few(32)
-    price = task.price("information", lambda: some.information(point))
+    few = goal.of_few(32)
+    price = task.price("information", lambda: few.information(point))
     value, gradient = _of(goal(point))
     for _ in range(MOST_STEPS):
         information = goal.information(point)
@@ -39,20 +39,20 @@ def scoring(task: Task) -> None:
             step = np.zeros_like(point)
             damped = part + damping * np.diag(np.maximum(np.diag(part), 1e-12))
             step[inside] = np.linalg.solve(damped, slope)
-            there = np.clip(point + step, low, high)
-            if gradient @ (there - point) < CLOSE:
+            trial = np.clip(point + step, low, high)
+            if gradient @ (trial - point) < CLOSE:
                 return
-            after, slopes = _of(goal(there))
+            after, slopes = _of(goal(trial))
             if np.isfinite(after) and after > value and np.isfinite(slopes).all():
-                point, value, gradient, damping = there, after, slopes, max(0.1 * damping, LEAST)
+                point, value, gradient, damping = trial, after, slopes, max(0.1 * damping, LEAST)
                 break
             damping *= 10.0
         else:
             return
 
 
-def _of(found) -> tuple[float, np.ndarray]:
-    return float(found.values.sum()), found.gradients.sum(axis=0)
+def _of(likelihood) -> tuple[float, np.ndarray]:
+    return float(likelihood.values.sum()), likelihood.gradients.sum(axis=0)
 
 
 # Noise estimation from true states: the only way without a search, and the best one for a model that is right.
@@ -64,13 +64,13 @@ def noise_estimation(task: Task) -> None:
     Source: Abbeel, Coates, Montemerlo, Ng, Thrun (2005), "Discriminative training of Kalman filters", Robotics:
     Science and Systems, where it is the likelihood of states and measurements together.
     """
-    found = []
+    estimates = []
     for problem, data in zip(task.problems, task.data, strict=True):
-        one = estimated_from(problem.model(**problem.untuned), data)
-        if one.process_cov is None or one.measurement_cov is None:
-            raise ValueError(f"way 'noise-estimation' needs residuals on {problem.name}, but {one.reason}")
-        found.append((one.process_cov, one.measurement_cov))
+        estimate = estimated_from(problem.model(**problem.untuned), data)
+        if estimate.process_cov is None or estimate.measurement_cov is None:
+            raise ValueError(f"way 'noise-estimation' needs residuals on {problem.name}, but {estimate.reason}")
+        estimates.append((estimate.process_cov, estimate.measurement_cov))
     task.charge(task.passes)
-    weights = [len(one.seeds) for one in task.data]
-    q, r = (np.average(np.array(some), axis=0, weights=weights) for some in zip(*found, strict=True))
+    weights = [len(runs.seeds) for runs in task.data]
+    q, r = (np.average(np.array(covs), axis=0, weights=weights) for covs in zip(*estimates, strict=True))
     task.keep(with_covariances(task.start, q, None if task.options.get("hold_r") else r))

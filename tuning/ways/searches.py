@@ -54,8 +54,8 @@ class Descent:
     def __init__(self, task: Task, evaluate: Callable[[Choice], float]):
         """Begin at the task's start."""
         self.task, self.coordinates, self._evaluate = task, Coordinates(task.searched), evaluate
-        given = self.coordinates.of(task.values_of(task.start, task.searched))
-        self.first = np.clip(given, self.coordinates.low, self.coordinates.high)
+        start = self.coordinates.of(task.values_of(task.start, task.searched))
+        self.first = np.clip(start, self.coordinates.low, self.coordinates.high)
         self.least = math.inf
 
     def __call__(self, point: np.ndarray) -> float:
@@ -107,9 +107,9 @@ def coordinate_steps(task: Task) -> None:
     least = descent(point)
     for _ in range(ITERATIONS):
         before = least
-        for place in range(len(point)):
+        for i in range(len(point)):
             for step in (FORWARD, BACKWARD):
-                other = point + step * np.eye(len(point))[place]
+                other = point + step * np.eye(len(point))[i]
                 other = np.clip(other, descent.coordinates.low, descent.coordinates.high)
                 value = descent(other)
                 if value < least:
@@ -134,13 +134,20 @@ def sample(sampler: str, objective: str | None = None, slower: int | None = None
     """
 
     def follow(task: Task) -> None:
-        rates = [task.data] if slower is None else [task.data, [one.every(slower) for one in task.data]]
-        space: dict[str, BaseDistribution] = {one.name: one.distribution for one in task.searched}
+        rates = [task.data] if slower is None else [task.data, [runs.every(slower) for runs in task.data]]
+        space: dict[str, BaseDistribution] = {
+            parameter.name: parameter.distribution for parameter in task.searched
+        }
         with task.uncounted(), quiet_optuna():  # packages are loaded
-            made = make_sampler(sampler, task.seed, 0, space)
-            study = optuna.create_study(sampler=made)
-        given = dict(zip(space, task.values_of(task.start, task.searched), strict=True))
-        study.enqueue_trial({one.name: min(max(given[one.name], one.low), one.high) for one in task.searched})
+            optuna_sampler = make_sampler(sampler, task.seed, 0, space)
+            study = optuna.create_study(sampler=optuna_sampler)
+        start = dict(zip(space, task.values_of(task.start, task.searched), strict=True))
+        study.enqueue_trial(
+            {
+                parameter.name: min(max(start[parameter.name], parameter.low), parameter.high)
+                for parameter in task.searched
+            }
+        )
         least = math.inf
         for _ in range(MOST_TRIALS):
             with quiet_optuna():

@@ -116,7 +116,7 @@ class Task:
     @property
     def passes(self) -> int:
         """Runs of all problems: what one evaluation takes."""
-        return sum(len(one.seeds) for one in self.data)
+        return sum(len(runs.seeds) for runs in self.data)
 
     @property
     def seconds(self) -> float:
@@ -130,7 +130,7 @@ class Task:
 
     def best_within(self, runs: float = math.inf, seconds: float = math.inf) -> Choice:
         """The choice that the way would have given for a smaller budget."""
-        return [one for one in self.kept if one.runs <= runs and one.seconds <= seconds][-1].choice
+        return [entry for entry in self.kept if entry.runs <= runs and entry.seconds <= seconds][-1].choice
 
     @cached_property
     def generator(self) -> np.random.Generator:
@@ -146,21 +146,21 @@ class Task:
     def searched(self) -> list[Parameter]:
         """What a search without gradients tunes: the same and the filter's own numbers, but no ensemble size."""
         if not filter_type(self.filter).has_covariance:
-            return [one for one in parameters(self.filter, self.problems[0]) if not one.integer]
-        found = parameters(self.filter, self.problems[0], **self.options)
-        return [within_first_range(one) for one in found if not one.integer]
+            return [parameter for parameter in parameters(self.filter, self.problems[0]) if not parameter.integer]
+        tunable = parameters(self.filter, self.problems[0], **self.options)
+        return [within_first_range(parameter) for parameter in tunable if not parameter.integer]
 
     def values_of(self, choice: Choice, parameters: Sequence[Parameter]) -> list[float]:
         """The values of parameters in a choice."""
-        pairs = ((one, one.get(choice)) for one in parameters)
-        return [neutral(one.name) if value is None else value for one, value in pairs]  # type: ignore[misc]
+        pairs = ((parameter, parameter.get(choice)) for parameter in parameters)
+        return [neutral(parameter.name) if value is None else value for parameter, value in pairs]  # type: ignore[misc]
 
     def with_values(self, values: Sequence[float] | np.ndarray, parameters: Sequence[Parameter]) -> Choice:
         """The start with other values of some parameters."""
-        found = self.start
-        for one, value in zip(parameters, values, strict=True):
-            found = one.set(found, float(value))
-        return found
+        choice = self.start
+        for parameter, value in zip(parameters, values, strict=True):
+            choice = parameter.set(choice, float(value))
+        return choice
 
     def keep(self, choice: Choice) -> None:
         """From now on this is what the way would give; Spent once the budget is over."""
@@ -181,20 +181,20 @@ class Task:
     def refuse_worse(self) -> None:
         """Return to what was given if the best is worse on the same runs, by objective and likelihood."""
         before = [self.start] if self.given is None else [self.start, self.given]
-        given = [one for one in before if not same_filter(one, self.best)]
+        earlier = [choice for choice in before if not same_filter(choice, self.best)]
         names = self.objective, LIKELIHOOD
         with self.uncounted():
-            found = [self._value(self.best, name, self.data) for name in names]
-            values = [[self._value(one, name, self.data) for name in names] for one in given]
+            new_scores = [self._value(self.best, name, self.data) for name in names]
+            values = [[self._value(choice, name, self.data) for name in names] for choice in earlier]
         worse = [
             (scores[0], i)
             for i, scores in enumerate(values)
-            if all(not new <= old + ROUNDING * abs(old) for new, old in zip(found, scores, strict=True))
+            if all(not new <= old + ROUNDING * abs(old) for new, old in zip(new_scores, scores, strict=True))
         ]
         if worse:
-            least, i = min(worse, key=lambda one: math.inf if math.isnan(one[0]) else one[0])
-            self.kept.append(Kept(self.runs, self.seconds, given[i]))
-            self.refused = Refused(least, found[0])
+            least, i = min(worse, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0])
+            self.kept.append(Kept(self.runs, self.seconds, earlier[i]))
+            self.refused = Refused(least, new_scores[0])
 
     @contextmanager
     def uncounted(self) -> Iterator[None]:
@@ -217,31 +217,31 @@ class Task:
         if ("value", name) not in self._seen:
             self._seen.add(("value", name))
             with self.uncounted():
-                self._value(self.start, name, [one.slice(0, 1) for one in self.data])
-        found = self._value(choice, name, self.data if data is None else data)
+                self._value(self.start, name, [runs.slice(0, 1) for runs in self.data])
+        value = self._value(choice, name, self.data if data is None else data)
         self.charge(self.passes)
-        return found
+        return value
 
     def _value(self, choice: Choice, name: str, data: Sequence[Data]) -> float:
-        objective, found = find_objective(name), []
-        for problem, one in zip(self.problems, data, strict=True):
+        objective, values = find_objective(name), []
+        for problem, batch in zip(self.problems, data, strict=True):
             filter_, needs = choice.filter(problem), objective.needs
             scale = problem.scale if LOG_SCORES in needs else None
-            runs = metrics_of_all(filter_, one, NEES in needs, bool(objective.output), scale)
-            evaluation = compute_metrics(filter_, runs, one, problem.scale, False, VARIANCES in needs)
-            found.append(penalised(objective.value(evaluation, math.nan), evaluation))
-        return float(np.mean(found))
+            runs = metrics_of_all(filter_, batch, NEES in needs, bool(objective.output), scale)
+            evaluation = compute_metrics(filter_, runs, batch, problem.scale, False, VARIANCES in needs)
+            values.append(penalised(objective.value(evaluation, math.nan), evaluation))
+        return float(np.mean(values))
 
     def goal(self, objective: str, keeps: bool = True) -> Goal:
         """What gradients of an objective lead to: each evaluation counts; by default the best point is kept."""
         best: dict[tuple, float] = {}
         last = objective, self.passes
 
-        def watch(goal: Goal, point: np.ndarray, found: Likelihood) -> None:
-            self.charge(prices[goal.objective] * len(found.values))
+        def watch(goal: Goal, point: np.ndarray, likelihood: Likelihood) -> None:
+            self.charge(prices[goal.objective] * len(likelihood.values))
             if not keeps:
                 return
-            value, key = float(found.values.sum()), (goal.objective, len(found.values))
+            value, key = float(likelihood.values.sum()), (goal.objective, len(likelihood.values))
             if np.isfinite(value) and value > best.get(key, -math.inf) and (key == last or last not in best):
                 best[key] = value
                 self.keep(goal.choice_at(point))
@@ -249,7 +249,7 @@ class Task:
         with self.uncounted():
             goal = Goal(self.start, self.problems, self.data, self.free, objective, watch)
             needed = {objective, LIKELIHOOD} if goal.is_of_squares else {objective}
-            prices = {one: self._price_of_gradients(one) for one in needed}
+            prices = {objective_: self._price_of_gradients(objective_) for objective_ in needed}
         return goal
 
     def _price_of_gradients(self, objective: str) -> float:
@@ -262,25 +262,25 @@ class Task:
         """What a call over the first 32 runs takes, in passes of the filter, at least 1: measured once a name."""
         if name not in self._prices:
             with self.uncounted():
-                some = [one.slice(0, FEW) for one in self.data]
-                plain = shortest(lambda: self._value(self.start, LIKELIHOOD, some))
+                few = [runs.slice(0, FEW) for runs in self.data]
+                plain = shortest(lambda: self._value(self.start, LIKELIHOOD, few))
                 self._prices[name] = max(shortest(call) / plain, 1.0)
         return self._prices[name]
 
-    def model(self, choice: Choice, place: int = 0) -> StateSpaceModel:
+    def model(self, choice: Choice, index: int = 0) -> StateSpaceModel:
         """The model that a choice's filter assumes: of a linear filter its affine approximation."""
-        return choice.filter(self.problems[place]).kernel_model
+        return choice.filter(self.problems[index]).kernel_model
 
 
 def shortest(call: Callable[[], object]) -> float:
     """The shortest of some calls, after one that may compile [s of processor time]."""
     call()
-    found = []
+    seconds = []
     for _ in range(TIMED):
         begin = time.process_time()
         call()
-        found.append(time.process_time() - begin)
-    return max(min(found), 1e-6)
+        seconds.append(time.process_time() - begin)
+    return max(min(seconds), 1e-6)
 
 
 def way_out(name: str) -> str:
@@ -293,6 +293,10 @@ def way_out(name: str) -> str:
     )
 
 
-def within_first_range(one: Parameter) -> Parameter:
+def within_first_range(parameter: Parameter) -> Parameter:
     """A parameter of Q or R in the part of its range in which a search begins."""
-    return one if one.first is None else replace(one, low=one.first[0], high=one.first[1], default=None)
+    return (
+        parameter
+        if parameter.first is None
+        else replace(parameter, low=parameter.first[0], high=parameter.first[1], default=None)
+    )

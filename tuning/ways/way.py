@@ -48,7 +48,7 @@ class Way(NamedTuple):
             raise ValueError(f"way {name!r} tunes the inflation of an ensemble, but {task.filter!r} has none")
         if TRUTH in self.needs and not task.has_truth:
             pairs = zip(task.problems, task.data, strict=True)
-            lacking = next(one.name for one, data in pairs if one.scale is None or data.states is None)
+            lacking = next(problem.name for problem, data in pairs if problem.scale is None or data.states is None)
             raise ValueError(f"way {name!r} needs true states, but {lacking} has none")
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
