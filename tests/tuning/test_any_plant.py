@@ -18,7 +18,7 @@ from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_g
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.summary import summary
-from tuning.evaluation.worth import worth
+from tuning.evaluation.worth import tuning_effect
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
@@ -106,13 +106,15 @@ def test_without_truth_the_innovations_stay(comparisons):
     assert said["rmse"] == [None] * 3 and said["score"] is said["nees"] is None and said["nis"] is not None
     gain = likelihood_gain(blind.true, blind.untuned)
     assert 0 < gain.low < gain.value == pytest.approx(without.log_likelihood - blind.untuned.log_likelihood)
-    assert worth(blind).startswith("changes the log-likelihood of a run by +")
+    assert tuning_effect(blind).startswith("changes the log-likelihood of a run by +")
     worse = blind._replace(tuned=blind.untuned, untuned=blind.tuned)
     loss = worse.likelihood_gains["rule of thumb"]
     assert loss.low < loss.high < 0
     size = f"{-loss.value:.2f} [{-loss.high:.2f}, {-loss.low:.2f}]"
     signed = f"{loss.value:.2f} [{loss.low:.2f}, {loss.high:.2f}]"
-    assert worth(worse).startswith(f"changes the log-likelihood of a run by {signed} against the rule of thumb")
+    assert tuning_effect(worse).startswith(
+        f"changes the log-likelihood of a run by {signed} against the rule of thumb"
+    )
     assert f"{size} below that of the rule of thumb" in " ".join(gains(worse, "runs"))
 
 

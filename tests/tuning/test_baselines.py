@@ -22,7 +22,7 @@ from tuning.evaluation.baselines import (
     baselines,
     competing_baselines,
     full_noise,
-    given,
+    given_noise,
     nearest,
     noise_estimated,
     oracle,
@@ -35,7 +35,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.residuals import noise_estimation, residuals
 from tuning.evaluation.summary import summarised, summary
-from tuning.evaluation.worth import gain, warnings_of, worth
+from tuning.evaluation.worth import gain, tuning_effect, warnings_of
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.parameter import Parameter
@@ -53,17 +53,17 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
     comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
     assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
     assert list(comparison.ratios)[0] == GIVEN and comparison.ratios[RULE] == (1.0, 1.0, 1.0)
-    assert " against the given filter" in worth(comparison).partition(" and ")[0]
+    assert " against the given filter" in tuning_effect(comparison).partition(" and ")[0]
     assert " times that of the given filter, " in gains(comparison, "seeds")[0]
 
 
 def test_a_model_with_the_noise_of_its_plant_is_given_and_the_oracle_and_competes_with_no_trial():
     problem = pair()
-    assert given("kf", problem) == oracle("kf", problem) == baselines("kf", problem)[GIVEN]
+    assert given_noise("kf", problem) == oracle("kf", problem) == baselines("kf", problem)[GIVEN]
     assert list(competing_baselines("kf", problem)) == [SCALED, RULE, NOISE]
     comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 4)
     assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
-    assert list(comparison.ratios)[-2:] == [GIVEN, ORACLE] and "given" not in worth(comparison)
+    assert list(comparison.ratios)[-2:] == [GIVEN, ORACLE] and "given" not in tuning_effect(comparison)
     assert gains(comparison, "seeds")[-1].startswith("The given Q and R are the plant's own")
     assert contender("kf", "given").choose(problem) == oracle("kf", problem)
     assert thruster().given is None
@@ -73,7 +73,7 @@ def test_the_default_of_the_user_s_function_is_the_rule_of_thumb_and_given():
     problem = altitude_problem.problem()
     assert problem.untuned == problem.given == altitude_problem.GIVEN
     assert list(baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
-    comparison = evaluate_held_out(given("ekf", problem), problem, 0, 4)
+    comparison = evaluate_held_out(given_noise("ekf", problem), problem, 0, 4)
     assert list(comparison.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
 
 

@@ -18,7 +18,7 @@ from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
-from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.experiments.hidden_truth import hide_truth
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
@@ -161,7 +161,9 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     said = scaling_sentence(comparison)
     assert "The scaled default is the given Q and R with this Q times" in said
     assert "give the model state_low and state_high" in said  # for the model has no ranges
-    assert "against the given filter" in worth(comparison) and "rule of thumb" not in worth(comparison)
+    assert "against the given filter" in tuning_effect(comparison) and "rule of thumb" not in tuning_effect(
+        comparison
+    )
     assert [row[0] for row in errors_table(problem, comparison).rows][:2] == ["given", "scaled default"]
     assert "given" in numbers_table(result.choice, problem, 0, comparison.default).columns
 

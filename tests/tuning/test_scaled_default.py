@@ -19,7 +19,7 @@ from tuning.evaluation.baselines import (
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds, training_seeds
@@ -63,7 +63,7 @@ def test_where_there_is_no_scaled_default_it_says_why():
     assert scaling_sentence(comparison).startswith(
         "There is no scaled default, so the rule of thumb comes first: no factor"
     )
-    assert worth(comparison) == "makes no significant difference on 4 seeds against the rule of thumb"
+    assert tuning_effect(comparison) == "makes no significant difference on 4 seeds against the rule of thumb"
     with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q from"):
         contender("ekf", "scaled").filter(startup)
 
@@ -103,7 +103,7 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
     assert (
         comparison.ratios[RULE].high < comparison.ratios[SCALED].low
     )  # the rule of thumb is the easier one to beat
-    said = worth(comparison, "the error")
+    said = tuning_effect(comparison, "the error")
     assert said.startswith("lowers the error by ") and " against the scaled default and by " in said
     assert f"its Q times {comparison.default.factor:.4g}" in scaling_sentence(comparison)
 
@@ -119,16 +119,16 @@ def test_three_baselines_stand_with_commas_and_a_verb_is_said_once():
     comparison = Comparison(found, found, found, np.ones(2), range(2))
     given, default, rule = Interval(1.0, 0.9, 1.1), Interval(0.74, 0.7386, 0.7414), Interval(0.5, 0.5, 0.5)
     ratios = {RULE: rule, SCALED: default, GIVEN: given}
-    assert worth(comparison._replace(stored_ratios=ratios)) == (
+    assert tuning_effect(comparison._replace(stored_ratios=ratios)) == (
         "makes no significant difference on 2 seeds against the given filter, lowers the score by 26.0 % "
         "[25.9, 26.1] against the scaled default and by 50 % against the rule of thumb"
     )
-    said = worth(comparison._replace(stored_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
+    said = tuning_effect(comparison._replace(stored_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
     many = "by 20 % [10, 30] against the"
     assert said == f"lowers the score {many} given filter, {many} scaled default and {many} rule of thumb"
     blind = comparison._replace(tuned=found._replace(mean_squares=np.full((2, 2), np.nan)))
     gains = {GIVEN: Interval(1.0, 0.5, 1.5), SCALED: Interval(0.0, 0.0, 0.0), RULE: Interval(-2.0, -3.0, -1.0)}
-    assert worth(blind._replace(stored_gains=gains)) == (
+    assert tuning_effect(blind._replace(stored_gains=gains)) == (
         "changes the log-likelihood of a run by +1.00 [+0.50, +1.50] against the given filter, by +0.00 against "
         "the scaled default and by -2.00 [-3.00, -1.00] against the rule of thumb"
     )

@@ -13,7 +13,7 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.summary import sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
-from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.reporting import report as reports
 from tuning.reporting.report import write_report
 from tuning.reporting.tables import errors_table, numbers_table
@@ -33,7 +33,7 @@ def test_a_comparison_reads_as_it_was(tmp_path, scenario):
     assert metrics(found) == metrics(fresh) and found.ratios == fresh.ratios
     assert errors_table(problem, found) == errors_table(problem, fresh)
     assert numbers_table(choice, problem, 0, found.default) == numbers_table(choice, problem, 0)
-    assert worth(found) == worth(fresh) and scaling_sentence(found) == scaling_sentence(fresh)
+    assert tuning_effect(found) == tuning_effect(fresh) and scaling_sentence(found) == scaling_sentence(fresh)
     assert found.default.choice == fresh.default.choice
 
 

@@ -366,7 +366,7 @@ def contenders_of(
     for one in filters:
         if isinstance(one, Study):
             choice = sized(one.choice, size_of(one.choice.name))
-            label, suit = f"{label_of(choice.name)} tuned", partial(suited, kept=constants_in(one.problem))
+            label, suit = f"{label_of(choice.name)} tuned", partial(suited, constants=constants_in(one.problem))
             out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
         elif is_own(one):
             label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"

@@ -23,7 +23,7 @@ from tuning.api.progress import console_for
 from tuning.api.run import Tuning, aim_of, run_tuning, with_budget
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.tuned import check_keepable
-from tuning.evaluation.worth import worth
+from tuning.evaluation.worth import tuning_effect
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.augmented import augmented, unknowns_of
 from tuning.problems.problem import Problem, score_label
@@ -204,8 +204,10 @@ class Study:
         said = f"Study({label_of(self.choice.name)} on {names}, {result.finished} trials"
         ended = ", interrupted" if self.interrupted else ""
         if not self.tuning.comparison.tuned.has_truth:
-            return f"{said}{ended}: tuning {worth(self.tuning.comparison)})"
-        return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.comparison)})"
+            return f"{said}{ended}: tuning {tuning_effect(self.tuning.comparison)})"
+        return (
+            f"{said}{ended}: score {about(self.held_out.score)}; tuning {tuning_effect(self.tuning.comparison)})"
+        )
 
     def __str__(self) -> str:
         """The choice and its reason, a summary line, and the tables of its held-out evaluations."""
@@ -218,7 +220,7 @@ class Study:
         found = self.held_out
         rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
         numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *found.choices], rows)
-        said = " ".join([*self.tuning.chosen, f"Tuning {worth(self.tuning.comparison)}."])
+        said = " ".join([*self.tuning.chosen, f"Tuning {tuning_effect(self.tuning.comparison)}."])
         return numbers + found._repr_html_() + f"<p>{escape(said)}</p>"
 
 

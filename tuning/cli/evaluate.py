@@ -34,7 +34,7 @@ from tuning.cli.options import (
 from tuning.cli.output import announce_compilation, check_picture, emit, progress_console, working
 from tuning.cli.problems import PROBLEMS
 from tuning.cli.tables import choice_table
-from tuning.evaluation.baselines import GIVEN, ORACLE, TUNED, given
+from tuning.evaluation.baselines import GIVEN, ORACLE, TUNED, given_noise
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
@@ -197,7 +197,7 @@ def _given(name: str, problem: Problem) -> Choice:
     """The filter with the given Q and R of the problem's model; ValueError if there are none."""
     if not filter_type(name).has_covariance:
         raise ValueError(f"--given must be used with a filter that has a Q and R, but got {name}")
-    found = given(name, problem)
+    found = given_noise(name, problem)
     if found is None:
         raise ValueError(
             f"--given must be used with a problem whose model has a given Q and R, but got {problem.name}"

@@ -57,7 +57,7 @@ def rule_of_thumb(name: str, scenario: Problem) -> Choice:
     return untuned_choice(name, scenario)
 
 
-def given(name: str, scenario: Problem) -> Choice | None:
+def given_noise(name: str, scenario: Problem) -> Choice | None:
     """The filter with the given Q and R of the problem's model, which may be the plant's; None without."""
     return given_choice(name, scenario) if filter_type(name).has_covariance else None
 
@@ -74,23 +74,25 @@ def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | Non
     """
     if not filter_type(name).has_covariance:
         return None
-    found = noise_estimation(scenario, seed)
-    if found.process_cov is None or found.measurement_cov is None:
+    estimated = noise_estimation(scenario, seed)
+    if estimated.process_cov is None or estimated.measurement_cov is None:
         return None
     rule = rule_of_thumb(name, scenario)
     if scenario.parameters is None:
-        return with_covariances(rule, found.process_cov, found.measurement_cov)
-    projected = rule._replace(model={**rule.model, **nearest(scenario, found.process_cov, found.measurement_cov)})
+        return with_covariances(rule, estimated.process_cov, estimated.measurement_cov)
+    projected = rule._replace(
+        model={**rule.model, **nearest(scenario, estimated.process_cov, estimated.measurement_cov)}
+    )
     return None if same_filter(projected, rule) else projected
 
 
 def full_noise(name: str, scenario: Problem, seed: int = 0, *, with_r: bool = False) -> Choice | None:
     """Noise estimation of a problem with own parameters, and a full Q, or Q and R, which they cannot express."""
-    found, projected = noise_estimation(scenario, seed), noise_estimated(name, scenario, seed)
-    if scenario.parameters is None or found.process_cov is None:
+    estimated, projected = noise_estimation(scenario, seed), noise_estimated(name, scenario, seed)
+    if scenario.parameters is None or estimated.process_cov is None:
         return None
     start = _with_noise(projected or rule_of_thumb(name, scenario), scenario)
-    return with_covariances(start, found.process_cov, found.measurement_cov if with_r else None)
+    return with_covariances(start, estimated.process_cov, estimated.measurement_cov if with_r else None)
 
 
 def nearest(scenario: Problem, q: np.ndarray, r: np.ndarray) -> dict[str, float]:
@@ -111,8 +113,8 @@ def nearest(scenario: Problem, q: np.ndarray, r: np.ndarray) -> dict[str, float]
     """
     from scipy.optimize import minimize  # loads half of SciPy, for this line
 
-    start = {one.name: float(scenario.untuned[one.name]) for one in scenario.parameters or ()}
-    space = Coordinates([one for one in scenario.parameters or () if not one.integer])
+    start = {parameter.name: float(scenario.untuned[parameter.name]) for parameter in scenario.parameters or ()}
+    space = Coordinates([parameter for parameter in scenario.parameters or () if not parameter.integer])
     first = scenario.model(**scenario.untuned)
     pairs = ((q, first.process_noise_cov), (r, first.measurement_noise_cov))
     floors = [FLOOR * np.where(np.diag(s) > 0, np.diag(s), np.diag(c)) for s, c in pairs]
@@ -123,21 +125,21 @@ def nearest(scenario: Problem, q: np.ndarray, r: np.ndarray) -> dict[str, float]
         except ValueError:  # of a user's function
             return BEYOND
         covs = model.process_noise_cov, model.measurement_noise_cov
-        found = sum(map(_divergence, (q, r), covs, floors))
-        return found if found < BEYOND else BEYOND
+        total = sum(map(_divergence, (q, r), covs, floors))
+        return total if total < BEYOND else BEYOND
 
     at = space.start({name: value for name, value in start.items() if name in space.names})
     ends = list(zip(space.low, space.high, strict=True))
-    found = minimize(divergence, at, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-13, "gtol": 1e-7})
-    moved = dict(zip(space.names, np.abs(found.x - at) > UNMOVED, strict=True))
-    return start | {name: value for name, value in space.named(found.x).items() if moved[name]}
+    optimum = minimize(divergence, at, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-13, "gtol": 1e-7})
+    changed = dict(zip(space.names, np.abs(optimum.x - at) > UNMOVED, strict=True))
+    return start | {name: value for name, value in space.named(optimum.x).items() if changed[name]}
 
 
 def _divergence(s: np.ndarray, c: np.ndarray, floor: np.ndarray) -> float:
     """tr(C^-1 S) + log det C of matrices (n, n) with a floor (n,), in units of S, from which D differs by no C."""
     rows = floor > 0  # a state without noise in either
     scale = np.sqrt(floor[rows] / FLOOR)
-    s, c = (one[np.ix_(rows, rows)] / np.outer(scale, scale) + FLOOR * np.eye(len(scale)) for one in (s, c))
+    s, c = (matrix[np.ix_(rows, rows)] / np.outer(scale, scale) + FLOOR * np.eye(len(scale)) for matrix in (s, c))
     try:
         factor = np.linalg.cholesky(c)
     except np.linalg.LinAlgError:
@@ -203,8 +205,8 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0, ensemble_size: i
 
     first, exponent = excess(0.0), 0
     if not np.any(scenario.model(**rule.model).process_noise_cov):
-        said = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
-        return Scaled(None, None, None, said)
+        reason = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
+        return Scaled(None, None, None, reason)
     step = 1 if first > 0 else -1  # a larger Q lowers the NIS
     last = first
     while last * first > 0 and abs(exponent) < DECADES:
@@ -220,8 +222,8 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0, ensemble_size: i
     factor = float(f"{10.0**root:.{DIGITS}g}")
     nis = nis_at(factor)
     if abs(nis - 1.0) > CLOSE:
-        said = f"no factor on Q brings the mean NIS of {name} to 1: it jumps to {nis:.3g} with {factor:g}"
-        return Scaled(None, None, None, said)
+        reason = f"no factor on Q brings the mean NIS of {name} to 1: it jumps to {nis:.3g} with {factor:g}"
+        return Scaled(None, None, None, reason)
     return Scaled(scaled_rule(rule, scenario, factor), factor, nis)
 
 
@@ -231,8 +233,8 @@ def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
     if scenario.parameters is None:
         return larger
     model = scenario.model(**larger.model)
-    found = nearest(scenario, model.process_noise_cov, model.measurement_noise_cov)
-    return rule._replace(model={**rule.model, **found})
+    parameters = nearest(scenario, model.process_noise_cov, model.measurement_noise_cov)
+    return rule._replace(model={**rule.model, **parameters})
 
 
 def scaled(choice: Choice, factor: float) -> Choice:
@@ -277,11 +279,11 @@ def baselines(
         ensemble_size: N of all of them, `baseline_size` beside a choice; that of the rule of thumb if None.
     """
     scaled = (scaled_default(name, scenario, seed, ensemble_size) if default is None else default).choice
-    found = {GIVEN: given(name, scenario), SCALED: scaled, RULE: rule_of_thumb(name, scenario)}
-    if found[GIVEN] is not None and rule_label(scenario) == GIVEN:
-        del found[RULE]
-    found |= {NOISE: noise_estimated(name, scenario, seed), ORACLE: oracle(name, scenario)}
-    return {key: _with_size(choice, ensemble_size) for key, choice in found.items() if choice is not None}
+    choices = {GIVEN: given_noise(name, scenario), SCALED: scaled, RULE: rule_of_thumb(name, scenario)}
+    if choices[GIVEN] is not None and rule_label(scenario) == GIVEN:
+        del choices[RULE]
+    choices |= {NOISE: noise_estimated(name, scenario, seed), ORACLE: oracle(name, scenario)}
+    return {key: _with_size(choice, ensemble_size) for key, choice in choices.items() if choice is not None}
 
 
 def competing_baselines(
@@ -291,11 +293,11 @@ def competing_baselines(
 
     A model that came with the plant's own Q and R is compared with, held out, but a study does not know them.
     """
-    found = baselines(name, scenario, seed, ensemble_size=ensemble_size)
-    known = found.pop(ORACLE, None)
-    if known is not None and RULE in found and GIVEN in found and same_filter(found[GIVEN], known):
-        del found[GIVEN]
-    return found
+    choices = baselines(name, scenario, seed, ensemble_size=ensemble_size)
+    known = choices.pop(ORACLE, None)
+    if known is not None and RULE in choices and GIVEN in choices and same_filter(choices[GIVEN], known):
+        del choices[GIVEN]
+    return choices
 
 
 def same_filter(a: Choice, b: Choice) -> bool:

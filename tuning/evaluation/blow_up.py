@@ -20,12 +20,14 @@ def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None)
         dt: sample time [s], if there is one.
     """
     names = [channel.name for channel in filter_.model.measurements]
-    innovations, measurements = (data.late_scored(one) for one in (estimates.innovations, data.measurements))
+    innovations, measurements = (data.late_scored(values) for values in (estimates.innovations, data.measurements))
     return blow_up_sentence(innovations, measurements, names, dt)
 
 
 def blow_up_on(filter_: Filter, data: Data, dt: float | None) -> str:
     """`blow_up` of a filter on the first runs of some data."""
-    some = data.slice(0, RUNS)
-    said = [blow_up(filter_, estimates, one, dt) for one, estimates in estimates_in_parts(filter_, some)]
-    return next((one for one in said if one), "")
+    first_runs = data.slice(0, RUNS)
+    sentences = [
+        blow_up(filter_, estimates, part, dt) for part, estimates in estimates_in_parts(filter_, first_runs)
+    ]
+    return next((sentence for sentence in sentences if sentence), "")

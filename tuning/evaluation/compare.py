@@ -123,16 +123,16 @@ class Leaderboard(NamedTuple):
 
 def winners(board: Leaderboard) -> str:
     """The filters that are significantly better or worse than the first one."""
-    first, *others = board.rows
-    if not others:
+    first, *rest = board.rows
+    if not rest:
         return f"On {board.scenario.name} no other filter can be compared with {first.label}."
-    said = []
+    parts = []
     for verdict, words in VERDICTS.items():
-        names = [f"{row.label}{_doubt(row, first)}" for row in others if row.verdict == verdict]
+        names = [f"{row.label}{_doubt(row, first)}" for row in rest if row.verdict == verdict]
         if names:
-            said.append(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {words} {first.label}")
+            parts.append(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {words} {first.label}")
     by = "score" if first.evaluation.has_truth else "log-likelihood"
-    return f"By the {by} on {board.scenario.name}, {'; '.join(said)}."
+    return f"By the {by} on {board.scenario.name}, {'; '.join(parts)}."
 
 
 def _doubt(row: Row, first: Row) -> str:
@@ -184,9 +184,9 @@ def contender(
 
     unknown = unknown or {}
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(kind).untuned))] if kind.has_ensemble else []
-    others = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
+    options = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
-    label = " ".join([kind.label, *size, *others, *added])
+    label = " ".join([kind.label, *size, *options, *added])
     return Contender(label, chosen, unknown, known=knowing)
 
 
@@ -194,7 +194,7 @@ def _said(value) -> str:
     """A parameter's value: a word, a number, or several."""
     if isinstance(value, str):
         return value
-    return ", ".join(f"{one:g}" for one in np.ravel(value))
+    return ", ".join(f"{number:g}" for number in np.ravel(value))
 
 
 def sized(choice: Choice, ensemble_size: int | None) -> Choice:
@@ -228,13 +228,13 @@ def compare(
         ValueError: if there are no filters, two have the same label, or one cannot work on a scenario.
         KeyboardInterrupt: if it is interrupted before any row is done.
     """
-    labels = [one.label for one in contenders]
+    labels = [contender.label for contender in contenders]
     if not labels or len(set(labels)) < len(labels):
         raise ValueError(f"a comparison must be of different filters, but got {', '.join(labels) or 'none'}")
     boards: list[Leaderboard] = []
     interrupted = False
     # All filters are made before the first one runs, so that an error in the last one is raised at once.
-    teams = [(scenario, [one.filter(scenario) for one in contenders]) for scenario in scenarios]
+    teams = [(scenario, [contender.filter(scenario) for contender in contenders]) for scenario in scenarios]
     try:
         with stop_on_interrupt() as stopped:
             for scenario, filters in teams:
@@ -242,11 +242,11 @@ def compare(
                 data = data_of(scenario, chosen)
                 board = Leaderboard(scenario, chosen, scenario.bound(data), [])
                 boards.append(board)
-                for one, filter_ in zip(contenders, filters, strict=True):
-                    on_row(scenario, one.label)
-                    row = _row(one.label, filter_, data, board)
-                    source, note = one.origin(scenario)
-                    board.rows.append(row._replace(knows=source, note=note, beliefs=one.beliefs(scenario)))
+                for contender, filter_ in zip(contenders, filters, strict=True):
+                    on_row(scenario, contender.label)
+                    row = _row(contender.label, filter_, data, board)
+                    source, note = contender.origin(scenario)
+                    board.rows.append(row._replace(knows=source, note=note, beliefs=contender.beliefs(scenario)))
                     if stopped():
                         raise KeyboardInterrupt
     except KeyboardInterrupt:
@@ -282,18 +282,18 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
 
     The scale selects the states of log scores; None for none.
     """
-    seen = data.seen
-    few = seen.filter_keys[:2], seen.inputs[:2, :2], seen.measurements[:2, :3]
+    observed = data.seen
+    few = observed.filter_keys[:2], observed.inputs[:2, :2], observed.measurements[:2, :3]
     first = [np.ascontiguousarray(part) for part in few]
     for part in first:
         part.setflags(write=False)  # as the data's arrays: numba compiles again for writable ones
     run(filter_, *first)
-    found, seconds, started = [], 0.0, time.perf_counter()
-    for some, estimates in estimates_in_parts(filter_, data):
+    metrics, seconds, started = [], 0.0, time.perf_counter()
+    for runs, estimates in estimates_in_parts(filter_, data):
         seconds += time.perf_counter() - started
-        found.append(metrics_by_run(filter_, estimates, some, scale=scale))
+        metrics.append(metrics_by_run(filter_, estimates, runs, scale=scale))
         started = time.perf_counter()
-    return joined(found), seconds
+    return joined(metrics), seconds
 
 
 # Which filters can run on all problems of a comparison, which do so by default, and why others do not.
@@ -306,7 +306,7 @@ MOST_STATES = 6  # to which a thousand particles are spread by default: the numb
 
 def default_filters(problems: Sequence[Problem]) -> tuple[list[str], dict[str, str]]:
     """The filters of a comparison in which none is named, and by label why one is not among them."""
-    n, problem = max(((len(one.quantities.states), one.name) for one in problems), default=(0, ""))
+    n, problem = max(((len(problem.quantities.states), problem.name) for problem in problems), default=(0, ""))
     if n <= MOST_STATES:
         return list(DEFAULT_FILTERS), {}
     why = f"by default particles are for up to {MOST_STATES} states, but {problem} has {n} (--filter {PARTICLES})"
@@ -323,15 +323,15 @@ def fitting(names: Iterable[Any], problems: Sequence[Problem]) -> tuple[list[Any
     Raises:
         ValueError: for an estimator that does not accept a model, or cannot be read: only filters are left out.
     """
-    kept: list[Any] = []
+    accepted: list[Any] = []
     left_out: dict[str, str] = {}
     for name in names:
         try:
             for problem in problems:
                 rule_of_thumb(name, problem).filter(problem)
-            kept.append(name)
+            accepted.append(name)
         except ValueError as error:
             if not isinstance(name, str) or name not in FILTERS:
                 raise
             left_out[label_of(name)] = str(error)
-    return kept, left_out
+    return accepted, left_out

@@ -78,8 +78,8 @@ class Evaluation(NamedTuple):
     @property
     def scored_nees(self) -> dict[str, float]:
         """Mean e_i^2 / P_ii of each scored state by its label, expected value 1; empty if there is none."""
-        found = () if self.state_nees is None else self.state_nees.tolist()
-        return {self.states[i].short_label: found[i] for i in self.scored if found and not np.isnan(found[i])}
+        ratios = () if self.state_nees is None else self.state_nees.tolist()
+        return {self.states[i].short_label: ratios[i] for i in self.scored if ratios and not np.isnan(ratios[i])}
 
 
 def farthest(ratios: Iterable[float]) -> float:
@@ -110,22 +110,30 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     return with_restarts(compute_metrics(filter_, runs, data, scale), filter_, runs, data)
 
 
-def with_restarts(found: Evaluation, filter_: Filter, runs: RunMetrics, data: Data) -> Evaluation:
+def with_restarts(evaluation: Evaluation, filter_: Filter, runs: RunMetrics, data: Data) -> Evaluation:
     """An evaluation with the first restart, and why, if there is one: its run is stepped once more."""
     lost = np.flatnonzero(runs.divergences).tolist()
     if not lost:
-        return found
-    one, place = data.one(lost[0]), lost[0]
-    told = restarts_of(filter_, runs.divergences[place], one.filter_keys, one.inputs, one.measurements)
-    assert told is not None  # it has restarted
-    return found._replace(
-        restarts=told._replace(times=found.divergences, runs=len(lost), of_runs=len(runs.divergences), run=place)
+        return evaluation
+    run_data, index = data.one(lost[0]), lost[0]
+    restarts = restarts_of(
+        filter_, runs.divergences[index], run_data.filter_keys, run_data.inputs, run_data.measurements
+    )
+    assert restarts is not None  # it has restarted
+    return evaluation._replace(
+        restarts=restarts._replace(
+            times=evaluation.divergences, runs=len(lost), of_runs=len(runs.divergences), run=index
+        )
     )
 
 
 def restart_sentences(evaluations: Mapping[str, Evaluation]) -> list[str]:
     """Restarts of filters by name, a sentence a filter that restarted."""
-    return [f"{name}: {one.restarts.sentence}" for name, one in evaluations.items() if one.restarts]
+    return [
+        f"{name}: {evaluation.restarts.sentence}"
+        for name, evaluation in evaluations.items()
+        if evaluation.restarts
+    ]
 
 
 def values_of(filter_: Filter, data: Data, scale) -> Evaluation:
@@ -141,12 +149,12 @@ def compute_metrics(
     Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values,
     as do variances of NEES and NIS.
     """
-    some = runs.present[runs.present > 0]
+    counts = runs.present[runs.present > 0]
     nees_variance, nis_variance = variance_ratios(runs) if variances else (np.nan, np.nan)
     return Evaluation(
         **_errors(filter_, runs, data, scale, intervals),
         nis=mean_interval(runs.nis, intervals),
-        expected_nis=float(some.mean()) if some.size else np.nan,
+        expected_nis=float(counts.mean()) if counts.size else np.nan,
         channels=data.measurements.shape[-1],
         log_likelihood=float(runs.log_likelihoods.mean()),
         log_likelihoods=runs.log_likelihoods,
@@ -177,9 +185,11 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
             "state_nees": np.full(n, np.nan),
         }
     n, scale, weights = data.states.shape[-1], _checked(scale, data.states.shape[-1]), runs.weights
-    found = without_interval(score(mean_squares, scale, weights))
+    score_interval = without_interval(score(mean_squares, scale, weights))
     if intervals:
-        found = interval(found.value, _scores(np.sqrt(resampled_means(mean_squares, weights)), scale))
+        score_interval = interval(
+            score_interval.value, _scores(np.sqrt(resampled_means(mean_squares, weights)), scale)
+        )
     squares_of = runs.output_mean_squares.items()
     outputs = {symbol: rmse_intervals(squares, intervals, weights)[0] for symbol, squares in squares_of}
     return {
@@ -187,7 +197,7 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
         "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
         "rmse": rmse_intervals(mean_squares, intervals, weights),
         "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1)) if data.counted is None else _mean_there(start_up)),
-        "score": found,
+        "score": score_interval,
         "output_rmse": outputs,
         "nees": mean_interval(nees, intervals),
         "median_nees": float(np.nanmedian(nees)) if np.isfinite(nees).any() else np.nan,
@@ -199,9 +209,9 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
 
 def _mean_there(values: np.ndarray) -> np.ndarray:
     """Mean (n,) of values (B, T, n) without those that are NaN; NaN where there are no others."""
-    there = ~np.isnan(values)
-    counts = there.sum(axis=(0, 1))
-    return np.where(counts > 0, np.where(there, values, 0.0).sum(axis=(0, 1)) / np.maximum(counts, 1), np.nan)
+    known = ~np.isnan(values)
+    counts = known.sum(axis=(0, 1))
+    return np.where(counts > 0, np.where(known, values, 0.0).sum(axis=(0, 1)) / np.maximum(counts, 1), np.nan)
 
 
 def _checked(scale, n: int) -> np.ndarray:
@@ -224,18 +234,20 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
         dt: sample time [s], named in the report if the model blows up between samples.
     """
     model, members, first = filter_.model, None, data.first_scored
-    seen, states = data.seen, None if data.states is None else data.known_states
+    observed, states = data.seen, None if data.states is None else data.known_states
     n = model.n if data.states is None else data.states.shape[-1]
     if filter_.size and data.states is not None:
-        some = (part[:MEMBER_RUNS] for part in (seen.filter_keys, seen.inputs, seen.measurements))
-        members = record_members(filter_, *some, first=first, every=MEMBER_STEPS)
+        first_runs = (
+            part[:MEMBER_RUNS] for part in (observed.filter_keys, observed.inputs, observed.measurements)
+        )
+        members = record_members(filter_, *first_runs, first=first, every=MEMBER_STEPS)
     angles = model.shape.state_angles[:n]
     parts, blown = [], ""
-    for one, estimates in estimates_in_parts(filter_, data):
-        blown = blown or blow_up(filter_, estimates, one, dt)
-        own = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
-        parts.append(findings(own, one.states, one.measurements, first, angles, one.counted))
-    found = report_of(
+    for runs, estimates in estimates_in_parts(filter_, data):
+        blown = blown or blow_up(filter_, estimates, runs, dt)
+        of_plant = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
+        parts.append(findings(of_plant, runs.states, runs.measurements, first, angles, runs.counted))
+    report = report_of(
         joined(parts),
         states,
         members=members,
@@ -244,7 +256,7 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
         angles=angles,
         channels=[channel.label for channel in model.measurements],
     )
-    return found._replace(constants=tuple(getattr(model.constants, "_fields", ())), blown=blown)
+    return report._replace(constants=tuple(getattr(model.constants, "_fields", ())), blown=blown)
 
 
 def score(mean_squares: np.ndarray, scale: np.ndarray, weights: np.ndarray | None = None) -> float:
@@ -287,7 +299,7 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
 def median_score_ratio(a: Evaluation, b: Evaluation) -> float:
     """Median over runs of the ratio of the run's scores, which a few runs do not dominate; NaN without truth."""
     _check_paired(a, b)
-    scores = [_scores(np.sqrt(one.mean_squares), one.scale) for one in (a, b)]
+    scores = [_scores(np.sqrt(evaluation.mean_squares), evaluation.scale) for evaluation in (a, b)]
     return float(np.median(scores[0] / scores[1]))
 
 

@@ -62,11 +62,11 @@ class Comparison(NamedTuple):
     @property
     def evaluations(self) -> dict[str, Evaluation]:
         """All evaluations by the names in tables, in the order of the rows."""
-        found = {GIVEN: self.given, RULE: self.untuned, SCALED: self.scaled, NOISE: self.noise}
-        found |= {TUNED: self.tuned, ORACLE: self.true}
+        by_name = {GIVEN: self.given, RULE: self.untuned, SCALED: self.scaled, NOISE: self.noise}
+        by_name |= {TUNED: self.tuned, ORACLE: self.true}
         if self.rule == GIVEN:
-            del found[RULE]
-        return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
+            del by_name[RULE]
+        return {name: evaluation for name, evaluation in by_name.items() if evaluation is not None}
 
     @property
     def baselines(self) -> tuple[str, ...]:
@@ -86,16 +86,16 @@ class Comparison(NamedTuple):
         """Score of the tuned filter over that of each baseline, paired, the most important baseline first."""
         if self.stored_ratios is not None:
             return dict(self.stored_ratios)
-        found = self.evaluations
-        return {name: score_ratio(self.tuned, found[name]) for name in self.baselines}
+        evaluations = self.evaluations
+        return {name: score_ratio(self.tuned, evaluations[name]) for name in self.baselines}
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
         """Log-likelihood of a run of the tuned filter minus that of each baseline; it needs no truth."""
         if self.stored_gains is not None:
             return dict(self.stored_gains)
-        found = self.evaluations
-        return {name: likelihood_gain(self.tuned, found[name]) for name in self.baselines}
+        evaluations = self.evaluations
+        return {name: likelihood_gain(self.tuned, evaluations[name]) for name in self.baselines}
 
 
 def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
@@ -123,11 +123,11 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         "noise": known.get(NOISE),
     }
     done: list[tuple[Choice, Evaluation]] = []
-    for one in with_progress("filters on held-out seeds", list(choices.values())):
-        if one is not None and _found(one, done) is None:  # baselines may be the same filter
-            done.append((one, evaluate(one.filter(scenario), data, scenario.scale)))
-    found = {role: None if one is None else _found(one, done) for role, one in choices.items()}
-    untuned, tuned = found.pop("untuned"), found.pop("tuned")
+    for candidate in with_progress("filters on held-out seeds", list(choices.values())):
+        if candidate is not None and _found(candidate, done) is None:  # baselines may be the same filter
+            done.append((candidate, evaluate(candidate.filter(scenario), data, scenario.scale)))
+    evaluations = {role: None if choice is None else _found(choice, done) for role, choice in choices.items()}
+    untuned, tuned = evaluations.pop("untuned"), evaluations.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
     constants = time_constants_on(choice.filter(scenario), scenario, seed)
     if constants is not None:
@@ -141,14 +141,14 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     return Comparison(
         untuned,
         tuned,
-        found["true"],
+        evaluations["true"],
         bound,
         seeds,
-        found["scaled"],
+        evaluations["scaled"],
         default,
         rule=rule,
-        given=found["given"],
-        noise=found["noise"],
+        given=evaluations["given"],
+        noise=evaluations["noise"],
         lacks_ranges=lacks,
         over_regression=over_regression,
     )

@@ -14,7 +14,7 @@ from tuning.evaluation.baselines import (
     RULE,
     SCALED,
     competing_baselines,
-    given,
+    given_noise,
     noise_estimated,
     oracle,
     rule_of_thumb,
@@ -96,15 +96,15 @@ def known(
             return _named("true", name, problem, seed, trials, ensemble_size)
         studied = _studied(name, problem, seed, trials, ensemble_size)
         return studied._replace(note=f"Model and plant differ: {error}.") if studied.source else studied
-    found = scaled_default(name, problem, seed, ensemble_size)
-    if found.choice is not None:
-        return Known(found.choice, "scaled")
-    others = {"given": given(name, problem), "noise": noise_estimated(name, problem, seed)}
-    others["untuned"] = rule_of_thumb(name, problem)
-    source, choice = next((key, one) for key, one in others.items() if one is not None)
+    default = scaled_default(name, problem, seed, ensemble_size)
+    if default.choice is not None:
+        return Known(default.choice, "scaled")
+    choices = {"given": given_noise(name, problem), "noise": noise_estimated(name, problem, seed)}
+    choices["untuned"] = rule_of_thumb(name, problem)
+    source, choice = next((key, candidate) for key, candidate in choices.items() if candidate is not None)
     if not filter_type(name).has_covariance:
         return Known(choice, "")
-    return Known(choice, source, f"There is no scaled default: {found.reason}.")
+    return Known(choice, source, f"There is no scaled default: {default.reason}.")
 
 
 def _named(knows: str, name: Any, problem: Problem, seed: int, trials: int, ensemble_size: int | None) -> Known:
@@ -114,14 +114,17 @@ def _named(knows: str, name: Any, problem: Problem, seed: int, trials: int, ense
     if knows == "untuned":
         return Known(rule_of_thumb(name, problem), knows)
     if knows == "scaled":
-        found = scaled_default(name, problem, seed, ensemble_size)
-        if found.choice is None:
-            raise ValueError(f"{name} must have a scaled default on {problem.name}, but {found.reason}")
-        return Known(found.choice, knows)
+        default = scaled_default(name, problem, seed, ensemble_size)
+        if default.choice is None:
+            raise ValueError(f"{name} must have a scaled default on {problem.name}, but {default.reason}")
+        return Known(default.choice, knows)
     if knows == "noise":
         choice, rule = noise_estimated(name, problem, seed), "noise estimation needs true states of all states"
     elif knows == "given":
-        choice, rule = given(name, problem), "given Q and R must be those of a user's model or of its parameters"
+        choice, rule = (
+            given_noise(name, problem),
+            "given Q and R must be those of a user's model or of its parameters",
+        )
     else:
         choice, rule = oracle(name, problem), "an oracle must know the plant's Q and R"
     if choice is None:
@@ -148,13 +151,13 @@ def _studied(name: Any, problem: Problem, seed: int, trials: int, ensemble_size:
         study = open_study(STUDY, plan)
         if run_trials(study, plan, data, trials):
             raise KeyboardInterrupt
-    found = {OF_BASELINE[key]: one for key, one in competing_baselines(name, problem, seed, size).items()}
+    choices = {OF_BASELINE[key]: choice for key, choice in competing_baselines(name, problem, seed, size).items()}
     best = best_trial(study.trials)
     if best is not None:
-        found[STUDY] = plan.choice_of(best.params)
-    values = {key: measured(choice, plan, data).value for key, choice in found.items()}
+        choices[STUDY] = plan.choice_of(best.params)
+    values = {key: measured(choice, plan, data).value for key, choice in choices.items()}
     source = min(values, key=lambda key: values[key])
-    return Known(found[source], source if kind.has_covariance else "")
+    return Known(choices[source], source if kind.has_covariance else "")
 
 
 def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:

@@ -32,7 +32,7 @@ def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Da
     Returns:
         The mean over all scored measurements; NaN for a filter without a covariance, or if there are too few rows.
     """
-    angles = [is_angle(place, model.shape.measurement_angles) for place in range(model.m)]
+    angles = [is_angle(i, model.shape.measurement_angles) for i in range(model.m)]
     densities = log_densities(training, data, np.array(angles))
     scored = np.where(data.scored[..., None], densities, np.nan)
     counts = np.isfinite(scored).sum(axis=(1, 2))
@@ -61,8 +61,8 @@ def log_densities(training: Data, data: Data, angles: np.ndarray) -> np.ndarray:
         data: runs whose densities are returned.
         angles: (m,) bool, which channels are angles.
     """
-    seen, m = training.seen, training.measurements.shape[-1]
-    (z_mean, z_std), (u_mean, u_std) = map(_mean_and_std, (seen.measurements, seen.inputs))
+    observed, m = training.seen, training.measurements.shape[-1]
+    (z_mean, z_std), (u_mean, u_std) = map(_mean_and_std, (observed.measurements, observed.inputs))
 
     def rows_of(runs: Data) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         z, u = _continued(runs.seen.measurements, angles), runs.seen.inputs
@@ -72,27 +72,27 @@ def log_densities(training: Data, data: Data, angles: np.ndarray) -> np.ndarray:
             for z_run, u_run, measured in zip(z, u, runs.seen.measurements, strict=True)
         ]
 
-    known, others, found = rows_of(training), rows_of(data), np.full(data.measurements.shape, np.nan)
+    known, rows, densities = rows_of(training), rows_of(data), np.full(data.measurements.shape, np.nan)
     for i in range(m):
         regression = _fitted(known, i)
         if regression is None:
-            return np.full(found.shape, np.nan)
+            return np.full(densities.shape, np.nan)
         columns, weights, variance = regression
-        for b, (past, z, measured) in enumerate(others):
+        for b, (past, z, measured) in enumerate(rows):
             expected = np.hstack([past, z[:, :i]])[:, columns] @ weights
             begun = np.isfinite(expected)
             squares = np.where(begun, (z[:, i] - expected) ** 2 / variance, z[:, i] ** 2)
             logarithm = math.log(2.0 * math.pi * z_std[i] ** 2) + np.where(begun, math.log(variance), 0.0)
-            found[b, :, i] = np.where(measured[:, i], -0.5 * (logarithm + squares), np.nan)
-    return found
+            densities[b, :, i] = np.where(measured[:, i], -0.5 * (logarithm + squares), np.nan)
+    return densities
 
 
 def _mean_and_std(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of each column of values (B, T, n); 0 and 1 where there is neither."""
-    there = np.isfinite(values)
-    counts = np.maximum(there.sum(axis=(0, 1)), 1)
-    mean = np.where(there, values, 0.0).sum(axis=(0, 1)) / counts
-    std = np.sqrt((np.where(there, values - mean, 0.0) ** 2).sum(axis=(0, 1)) / counts)
+    known = np.isfinite(values)
+    counts = np.maximum(known.sum(axis=(0, 1)), 1)
+    mean = np.where(known, values, 0.0).sum(axis=(0, 1)) / counts
+    std = np.sqrt((np.where(known, values - mean, 0.0) ** 2).sum(axis=(0, 1)) / counts)
     return mean, np.where(std > 0.0, std, 1.0)
 
 
@@ -100,18 +100,18 @@ def _continued(z: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Measurements (B, T, m), the last value where one is missing, NaN before the first; angles without jumps."""
     times = np.where(np.isnan(z), -1, np.arange(z.shape[1])[:, None])
     last = np.maximum.accumulate(times, axis=1)
-    found = np.where(last < 0, np.nan, np.take_along_axis(z, np.maximum(last, 0), axis=1))
+    continued = np.where(last < 0, np.nan, np.take_along_axis(z, np.maximum(last, 0), axis=1))
     for i in np.flatnonzero(angles):
-        found[..., i] = np.where(last[..., i] < 0, np.nan, np.unwrap(np.nan_to_num(found[..., i]), axis=1))
-    return found
+        continued[..., i] = np.where(last[..., i] < 0, np.nan, np.unwrap(np.nan_to_num(continued[..., i]), axis=1))
+    return continued
 
 
 def _past(z: np.ndarray, u: np.ndarray) -> np.ndarray:
     """1, then z and u of the last rows, (T, 1 + 8 (m + p)), from z (T, m) and u (T - 1, p); NaN before these."""
-    found = np.full((len(z), ORDERS[-1], z.shape[1] + u.shape[1]), np.nan)
+    lagged = np.full((len(z), ORDERS[-1], z.shape[1] + u.shape[1]), np.nan)
     for lag in range(1, ORDERS[-1] + 1):
-        found[lag:, lag - 1] = np.hstack([z[:-lag], u[: max(len(u) + 1 - lag, 0)]])
-    return np.hstack([np.ones((len(z), 1)), found.reshape(len(z), -1)])
+        lagged[lag:, lag - 1] = np.hstack([z[:-lag], u[: max(len(u) + 1 - lag, 0)]])
+    return np.hstack([np.ones((len(z), 1)), lagged.reshape(len(z), -1)])
 
 
 def _fitted(runs: list, i: int) -> tuple[list[int], np.ndarray, float] | None:

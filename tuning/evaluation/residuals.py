@@ -56,22 +56,24 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
     """
     states = np.ascontiguousarray(data.known_states[:, data.late])
     inputs = np.ascontiguousarray(data.inputs[:, data.late], dtype=np.float64)
-    expected, seen = predicted(model, states, inputs)
+    expected, outputs = predicted(model, states, inputs)
     shape, measured = model.shape, data.late_scored(data.measurements)
     process = difference(states[:, 1:], expected, shape.state_angles)
-    measurement = difference(measured, seen, shape.measurement_angles)
-    there = [np.isfinite(one).all(axis=-1) for one in (process, measurement)]
-    both = [one[:, :-1] & one[:, 1:] for one in there]
-    pairs = [(one[:, :-1][mask], one[:, 1:][mask]) for one, mask in zip((process, measurement), both, strict=True)]
-    return Residuals(process[there[0]], measurement[there[1]], *pairs)
+    measurement = difference(measured, outputs, shape.measurement_angles)
+    complete = [np.isfinite(rows).all(axis=-1) for rows in (process, measurement)]
+    both = [mask[:, :-1] & mask[:, 1:] for mask in complete]
+    pairs = [
+        (rows[:, :-1][mask], rows[:, 1:][mask]) for rows, mask in zip((process, measurement), both, strict=True)
+    ]
+    return Residuals(process[complete[0]], measurement[complete[1]], *pairs)
 
 
 def predicted(model: StateSpaceModel, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, m)."""
-    expected, seen = np.empty_like(states[:, 1:]), np.empty((*states.shape[:2], model.m))
+    expected, outputs = np.empty_like(states[:, 1:]), np.empty((*states.shape[:2], model.m))
     steps = _steps(model.functions, model.shape, is_interpreting())
-    steps(np.ascontiguousarray(states), inputs, model.numbers, expected, seen)
-    return expected, seen
+    steps(np.ascontiguousarray(states), inputs, model.numbers, expected, outputs)
+    return expected, outputs
 
 
 @lru_cache(maxsize=16)
@@ -93,17 +95,17 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
         return Estimated(reason="there is no truth")
     if data.known_states.shape[-1] != model.n:
         return Estimated(reason=f"of the model's {model.n} states only {data.known_states.shape[-1]} are known")
-    found = residuals(model, data)
-    for rows, what in zip(found[:2], ("states", "channels"), strict=True):
+    model_residuals = residuals(model, data)
+    for rows, what in zip(model_residuals[:2], ("states", "channels"), strict=True):
         if len(rows) < FEWEST * rows.shape[1]:
             return Estimated(reason=f"there are too few steps at which all {what} are known")
-    q, r = (np.atleast_2d(np.cov(rows, rowvar=False)) for rows in found[:2])
+    q, r = (np.atleast_2d(np.cov(rows, rowvar=False)) for rows in model_residuals[:2])
     if (np.sqrt(np.diag(q)) <= ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))).all():
         q = np.zeros_like(q)
     if not _is_regular(r):
         return Estimated(reason="the measurements have no noise")
-    means = (rows.mean(axis=0) for rows in found[:2])
-    return Estimated(q, r, *means, *(_correlation(rows) for rows in found[2:]))
+    means = (rows.mean(axis=0) for rows in model_residuals[:2])
+    return Estimated(q, r, *means, *(_correlation(rows) for rows in model_residuals[2:]))
 
 
 @lru_cache(maxsize=16)
@@ -123,11 +125,19 @@ def model_error(problem: Problem, seed: int = 0) -> str:
     model, data = problem.model(**problem.true), data_of(problem, problem.training_seeds(seed, TRAINING_SEEDS))
     if data.states is None or data.known_states.shape[-1] != model.n:
         return ""
-    found = residuals(model, data)
+    model_residuals = residuals(model, data)
     rounding = ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))
-    errors = _errors(model.states, np.diag(model.process_noise_cov), found.process, found.process_pairs, rounding)
+    errors = _errors(
+        model.states,
+        np.diag(model.process_noise_cov),
+        model_residuals.process,
+        model_residuals.process_pairs,
+        rounding,
+    )
     variances = np.diag(model.measurement_noise_cov)
-    errors |= _errors(model.measurements, variances, found.measurement, found.measurement_pairs, 0.0)
+    errors |= _errors(
+        model.measurements, variances, model_residuals.measurement, model_residuals.measurement_pairs, 0.0
+    )
     return errors[max(errors)] if errors else ""
 
 
@@ -155,7 +165,7 @@ def _correlation(pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Correlation of each component of residuals (N, n) with that a step later, (n,); 0 where nothing varies."""
     if len(pairs[0]) < FEWEST:  # channels that are never measured at two steps in a row
         return np.zeros(pairs[0].shape[1])
-    now, later = (one - one.mean(axis=0) for one in pairs)
+    now, later = (values - values.mean(axis=0) for values in pairs)
     spread = np.sqrt((now**2).sum(axis=0) * (later**2).sum(axis=0))
     return np.divide((now * later).sum(axis=0), spread, out=np.zeros(now.shape[1]), where=spread > 0)
 
@@ -167,14 +177,14 @@ def _is_regular(cov: np.ndarray) -> bool:
 
 @lru_cache(maxsize=64)
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
-    """The function steps(states, inputs, numbers, expected, seen) that evaluates f and h along true states."""
+    """The function steps(states, inputs, numbers, expected, outputs) that evaluates f and h along true states."""
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     substeps = number_places(n, m).substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
     fingerprint = function_fingerprint(transition, observe, within=__name__)
 
-    def steps(states, inputs, numbers, expected, seen):
+    def steps(states, inputs, numbers, expected, outputs):
         fingerprint  # noqa: B018 - part of the cache's key
         x, z, u, c = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), constants(numbers)
         for b in range(states.shape[0]):
@@ -183,7 +193,7 @@ def _steps(functions: Functions, shape: Shape, interpreting: bool):
                     x[i] = states[b, k, i]
                 store_measurement(z, observe(state(x), c))
                 for i in range(m):
-                    seen[b, k, i] = z[i]
+                    outputs[b, k, i] = z[i]
                 if k < expected.shape[1]:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k, i]

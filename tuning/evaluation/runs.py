@@ -41,15 +41,15 @@ def log_scores_of(
     """
     if data.states is None or scale is None or not filter_.has_covariance:
         return np.full(data.measurements[:, data.late].shape[:2], np.nan)
-    places, late = np.flatnonzero(np.isfinite(scale)), data.late
-    angles = [is_angle(place, filter_.model.shape.state_angles) for place in places.tolist()]
-    covs = estimates.covs[:, late][..., places[:, None], places]
+    indices, late = np.flatnonzero(np.isfinite(scale)), data.late
+    angles = [is_angle(index, filter_.model.shape.state_angles) for index in indices.tolist()]
+    covs = estimates.covs[:, late][..., indices[:, None], indices]
     with np.errstate(all="ignore"):
-        errors = difference(estimates.means[:, late][..., places], data.states[:, late][..., places], angles)
+        errors = difference(estimates.means[:, late][..., indices], data.states[:, late][..., indices], angles)
         logarithms, squares = np.linalg.slogdet(covs)[1], sums_of_squares(whitened(errors, covs))
-        found = -0.5 * (len(places) * math.log(2.0 * math.pi) + logarithms + squares)
-    found = np.where(np.isfinite(found), np.maximum(found, LEAST), LEAST)
-    return np.where(data.scored[:, late], found, np.nan)
+        scores = -0.5 * (len(indices) * math.log(2.0 * math.pi) + logarithms + squares)
+    scores = np.where(np.isfinite(scores), np.maximum(scores, LEAST), LEAST)
+    return np.where(data.scored[:, late], scores, np.nan)
 
 
 FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
@@ -101,13 +101,19 @@ def metrics_by_run(
     if filter_.has_covariance:
         likelihoods = _sums(data, estimates.log_likelihoods)
     nis = np.where(present > 0, squares, np.nan)
-    found = RunMetrics(nis, present, likelihoods, estimates.divergences, None, None, None, {}, data.scored_counts)
+    metrics = RunMetrics(
+        nis, present, likelihoods, estimates.divergences, None, None, None, {}, data.scored_counts
+    )
     if scale is not None:
-        found = found._replace(log_scores=log_scores_of(filter_, estimates, data, scale))
+        metrics = metrics._replace(log_scores=log_scores_of(filter_, estimates, data, scale))
     if data.states is None:
-        return found
-    found = found._replace(**_against_truth(filter_, estimates, data, nees))
-    return found._replace(output_mean_squares=_output_mean_squares(filter_, estimates, data)) if outputs else found
+        return metrics
+    metrics = metrics._replace(**_against_truth(filter_, estimates, data, nees))
+    return (
+        metrics._replace(output_mean_squares=_output_mean_squares(filter_, estimates, data))
+        if outputs
+        else metrics
+    )
 
 
 def metrics_of_all(
@@ -119,26 +125,28 @@ def metrics_of_all(
 ) -> RunMetrics:
     """`metrics_by_run` of a filter on all runs of some data, in parts: the same as for all at once."""
     parts = estimates_in_parts(filter_, data)
-    return joined([metrics_by_run(filter_, found, some, nees, outputs, scale) for some, found in parts])
+    return joined([metrics_by_run(filter_, estimates, part, nees, outputs, scale) for part, estimates in parts])
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
     """The metrics of all runs of a filter, from those of consecutive parts."""
     if len(parts) == 1:
         return parts[0]
-    outputs = [one.output_mean_squares for one in parts]
+    outputs = [part.output_mean_squares for part in parts]
     return RunMetrics(
-        nis=np.concatenate([one.nis for one in parts]),
-        present=np.concatenate([one.present for one in parts]),
-        log_likelihoods=np.concatenate([one.log_likelihoods for one in parts]),
-        divergences=np.concatenate([one.divergences for one in parts]),
-        mean_squares=_concatenated([one.mean_squares for one in parts]),
-        start_up_squares=_concatenated([one.start_up_squares for one in parts]),
-        nees=_concatenated([one.nees for one in parts]),
-        output_mean_squares={symbol: np.concatenate([one[symbol] for one in outputs]) for symbol in outputs[0]},
-        counts=np.concatenate([one.counts for one in parts]),
-        log_scores=_concatenated([one.log_scores for one in parts]),
-        state_nees=_concatenated([one.state_nees for one in parts]),
+        nis=np.concatenate([part.nis for part in parts]),
+        present=np.concatenate([part.present for part in parts]),
+        log_likelihoods=np.concatenate([part.log_likelihoods for part in parts]),
+        divergences=np.concatenate([part.divergences for part in parts]),
+        mean_squares=_concatenated([part.mean_squares for part in parts]),
+        start_up_squares=_concatenated([part.start_up_squares for part in parts]),
+        nees=_concatenated([part.nees for part in parts]),
+        output_mean_squares={
+            symbol: np.concatenate([squares[symbol] for squares in outputs]) for symbol in outputs[0]
+        },
+        counts=np.concatenate([part.counts for part in parts]),
+        log_scores=_concatenated([part.log_scores for part in parts]),
+        state_nees=_concatenated([part.state_nees for part in parts]),
     )
 
 
@@ -157,13 +165,13 @@ def variance_ratios(runs: RunMetrics) -> tuple[float, float]:
 
 def _variance_over_steps(values: np.ndarray) -> float:
     """Variance of values (B, T) over each run's steps that are not NaN, mean over runs that have two of them."""
-    there = ~np.isnan(values)
-    several = there.sum(axis=1) > 1
-    there, counts = there[several], there[several].sum(axis=1)
+    present = ~np.isnan(values)
+    several = present.sum(axis=1) > 1
+    present, counts = present[several], present[several].sum(axis=1)
     if not counts.size:
         return np.nan
-    means = np.where(there, values[several], 0.0).sum(axis=1) / counts
-    squares = np.where(there, values[several] - means[:, None], 0.0) ** 2
+    means = np.where(present, values[several], 0.0).sum(axis=1) / counts
+    squares = np.where(present, values[several] - means[:, None], 0.0) ** 2
     return float((squares.sum(axis=1) / (counts - 1)).mean())
 
 
@@ -211,16 +219,20 @@ def _state_nees(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
 
 def _sums(data: Data, values: np.ndarray) -> np.ndarray:
     """Sums (B,) of values (B, K + 1) over each run's scored steps."""
-    found = data.late_scored(values)
-    return found.sum(axis=1) if data.counted is None else np.where(np.isnan(found), 0.0, found).sum(axis=1)
+    late_values = data.late_scored(values)
+    return (
+        late_values.sum(axis=1)
+        if data.counted is None
+        else np.where(np.isnan(late_values), 0.0, late_values).sum(axis=1)
+    )
 
 
 def _means(data: Data, values: np.ndarray) -> np.ndarray:
     """Means (B, n) of late values (B, T, n) over each run's scored steps."""
     if data.counted is None:
         return _means_over_steps(values)
-    kept = where_true(data.counted[:, data.late], values, 0.0)
-    return kept.sum(axis=1) / np.maximum(data.scored_counts, 1)[:, None]
+    counted = where_true(data.counted[:, data.late], values, 0.0)
+    return counted.sum(axis=1) / np.maximum(data.scored_counts, 1)[:, None]
 
 
 def _means_over_steps(values: np.ndarray) -> np.ndarray:
@@ -232,7 +244,7 @@ def _means_over_steps(values: np.ndarray) -> np.ndarray:
 
 def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, np.ndarray]:
     """Mean square errors of each derived output that both the truth and the filter's model have."""
-    late, found = data.late, {}
+    late, mean_squares = data.late, {}
     for symbol, truth in (data.outputs or {}).items():
         if symbol not in filter_.model.outputs:
             continue
@@ -241,7 +253,7 @@ def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> d
         values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
         errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
         squares = errors**2
-        found[symbol] = (
+        mean_squares[symbol] = (
             squares.mean(axis=1, keepdims=True) if data.counted is None else _means(data, squares[..., None])
         )
-    return found
+    return mean_squares

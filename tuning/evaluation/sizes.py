@@ -58,10 +58,12 @@ def ensemble_sizes(
     if max(problem.model().n for problem in plan.scenarios) > ALL_UP_TO:
         return few_seeds_first(choice, plan, training, sizes, consistent)
     outside = [_outside(choice.with_size(n), plan, training) if plan.is_constrained else 0.0 for n in sizes]
-    tables = [_on(one, fresh, choice, sizes) for one, fresh in zip(plan.scenarios, plan.size_data(), strict=True)]
-    scores = np.mean([[one.score.value for one in found] for found in tables], axis=0).tolist()
+    tables = [
+        _on(problem, fresh, choice, sizes) for problem, fresh in zip(plan.scenarios, plan.size_data(), strict=True)
+    ]
+    scores = np.mean([[evaluation.score.value for evaluation in table] for table in tables], axis=0).tolist()
     among = _counting(outside, consistent, scores)
-    columns = [_over_the_best(found, among) for found in tables]
+    columns = [_over_the_best(table, among) for table in tables]
     count = len(plan.size_data()[0].seeds)
     return [
         SizeRow(n, tables[0][i], _worst(column[i] for column in columns), outside[i], count)
@@ -85,22 +87,22 @@ def few_seeds_first(
     of each patient", British J. Cancer 34, 585-612.
     """
     fresh = plan.size_data()
-    few = [one.slice(0, FEW) for one in fresh]
+    few = [part.slice(0, FEW) for part in fresh]
 
     def on(data: Sequence[Data], n: int) -> list[Evaluation]:
         pairs = zip(plan.scenarios, data, strict=True)
-        return [evaluate(choice.with_size(n).filter(one), some, one.scale) for one, some in pairs]
+        return [evaluate(choice.with_size(n).filter(problem), part, problem.scale) for problem, part in pairs]
 
     early = [on(few, n) for n in with_progress("N", sizes)]
 
     def on_all(i: int) -> list[Evaluation]:
-        return early[i] if all(len(one.seeds) <= FEW for one in fresh) else on(fresh, sizes[i])
+        return early[i] if all(len(part.seeds) <= FEW for part in fresh) else on(fresh, sizes[i])
 
-    outside = [max(map(nis_violation, found)) if plan.is_constrained else 0.0 for found in early]
+    outside = [max(map(nis_violation, evaluations)) if plan.is_constrained else 0.0 for evaluations in early]
     trained: set[int] = set()
 
     def best_ones() -> list[int]:
-        among = _counting(outside, consistent, [_score(found) for found in early])
+        among = _counting(outside, consistent, [_score(evaluations) for evaluations in early])
         return [min(among, key=lambda i: early[i][k].score.value) for k in range(len(fresh))]
 
     def train(i: int) -> None:
@@ -112,49 +114,54 @@ def few_seeds_first(
         for i in set(best_ones()):
             train(i)
     best = best_ones()
-    whole = {i: on_all(i) for i in with_progress("best N on all seeds", sorted(set(best)))}
+    on_all_seeds = {i: on_all(i) for i in with_progress("best N on all seeds", sorted(set(best)))}
     hopeful = [i for i in range(len(sizes)) if not _surely_worse(early[i], [early[b] for b in best])]
     for i in with_progress("smallest N on all seeds", hopeful):
-        if i not in whole:
+        if i not in on_all_seeds:
             train(i)
-            whole[i] = on_all(i)
-        ends = [ratio[i].high for ratio in _ratios_of(whole, _eligible(whole, outside, consistent))]
-        if i in _eligible(whole, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
+            on_all_seeds[i] = on_all(i)
+        ends = [ratio[i].high for ratio in _ratios_of(on_all_seeds, _eligible(on_all_seeds, outside, consistent))]
+        if i in _eligible(on_all_seeds, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
             break
-    over = _ratios_of(whole, _eligible(whole, outside, consistent))
+    over = _ratios_of(on_all_seeds, _eligible(on_all_seeds, outside, consistent))
     rows = []
     for i, n in enumerate(sizes):
-        if i in whole:
+        if i in on_all_seeds:
             ratio = _worst(ratios[i] for ratios in over)
-            rows.append(SizeRow(n, whole[i][0], ratio, outside[i], len(fresh[0].seeds)))
+            rows.append(SizeRow(n, on_all_seeds[i][0], ratio, outside[i], len(fresh[0].seeds)))
             continue
-        ratios = (score_ratio(found, early[b][k]) for k, (found, b) in enumerate(zip(early[i], best, strict=True)))
+        ratios = (
+            score_ratio(evaluation, early[b][k])
+            for k, (evaluation, b) in enumerate(zip(early[i], best, strict=True))
+        )
         rows.append(SizeRow(n, early[i][0], _worst(ratios), outside[i], len(few[0].seeds)))
     return rows
 
 
-def _ratios_of(whole: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) -> list[dict[int, Interval]]:
+def _ratios_of(results: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) -> list[dict[int, Interval]]:
     """For each scenario, scores of the sizes that were run on all seeds over the best of the eligible ones."""
-    places = list(whole)
-    columns = zip(*whole.values(), strict=True)
-    found = [_over_the_best(column, [places.index(i) for i in among]) for column in columns]
-    return [dict(zip(places, ratios, strict=True)) for ratios in found]
+    indices = list(results)
+    columns = zip(*results.values(), strict=True)
+    intervals = [_over_the_best(column, [indices.index(i) for i in among]) for column in columns]
+    return [dict(zip(indices, ratios, strict=True)) for ratios in intervals]
 
 
-def _eligible(whole: Mapping[int, Sequence[Evaluation]], outside: Sequence[float], consistent: bool) -> list[int]:
-    """The eligible sizes of `whole`."""
-    places, scores = list(whole), [_score(found) for found in whole.values()]
-    return [places[i] for i in _counting([outside[i] for i in places], consistent, scores)]
+def _eligible(
+    results: Mapping[int, Sequence[Evaluation]], outside: Sequence[float], consistent: bool
+) -> list[int]:
+    """The eligible sizes among the results."""
+    indices, scores = list(results), [_score(evaluations) for evaluations in results.values()]
+    return [indices[i] for i in _counting([outside[i] for i in indices], consistent, scores)]
 
 
-def _score(found: Sequence[Evaluation]) -> float:
+def _score(evaluations: Sequence[Evaluation]) -> float:
     """The mean score over some problems."""
-    return float(np.mean([one.score.value for one in found]))
+    return float(np.mean([evaluation.score.value for evaluation in evaluations]))
 
 
-def _surely_worse(found: Sequence[Evaluation], best: Sequence[Sequence[Evaluation]]) -> bool:
+def _surely_worse(evaluations: Sequence[Evaluation], best: Sequence[Sequence[Evaluation]]) -> bool:
     """Whether the score is significantly more than 1 % above the best on some scenario, after a few seeds."""
-    pairs = [(one, best[k][k]) for k, one in enumerate(found)]
+    pairs = [(evaluation, best[k][k]) for k, evaluation in enumerate(evaluations)]
     return any(np.quantile(resampled_ratios(*pair), SURE) > 1.0 + SIZE_TOLERANCE for pair in pairs)
 
 
@@ -198,7 +205,7 @@ def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
         means, variances = _scored(choice.with_size(sizes[-1]), scenario, data)
         likely = np.maximum(variances, np.finfo(float).tiny)
         excess = [((_scored(choice.with_size(n), scenario, data)[0] - means) ** 2 / likely).mean() for n in rest]
-        rest = [n for n, one in zip(rest, excess, strict=True) if one < limit]
+        rest = [n for n, error in zip(rest, excess, strict=True) if error < limit]
     return min(rest, default=sizes[-1])
 
 
@@ -206,7 +213,8 @@ def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, 
     """Means and variances of all scored steps, (steps, n) each."""
     parts = list(estimates_in_parts(choice.filter(scenario), data))
     means, covs = (
-        np.concatenate([some.scored_rows(getattr(one, name)) for some, one in parts]) for name in ("means", "covs")
+        np.concatenate([part.scored_rows(getattr(estimates, name)) for part, estimates in parts])
+        for name in ("means", "covs")
     )
     return means, np.einsum("kii->ki", covs)
 
@@ -223,10 +231,10 @@ def _counting(outside: Sequence[float], consistent: bool, scores: Sequence[float
     return inside
 
 
-def left_out(rows: Sequence[SizeRow], kept: int) -> list[int]:
-    """Sizes that were not eligible because of their mean NIS, if that of the kept one is in its band."""
+def left_out(rows: Sequence[SizeRow], chosen: int) -> list[int]:
+    """Sizes that were not eligible because of their mean NIS, if that of the chosen one is in its band."""
     outside = {row.size: row.outside for row in rows}
-    return [] if outside.get(kept, 1.0) > 0 else [size for size, found in outside.items() if found > 0]
+    return [] if outside.get(chosen, 1.0) > 0 else [size for size, distance in outside.items() if distance > 0]
 
 
 def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
@@ -238,9 +246,9 @@ def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> 
 def _outside(choice: Choice, plan: Plan, training: Sequence[Data]) -> float:
     """The mean NIS of a choice outside its band on the training data; the largest of several scenarios."""
     pairs = zip(plan.scenarios, training, strict=True)
-    return max(nis_violation(values_of(choice.filter(one), data, one.scale)) for one, data in pairs)
+    return max(nis_violation(values_of(choice.filter(problem), data, problem.scale)) for problem, data in pairs)
 
 
-def _over_the_best(found: Sequence[Evaluation], among: Sequence[int]) -> list[Interval]:
-    best = min((found[i] for i in among), key=lambda evaluation: evaluation.score.value)
-    return [score_ratio(evaluation, best) for evaluation in found]
+def _over_the_best(evaluations: Sequence[Evaluation], among: Sequence[int]) -> list[Interval]:
+    best = min((evaluations[i] for i in among), key=lambda evaluation: evaluation.score.value)
+    return [score_ratio(evaluation, best) for evaluation in evaluations]

@@ -34,7 +34,7 @@ def summary(evaluation: Evaluation) -> dict:
     return {
         "rmse": [numbers(value) for value in evaluation.rmse],
         "start_up_rmse": _plain(evaluation.start_up_rmse),
-        **{_key(evaluation.outputs[symbol]): numbers(one) for symbol, one in evaluation.output_rmse.items()},
+        **{_key(evaluation.outputs[symbol]): numbers(rmse) for symbol, rmse in evaluation.output_rmse.items()},
         "score": numbers(evaluation.score),
         "nees": numbers(evaluation.nees),
         "state_nees": _plain(evaluation.state_nees),
@@ -110,13 +110,13 @@ def _restarts(data: Mapping | None) -> Restarts | None:
     return Restarts(**counts, states=tuple(map(str, data["states"])), cause=str(data["cause"]))
 
 
-def _time_constants(found: TimeConstants) -> dict:
+def _time_constants(constants: TimeConstants) -> dict:
     """Time constants as plain numbers, None in place of an infinite one."""
-    steps = [part if math.isfinite(part) else None for part in (*found.steps, found.uptake)]
-    known = {name: value for name, value in found._asdict().items() if value is not None}
-    lists = {"steps": steps[:-1], "unobservable": list(found.unobservable)}
-    if found.oracle is not None:
-        lists["oracle"] = [part if math.isfinite(part) else None for part in found.oracle]
+    steps = [part if math.isfinite(part) else None for part in (*constants.steps, constants.uptake)]
+    known = {name: value for name, value in constants._asdict().items() if value is not None}
+    lists = {"steps": steps[:-1], "unobservable": list(constants.unobservable)}
+    if constants.oracle is not None:
+        lists["oracle"] = [part if math.isfinite(part) else None for part in constants.oracle]
     return {**known, **lists, "uptake": steps[-1]}
 
 
@@ -156,7 +156,7 @@ ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations 
 
 def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
     """The table of ensemble sizes of a choice as plain data, with a digest of its inputs."""
-    found = [
+    table = [
         {
             "N": row.size,
             "seeds": row.seeds,
@@ -166,7 +166,7 @@ def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
         }
         for row in rows
     ]
-    return {"digest": _digest_of_sizes(choice, plan), "rows": found}
+    return {"digest": _digest_of_sizes(choice, plan), "rows": table}
 
 
 def stored_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
@@ -197,21 +197,25 @@ def stored_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
 
 def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
     of_filter = {key: value for key, value in choice.numbers.items() if key != "ensemble_size"}
-    own = {one.name: choice.model.get(one.name) for one in plan.scenarios[0].parameters or ()}
+    parameters = {
+        parameter.name: choice.model.get(parameter.name) for parameter in plan.scenarios[0].parameters or ()
+    }
     model = plan.scenarios[0].model(**choice.model)  # a file may contain more of it than a trial
     noise = [model.process_noise_cov.tolist(), model.measurement_noise_cov.tolist(), model.prior_cov.tolist()]
-    of_problems = [one.digest for one in plan.scenarios], plan.consistent, plan.budget, plan.seed
+    of_problems = [problem.digest for problem in plan.scenarios], plan.consistent, plan.budget, plan.seed
     seeds = SIZE_SEEDS, TRAINING_SEEDS, size_ladder(choice.name)
-    text = json.dumps([choice.name, own, noise, of_filter, of_problems, seeds, versions()], sort_keys=True)
+    text = json.dumps([choice.name, parameters, noise, of_filter, of_problems, seeds, versions()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def comparison_as_data(comparison: Comparison) -> dict:
     """The data of a comparison that a report needs besides the metrics in a tuned file."""
-    found = {role: getattr(comparison, role) for role in ROLES}
+    by_role = {role: getattr(comparison, role) for role in ROLES}
     return {
         "expected_nis": _plain_numbers(comparison.tuned.expected_nis),
-        "median_nees": {role: one and _plain_numbers(one.median_nees) for role, one in found.items()},
+        "median_nees": {
+            role: evaluation and _plain_numbers(evaluation.median_nees) for role, evaluation in by_role.items()
+        },
         "score_ratios": {name: numbers(ratio) for name, ratio in comparison.ratios.items()},
         "likelihood_gains": {name: numbers(gain) for name, gain in comparison.likelihood_gains.items()},
         "over_regression": numbers(comparison.over_regression),
@@ -233,8 +237,8 @@ def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Com
         return None
     try:
         held_out, more = content["held_out"][problem.name], content["comparisons"][problem.name]
-        found = {role: _summarised(role, held_out, more, problem) for role in ROLES}
-        untuned, tuned = found["untuned"], found["tuned"]
+        by_role = {role: _summarised(role, held_out, more, problem) for role in ROLES}
+        untuned, tuned = by_role["untuned"], by_role["tuned"]
         if untuned is None or tuned is None:
             return None
         scaling, reason = held_out["scaled_default"], str(more["no_scaled_default"])
@@ -248,16 +252,16 @@ def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Com
         return Comparison(
             untuned,
             tuned,
-            found["true"],
-            scaled=found["scaled"],
+            by_role["true"],
+            scaled=by_role["scaled"],
             bound=np.array([math.nan if part is None else float(part) for part in held_out["bound"]]),
             seeds=range(first, beyond),
             default=default,
             stored_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
             stored_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
             rule=rule_label(problem),
-            given=found["given"],
-            noise=found["noise"],
+            given=by_role["given"],
+            noise=by_role["noise"],
             lacks_ranges=problem.lacks_ranges,
             over_regression=as_interval(more.get("over_regression")),
         )

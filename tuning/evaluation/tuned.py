@@ -89,7 +89,9 @@ def write_tuned(
         "digest": problem.digest,
         "model": model_data(model, problem.dt),
         "plant": problem.plant_data,
-        "problems": {one.name: _kept(one) for one in plan.scenarios if one.name not in built_in()},
+        "problems": {
+            scenario.name: _kept(scenario) for scenario in plan.scenarios if scenario.name not in built_in()
+        },
         "study": {
             "name": study_name,
             **plan.identity,
@@ -99,8 +101,8 @@ def write_tuned(
             "microseconds_a_step": result.microseconds,
             **consistency(result),
         },
-        "held_out": {problem.name: metrics(one) for problem, one in pairs},
-        "comparisons": {problem.name: comparison_as_data(one) for problem, one in pairs},
+        "held_out": {problem.name: metrics(comparison) for problem, comparison in pairs},
+        "comparisons": {problem.name: comparison_as_data(comparison) for problem, comparison in pairs},
         "monitor": _monitor_of(choice, plan),
         "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, result.sized or choice, plan) if result.sizes else None,
@@ -112,8 +114,8 @@ def _monitor_of(choice: Choice, plan: Plan) -> dict | None:
     """The monitor of a filter with a covariance, whose counts follow from the training runs; else None."""
     if not choice.filter(plan.scenarios[0]).has_covariance:
         return None
-    seen = plan.training_data()[0].seen.measurements
-    return monitor_data(monitor_for(seen), seen.shape[-1])
+    measurements = plan.training_data()[0].seen.measurements
+    return monitor_data(monitor_for(measurements), measurements.shape[-1])
 
 
 def check_keepable(name) -> None:
@@ -135,7 +137,7 @@ def _kept(problem: Problem) -> dict:
     return {"digest": problem.digest, "content": problem.as_mapping()}
 
 
-def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem] = ()) -> Problem:
+def problem_in(content: Mapping, name, path: str | Path, problems: Sequence[Problem] = ()) -> Problem:
     """A problem of a tuned file: built in, stored in the file, or given by the caller.
 
     Names in a file are never imported: a problem that is code has to be given. A file of version 2 has only the
@@ -145,30 +147,30 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
         content: content of the tuned file, from `read_tuned_file`.
         name: name of the problem.
         path: path of the tuned file, for errors.
-        given: problems of the caller, matched by name or digest.
+        problems: those of the caller, matched by name or digest.
 
     Raises:
         ValueError: if there is no such problem, the stored content is damaged, or the given problem is another
             one.
     """
-    kept = content["problems"].get(name) if isinstance(name, str) and name not in built_in() else None
-    digest = kept.get("digest") if isinstance(kept, Mapping) else None
-    given = given if digest is not None else ()
-    same = next((one for one in given if one.digest == digest), None)
+    stored = content["problems"].get(name) if isinstance(name, str) and name not in built_in() else None
+    digest = stored.get("digest") if isinstance(stored, Mapping) else None
+    problems = problems if digest is not None else ()
+    same = next((problem for problem in problems if problem.digest == digest), None)
     if same is not None:
         return same
-    for one in given:
-        if one.name == name:
+    for problem in problems:
+        if problem.name == name:
             raise ValueError(
                 f"the problem of a tuned file must be the one it was tuned on, {name} of digest {digest}, but "
-                f"here it has the digest {one.digest}; {path} was made with {made_with(content)}: has "
+                f"here it has the digest {problem.digest}; {path} was made with {made_with(content)}: has "
                 "that changed?"
             )
     plain, unknown = name_and_unknown(name) if digest is not None else (name, {})
-    mapping = kept.get("content") if isinstance(kept, Mapping) else kept
+    mapping = stored.get("content") if isinstance(stored, Mapping) else stored
     if unknown and isinstance(mapping, Mapping) and "of" in mapping:
         return augmented(
-            problem_in({"problem": plain, "problems": {plain: mapping.get("of")}}, plain, path, given), unknown
+            problem_in({"problem": plain, "problems": {plain: mapping.get("of")}}, plain, path, problems), unknown
         )
     if isinstance(mapping, Mapping) and "logs" in mapping:
         raise ValueError(
@@ -210,26 +212,26 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
     content = read_tuned_file(path)
     try:
         seed = at_least("seed", content["study"]["seed"], 0)
-        found = problem_in(content, content["problem"], path, problems)
+        problem = problem_in(content, content["problem"], path, problems)
         _warn_of_changes(content, path)
     except (KeyError, TypeError) as error:
         raise ValueError(
             f"a tuned file must have all its entries, but in {path} this is missing or no such value: {error}"
         ) from None
-    given = content["filter"]["model"]
-    held = {name: given.get(name, {}) for name in {*found.held, *(set(given) & {FACTORS})}}
-    if held != dict(found.held):
+    arguments = content["filter"]["model"]
+    held_values = {name: arguments.get(name, {}) for name in {*problem.held, *(set(arguments) & {FACTORS})}}
+    if held_values != dict(problem.held):
         raise ValueError(
-            f"the model of a tuned file must be that of its scenario, {found.held.get(FACTORS, {})}, "
-            f"but {path} has {short_repr(given)}"
+            f"the model of a tuned file must be that of its scenario, {problem.held.get(FACTORS, {})}, "
+            f"but {path} has {short_repr(arguments)}"
         )
-    known = {*NOISE, PRIOR, *found.held, *(one.name for one in found.parameters or ())}
-    if set(given) - known:
+    known = {*NOISE, PRIOR, *problem.held, *(parameter.name for parameter in problem.parameters or ())}
+    if set(arguments) - known:
         raise ValueError(
             f"arguments of the model in a tuned file must be among {', '.join(sorted(known))}, "
-            f"but {path} has {', '.join(sorted(set(given) - known))}"
+            f"but {path} has {', '.join(sorted(set(arguments) - known))}"
         )
-    return _choice(content, found), found, seed
+    return _choice(content, problem), problem, seed
 
 
 def read_choice(path: str | Path, problem: Problem) -> Choice:
@@ -257,10 +259,10 @@ def _choice(content: Mapping, problem: Problem) -> Choice:
     Both, where the file has a Q and R that the parameters do not give, as baselines have.
     """
     entry, model = content["filter"], problem.model()
-    own = [one.name for one in problem.parameters or ()]
-    chosen = {name: entry["model"][name] for name in own if name in entry["model"]}
-    if not own or len(chosen) < len(own) or not _gives_noise(problem.model(**chosen), entry["model"]):
-        chosen = chosen if len(chosen) == len(own) else {}
+    names = [parameter.name for parameter in problem.parameters or ()]
+    chosen = {name: entry["model"][name] for name in names if name in entry["model"]}
+    if not names or len(chosen) < len(names) or not _gives_noise(problem.model(**chosen), entry["model"]):
+        chosen = chosen if len(chosen) == len(names) else {}
         chosen |= {
             name: _noise(name, entry["model"][name], size, positive_definite=name == "measurement_noise_cov")
             for name, size in zip(NOISE, (model.n, model.m), strict=True)
@@ -276,19 +278,19 @@ def _gives_noise(model: StateSpaceModel, entry: Mapping) -> bool:
     """Whether a model has the Q and R of a file, as far as that tells them."""
     for name in NOISE:
         if name in entry:
-            own, kept = getattr(model, name), np.asarray(entry[name], dtype=np.float64)
-            kept = kept if kept.ndim == 2 else np.diag(np.atleast_1d(kept))
-            if kept.shape != own.shape or not np.allclose(own, kept, rtol=SAME_NOISE, atol=0.0):
+            cov, stored = getattr(model, name), np.asarray(entry[name], dtype=np.float64)
+            stored = stored if stored.ndim == 2 else np.diag(np.atleast_1d(stored))
+            if stored.shape != cov.shape or not np.allclose(cov, stored, rtol=SAME_NOISE, atol=0.0):
                 return False
     return True
 
 
-def _noise(name: str, given, size: int, *, positive_definite: bool):
+def _noise(name: str, value, size: int, *, positive_definite: bool):
     """A covariance as a choice stores it: one variance, several, or the rows of a matrix."""
-    if np.ndim(given) == 0:
-        return positive(name, given)
-    matrix = covariance(name, given, size, positive_definite=positive_definite)
-    return tuple(map(tuple, matrix.tolist())) if np.ndim(given) == 2 else tuple(np.diag(matrix).tolist())
+    if np.ndim(value) == 0:
+        return positive(name, value)
+    matrix = covariance(name, value, size, positive_definite=positive_definite)
+    return tuple(map(tuple, matrix.tolist())) if np.ndim(value) == 2 else tuple(np.diag(matrix).tolist())
 
 
 def metrics(comparison: Comparison) -> dict:
@@ -307,8 +309,8 @@ def _summary_of(evaluation: Evaluation | None) -> dict | None:
 
 def scaling(comparison: Comparison) -> dict:
     """The scaled default's factor on Q and its mean NIS on the training runs, or None."""
-    found = comparison.default
-    return {"factor": found and found.factor, "mean_nis": found and found.nis}
+    default = comparison.default
+    return {"factor": default and default.factor, "mean_nis": default and default.nis}
 
 
 def consistency(result: StudyResult) -> dict:
@@ -379,16 +381,20 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
         raise ValueError(
             f"a tuned file must have held-out metrics to verify, but {path} has {short_repr(held_out)}"
         )
-    places, differences = 0, []
+    count, differences = 0, []
     for name, stored in held_out.items():
         comparison = evaluate_held_out(
             choice, problem_in(content, name, path, problems), seed, _count(stored, path)
         )
         pairs = _numbers(stored), _numbers(_as_old_as(stored, metrics(comparison)))
         names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
-        differing = [Difference(f"{name}: {place}", *(part.get(place) for part in pairs)) for place in names]
-        places += len(names)
-        differences += [one for one in differing if one.stored != one.found and not one.relative <= TOLERANCE]
+        differing = [Difference(f"{name}: {key}", *(part.get(key) for part in pairs)) for key in names]
+        count += len(names)
+        differences += [
+            difference
+            for difference in differing
+            if difference.stored != difference.found and not difference.relative <= TOLERANCE
+        ]
     differences.sort(key=lambda difference: -difference.relative)
     stored_versions, here = content.get("made_with", {}), versions()
     packages = {
@@ -396,14 +402,14 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
         for name, version in here.items()
         if stored_versions.get(name) != version
     }
-    return Verification(places, differences, packages)
+    return Verification(count, differences, packages)
 
 
-def _as_old_as(stored: Any, found: Any) -> Any:
-    """What was found, without keys that came later than the file."""
-    if not (isinstance(stored, dict) and isinstance(found, dict)):
-        return found
-    known = {key: value for key, value in found.items() if key in stored or key not in LATER}
+def _as_old_as(stored: Any, recomputed: Any) -> Any:
+    """The recomputed metrics without keys that came later than the file."""
+    if not (isinstance(stored, dict) and isinstance(recomputed, dict)):
+        return recomputed
+    known = {key: value for key, value in recomputed.items() if key in stored or key not in LATER}
     return {key: _as_old_as(stored.get(key), value) for key, value in known.items()}
 
 
@@ -419,15 +425,15 @@ def _count(stored, path: str | Path) -> int:
         ) from None
 
 
-def _numbers(value, place: str = "") -> dict[str, Any]:
+def _numbers(value, path: str = "") -> dict[str, Any]:
     """All values within nested mappings and lists, by their path."""
-    return dict(_leaves(value, place))
+    return dict(_leaves(value, path))
 
 
-def _leaves(value, place: str) -> Iterator[tuple[str, Any]]:
+def _leaves(value, path: str) -> Iterator[tuple[str, Any]]:
     if isinstance(value, dict | list | tuple):
         parts = value.items() if isinstance(value, dict) else enumerate(value)
         for key, part in parts:
-            yield from _leaves(part, f"{place} {key}".strip())
+            yield from _leaves(part, f"{path} {key}".strip())
     else:
-        yield place, value
+        yield path, value

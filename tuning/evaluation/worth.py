@@ -31,7 +31,7 @@ def without_truth(name: str) -> str:
     )
 
 
-def worth(comparison: Comparison, what: str = "the score") -> str:
+def tuning_effect(comparison: Comparison, what: str = "the score") -> str:
     """The effect of tuning on `what`: against the scaled default, if there is one, and the rule of thumb.
 
     Without truth it is the effect on the log-likelihood of a run's innovations.
@@ -73,13 +73,13 @@ def _nees_warning(evaluation: Evaluation) -> list[str]:
             until = "" if len(ratios) == 1 else f"{end} to "
             most = f"mean NEES {until}{rounded(farthest(ratios.values()))}"
             parts.append(f"too {size} for {', '.join(ratios)} ({most} where 1 is right)")
-    whole = _size_of(joint, n)
-    if whole:
-        parts.append(f"{whole} jointly ({rounded(joint.value)} where {n} is right)")
+    joint_size = _size_of(joint, n)
+    if joint_size:
+        parts.append(f"{joint_size} jointly ({rounded(joint.value)} where {n} is right)")
     reason = ""
     if not far:
         reason = ": each variance is about right, but P is nearly singular, or its correlations are wrong"
-    elif whole and not any(part.startswith(whole) for part in parts[:-1]):
+    elif joint_size and not any(part.startswith(joint_size) for part in parts[:-1]):
         reason = ": its correlations are wrong, too"
     return [f"Do not rely on the covariance, it is {_listed_words(parts)}{reason}."]
 
@@ -100,44 +100,44 @@ def _memory_warning(evaluation: Evaluation, problem: Problem, forget: float | No
 
     A filter that is as slow as the one with the plant's own Q and R is not warned of.
     """
-    found = evaluation.time_constants
-    if found is None or not found.steps:
+    constants = evaluation.time_constants
+    if constants is None or not constants.steps:
         return []
-    slowest = _times(found.steps[:1], problem)
+    slowest = _times(constants.steps[:1], problem)
     if forget is not None and problem.dt is not None:
-        if found.steps[0] * problem.dt <= forget * TOLERANCE:
+        if constants.steps[0] * problem.dt <= forget * TOLERANCE:
             return []
         return [
             f"The longest time constant of the gain is {slowest} and misses --forget {forget:g}: a larger Q "
             "shortens it no further."
         ]
-    if is_like_the_oracle(found):
+    if is_like_the_oracle(constants):
         return []
-    run = f"{_run_in_words(problem)} ({_times([found.length], problem)})"
-    if found.is_slow:
-        state, oracle = problem.model().states[found.slowest].short_label.split(" [")[0], ""
-        if found.oracle is not None:
-            oracle = f" With the plant's own Q and R it is {_times(found.oracle[:1], problem)}."
+    run = f"{_run_in_words(problem)} ({_times([constants.length], problem)})"
+    if constants.is_slow:
+        state, oracle = problem.model().states[constants.slowest].short_label.split(" [")[0], ""
+        if constants.oracle is not None:
+            oracle = f" With the plant's own Q and R it is {_times(constants.oracle[:1], problem)}."
         return [
             f"The longest time constant of the gain, of {state}, is {slowest}, more than a fifth of {run}: after "
             f"a disturbance that no run had, the estimate needs that long to recover.{oracle} "
-            f"{_advice(found, problem)}"
+            f"{_advice(constants, problem)}"
         ]
-    if found.has_no_gain:
+    if constants.has_no_gain:
         return [
-            f"The gain is practically zero: updates need {_times([found.uptake], problem)} to take up 63 % of an "
-            f"innovation, longer than {run}. The filter follows its model alone; a larger Q changes that."
+            f"The gain is practically zero: updates need {_times([constants.uptake], problem)} to take up 63 % of "
+            f"an innovation, longer than {run}. The filter follows its model alone; a larger Q changes that."
         ]
     return []
 
 
-def is_like_the_oracle(found: TimeConstants) -> bool:
+def is_like_the_oracle(constants: TimeConstants) -> bool:
     """Whether a filter that sleeps is practically as slow as the same filter with the plant's own Q and R."""
-    if found.oracle is None:
+    if constants.oracle is None:
         return False
-    pairs = zip((found.steps[0], found.uptake), found.oracle, strict=True)
-    slow = (found.is_slow, found.has_no_gain)
-    return all(own <= ALIKE * oracle for (own, oracle), counts in zip(pairs, slow, strict=True) if counts)
+    pairs = zip((constants.steps[0], constants.uptake), constants.oracle, strict=True)
+    slow = (constants.is_slow, constants.has_no_gain)
+    return all(steps <= ALIKE * oracle for (steps, oracle), counts in zip(pairs, slow, strict=True) if counts)
 
 
 def _run_in_words(problem: Problem) -> str:
@@ -147,13 +147,13 @@ def _run_in_words(problem: Problem) -> str:
     return f"the {word}" if len(problem.log_names) == 1 else f"the shortest {word}"
 
 
-def _advice(found: TimeConstants, problem: Problem) -> str:
+def _advice(constants: TimeConstants, problem: Problem) -> str:
     """How to make a filter that sleeps forget sooner."""
     if problem.dt is None:
         return "A larger Q shortens it."
-    if found.advised is None:
+    if constants.advised is None:
         return "A larger Q hardly shortens it: measure more, or more often."
-    return f"--forget {found.advised:g} keeps it within {found.advised:g} s."
+    return f"--forget {constants.advised:g} keeps it within {constants.advised:g} s."
 
 
 def memory_numbers(comparison: Comparison, problem: Problem, forget: float | None = None) -> dict:
@@ -161,66 +161,70 @@ def memory_numbers(comparison: Comparison, problem: Problem, forget: float | Non
 
     Without a sample time they are in steps. None stands for what is infinite or unknown.
     """
-    found, dt = comparison.tuned.time_constants, problem.dt or 1.0
-    if found is None or not found.steps:
+    constants, dt = comparison.tuned.time_constants, problem.dt or 1.0
+    if constants is None or not constants.steps:
         return {"longest": None, "run": None, "oracle": None, "allowed": forget, "advised": None, "warns": False}
-    longest, oracle = (value * dt for value in (found.steps[0], (found.oracle or (inf,))[0]))
+    longest, oracle = (value * dt for value in (constants.steps[0], (constants.oracle or (inf,))[0]))
     return {
         "longest": longest if isfinite(longest) else None,
-        "run": found.length * dt,
+        "run": constants.length * dt,
         "oracle": oracle if isfinite(oracle) else None,
         "allowed": forget,
-        "advised": found.advised,
+        "advised": constants.advised,
         "warns": bool(_memory_warning(comparison.tuned, problem, forget)),
     }
 
 
 def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
     """The time constants of a filter's gain, the longest first; "-" for a filter without a gain."""
-    found = evaluation.time_constants
-    if found is None or not found.steps:
+    constants = evaluation.time_constants
+    if constants is None or not constants.steps:
         return "Time constants of the gain: -."
     states = problem.model().states
-    some, more = found.steps[:MOST_TIMES], len(found.steps) - MOST_TIMES
+    longest, more = constants.steps[:MOST_TIMES], len(constants.steps) - MOST_TIMES
     rest = f" and {more} shorter ones" if more > 0 else ""
-    slowest = states[found.slowest].symbol
-    said = f"Time constants of the gain: {_times(some, problem)}{rest}; the longest is of {slowest}"
-    if found.unobservable:
-        names = ", ".join(states[place].symbol for place in found.unobservable)
-        said += f"; the measurements alone do not determine {names}, whatever the gain"
-    if is_like_the_oracle(found):
-        assert found.oracle is not None
-        said += (
-            f". The plant's own Q and R give {_times(found.oracle[:1], problem)}: such a slow filter is right, as "
-            f"long as nothing else disturbs the plant. {_advice(found, problem)[:-1]}"
+    slowest = states[constants.slowest].symbol
+    sentence = f"Time constants of the gain: {_times(longest, problem)}{rest}; the longest is of {slowest}"
+    if constants.unobservable:
+        names = ", ".join(states[i].symbol for i in constants.unobservable)
+        sentence += f"; the measurements alone do not determine {names}, whatever the gain"
+    if is_like_the_oracle(constants):
+        assert constants.oracle is not None
+        sentence += (
+            f". The plant's own Q and R give {_times(constants.oracle[:1], problem)}: such a slow filter is "
+            f"right, as long as nothing else disturbs the plant. {_advice(constants, problem)[:-1]}"
         )
-    return f"{said}."
+    return f"{sentence}."
 
 
 def slowest_sentence(evaluations: Mapping[str, Evaluation], problem: Problem) -> str:
     """The longest time constant of each filter's gain; "-" for a filter without a gain."""
-    found = {name: one.time_constants for name, one in evaluations.items()}
-    said = [
-        f"{name} {_times(one.steps[:1], problem) if one is not None and one.steps else '-'}"
-        for name, one in found.items()
+    by_filter = {name: evaluation.time_constants for name, evaluation in evaluations.items()}
+    parts = [
+        f"{name} {_times(constants.steps[:1], problem) if constants is not None and constants.steps else '-'}"
+        for name, constants in by_filter.items()
     ]
-    return f"Longest time constant of the gain: {', '.join(said)}."
+    return f"Longest time constant of the gain: {', '.join(parts)}."
 
 
 def _times(steps: Sequence[float], problem: Problem) -> str:
     """Numbers of steps as times [s], or as steps where there is no sample time."""
     dt = 1.0 if problem.dt is None else problem.dt
-    return f"{', '.join(rounded(one * dt) for one in steps)} {'steps' if problem.dt is None else 's'}"
+    return f"{', '.join(rounded(number * dt) for number in steps)} {'steps' if problem.dt is None else 's'}"
 
 
 def all_warnings(
     comparisons: Sequence[Comparison], problems: Sequence[Problem], forget: float | None = None
 ) -> list[str]:
     """The warnings of a tuned filter on all problems of a study; `forget` as in `warnings_of`."""
-    places = [f"{one.name}: " if len(problems) > 1 else "" for one in problems]
+    prefixes = [f"{problem.name}: " if len(problems) > 1 else "" for problem in problems]
     pairs = zip(comparisons, problems, strict=True)
-    found = [warnings_of(comparison.tuned, problem, forget) for comparison, problem in pairs]
-    return [f"{place}{said}" for place, some in zip(places, found, strict=True) for said in some]
+    warnings = [warnings_of(comparison.tuned, problem, forget) for comparison, problem in pairs]
+    return [
+        f"{prefix}{sentence}"
+        for prefix, sentences in zip(prefixes, warnings, strict=True)
+        for sentence in sentences
+    ]
 
 
 def _likelihood_worth(comparison: Comparison) -> str:
@@ -235,11 +239,8 @@ def _likelihood_worth(comparison: Comparison) -> str:
 
 def _listed(parts: Sequence[tuple[str, str]]) -> str:
     """Verbs and what follows them, with commas and an "and": a verb is not said again after the same."""
-    said = [
-        rest if place and parts[place - 1][0] == verb else f"{verb} {rest}"
-        for place, (verb, rest) in enumerate(parts)
-    ]
-    return _listed_words(said)
+    phrases = [rest if i and parts[i - 1][0] == verb else f"{verb} {rest}" for i, (verb, rest) in enumerate(parts)]
+    return _listed_words(phrases)
 
 
 def sized(gained: Interval) -> Interval:
@@ -270,18 +271,18 @@ def times(ratio: Interval) -> str:
 
 def scaling_sentence(comparison: Comparison) -> str:
     """A description of the scaled default, or why there is none; empty if the comparison has no record of it."""
-    found = comparison.default
-    if found is None:
+    default = comparison.default
+    if default is None:
         return ""
     remark, first = f" {NO_RANGES}" if comparison.lacks_ranges else "", comparison.baselines[0]
     rule = f"{RULE} with its" if comparison.rule == RULE else "given Q and R with this"
-    if found.choice is None:
+    if default.choice is None:
         so = f", so the {RULE} comes first" if first == RULE else ""
-        return f"There is no {SCALED}{so}: {found.reason}.{remark}"
-    if found.factor is None or found.nis is None:
-        raise ValueError(f"a scaled default must have its factor and mean NIS, but got {found}")
+        return f"There is no {SCALED}{so}: {default.reason}.{remark}"
+    if default.factor is None or default.nis is None:
+        raise ValueError(f"a scaled default must have its factor and mean NIS, but got {default}")
     oracle = f"; the {ORACLE} has the plant's own Q and R" if comparison.true is not None else ""
     return (
-        f"The {SCALED} is the {rule} Q times {found.factor:.4g}, which brings the mean NIS on the "
-        f"training runs to {found.nis * comparison.tuned.expected_nis:.2f}{oracle}.{remark}"
+        f"The {SCALED} is the {rule} Q times {default.factor:.4g}, which brings the mean NIS on the "
+        f"training runs to {default.nis * comparison.tuned.expected_nis:.2f}{oracle}.{remark}"
     )

@@ -95,15 +95,15 @@ class AssumedProblem(Problem):
     def model(self, **changes) -> StateSpaceModel:
         """The assumed model with some changes; see `Problem.model`."""
         noise: dict[str, Any] = {key: changes.pop(key) for key in (*NOISE, PRIOR) if key in changes}
-        given = {one.name: one.start for one in self._parameters or ()} | changes
+        arguments = {parameter.name: parameter.start for parameter in self._parameters or ()} | changes
         if not isinstance(self._assumed, StateSpaceModel):
-            model = self._made(self._assumed, given)
-        elif not given:
+            model = self._made(self._assumed, arguments)
+        elif not arguments:
             model = self._assumed
         else:
             raise ValueError(
                 f"arguments of the model of problem {self.name} must be among {', '.join((*NOISE, PRIOR))}, "
-                f"but got {', '.join(given)}"
+                f"but got {', '.join(arguments)}"
             )
         factor = noise.pop(PRIOR, None)
         if factor is not None:
@@ -130,7 +130,7 @@ class AssumedProblem(Problem):
     def untuned(self) -> dict:
         """Arguments of the model before any tuning: as given, the parameters' defaults, or by rule of thumb."""
         if self._parameters is not None:
-            return {one.name: one.start for one in self._parameters} | (self._untuned or {})
+            return {parameter.name: parameter.start for parameter in self._parameters} | (self._untuned or {})
         return self._thumb | (self._untuned or {})
 
     @cached_property
@@ -140,9 +140,13 @@ class AssumedProblem(Problem):
         None for parameters without a default.
         """
         if self._parameters is not None:
-            own = {one.name: one.default for one in self._parameters if one.default is not None}
-            found = own | (self._untuned or {})
-            return found if len(own) == len(self._parameters) else None
+            defaults = {
+                parameter.name: parameter.default
+                for parameter in self._parameters
+                if parameter.default is not None
+            }
+            values = defaults | (self._untuned or {})
+            return values if len(defaults) == len(self._parameters) else None
         model = self.model()
         q, r = rows_argument(model.process_noise_cov), as_argument(model.measurement_noise_cov)
         return {"process_noise_cov": q, "measurement_noise_cov": r} | (self._untuned or {})
@@ -153,8 +157,8 @@ class AssumedProblem(Problem):
         if self._parameters is not None or "process_noise_cov" in (self._untuned or {}):
             return False
         model = self.model()
-        given = model.state_low is not None and model.state_high is not None
-        return not given and self.data(self.range_seeds).states is None
+        has_limits = model.state_low is not None and model.state_high is not None
+        return not has_limits and self.data(self.range_seeds).states is None
 
     @property
     def true(self) -> dict | None:
@@ -195,11 +199,11 @@ class AssumedProblem(Problem):
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
 
-    def _made(self, make: Callable[..., StateSpaceModel], given: Mapping) -> StateSpaceModel:
+    def _made(self, make: Callable[..., StateSpaceModel], arguments: Mapping) -> StateSpaceModel:
         try:
-            model = make(**given)
+            model = make(**arguments)
         except Exception as error:
-            wanted = ", ".join(given) or "no arguments"
+            wanted = ", ".join(arguments) or "no arguments"
             raise ValueError(
                 f"the model of problem {self.name} must be made of {wanted}, but raised {error_line(error)}"
             ) from error
@@ -233,22 +237,26 @@ def as_argument(cov: np.ndarray):
 
 def rows_argument(cov: np.ndarray):
     """As `as_argument`, but a tuple for a single state, too, as a choice stores Q."""
-    found = as_argument(cov)
-    return found if isinstance(found, tuple) else (found,)
+    argument = as_argument(cov)
+    return argument if isinstance(argument, tuple) else (argument,)
 
 
-def _checked_parameters(given) -> tuple[Parameter, ...] | None:
-    if given is None:
+def _checked_parameters(parameters) -> tuple[Parameter, ...] | None:
+    if parameters is None:
         return None
-    found = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    if not found or not all(isinstance(one, Parameter) for one in found):
+    checked = (
+        tuple(parameters)
+        if isinstance(parameters, Sequence) and not isinstance(parameters, str)
+        else (parameters,)
+    )
+    if not checked or not all(isinstance(parameter, Parameter) for parameter in checked):
         raise ValueError(
-            f"parameters must be some of tuning.problems.parameter.Parameter, but got {short_repr(given)}"
+            f"parameters must be some of tuning.problems.parameter.Parameter, but got {short_repr(parameters)}"
         )
-    names = [one.name for one in found]
+    names = [parameter.name for parameter in checked]
     if len(set(names)) < len(names):
         raise ValueError(f"names of parameters must differ from one another, but got {', '.join(names)}")
-    return found
+    return checked
 
 
 def with_defaults(
@@ -264,21 +272,21 @@ def with_defaults(
         known = signature(make).parameters
     except (TypeError, ValueError):  # of a callable without one
         known = MappingProxyType({})
-    found = []
-    for one in parameters:
-        own = getattr(known.get(one.name), "default", None)
-        value = untuned.get(one.name, one.default if one.default is not None else own)
+    completed = []
+    for parameter in parameters:
+        of_function = getattr(known.get(parameter.name), "default", None)
+        value = untuned.get(parameter.name, parameter.default if parameter.default is not None else of_function)
         is_number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-        if not is_number or (one.log and value <= 0):
-            found.append(one)
+        if not is_number or (parameter.log and value <= 0):
+            completed.append(parameter)
             continue
-        value = round(value) if one.integer else value
-        ends = {"low": min(one.low, value), "high": max(one.high, value)}
-        found.append(replace(one, default=value, **ends))
-    return tuple(found)
+        value = round(value) if parameter.integer else value
+        ends = {"low": min(parameter.low, value), "high": max(parameter.high, value)}
+        completed.append(replace(parameter, default=value, **ends))
+    return tuple(completed)
 
 
-def _mapping(name: str, given) -> dict | None:
-    if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"{name} must map arguments of the model to values, but got {short_repr(given)}")
-    return None if given is None else dict(given)
+def _mapping(name: str, mapping) -> dict | None:
+    if mapping is not None and not isinstance(mapping, Mapping):
+        raise ValueError(f"{name} must map arguments of the model to values, but got {short_repr(mapping)}")
+    return None if mapping is None else dict(mapping)

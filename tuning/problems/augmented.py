@@ -53,8 +53,8 @@ def beliefs_of(constants: Any, unknown: Unknowns) -> dict[str | int, Unknown]:
     for name, belief in unknown.items():
         one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
         value = getattr(constants, name)
-        given = default_belief(name, value) if belief is None else Unknown(*belief)
-        beliefs[name] = given if given.mean is not None else given._replace(mean=value)
+        prior = default_belief(name, value) if belief is None else Unknown(*belief)
+        beliefs[name] = prior if prior.mean is not None else prior._replace(mean=value)
     return beliefs
 
 
@@ -75,20 +75,20 @@ def unknowns_of(augment: str | Sequence[str] | Mapping[str, Any]) -> dict[str, U
     """
     if not isinstance(augment, Mapping):
         return dict(map(unknown_in, [augment] if isinstance(augment, str) else augment))
-    found: dict[str, Unknown | None] = {}
-    for name, given in augment.items():
-        if given is None or isinstance(given, Unknown):
-            found[name] = given
+    priors: dict[str, Unknown | None] = {}
+    for name, prior in augment.items():
+        if prior is None or isinstance(prior, Unknown):
+            priors[name] = prior
         else:
-            found[name] = Unknown.of_numbers(*map(float, given if isinstance(given, list | tuple) else (given,)))
-    return found
+            priors[name] = Unknown.of_numbers(*map(float, prior if isinstance(prior, list | tuple) else (prior,)))
+    return priors
 
 
 def name_and_unknown(name: str) -> tuple[str, dict[str, Unknown | None]]:
     """The name of the problem within an augmented one's name, and the constants; none for another name."""
     constants: list[str] = []
-    while found := CONSTANT.search(name):
-        name, constants = name[: found.start()], [found[1], *constants]
+    while match := CONSTANT.search(name):
+        name, constants = name[: match.start()], [match[1], *constants]
     return name, dict(map(unknown_in, constants))
 
 
@@ -97,16 +97,16 @@ def augmented(problem: Problem, unknown: Unknowns) -> Problem:
     return AugmentedProblem(problem, unknown) if unknown else problem
 
 
-def suited(problem: Problem, kept: Mapping[str, Sequence[float]]) -> Problem:
+def suited(problem: Problem, constants: Mapping[str, Sequence[float]]) -> Problem:
     """A problem as the filter of a tuned file assumes it: with the constants as states that the file keeps.
 
     Args:
         problem: on which the filter is to run.
-        kept: [std, walk, mean] of each constant, `filters.tuned_file.AUGMENTED`; empty for none.
+        constants: [std, walk, mean] of each constant, `filters.tuned_file.AUGMENTED`; empty for none.
     """
-    if constants_in(problem) == kept:
+    if constants_in(problem) == constants:
         return problem
-    return augmented(within(problem), {name: Unknown.of_numbers(*one) for name, one in kept.items()})
+    return augmented(within(problem), {name: Unknown.of_numbers(*numbers) for name, numbers in constants.items()})
 
 
 def constants_in(problem: Problem) -> dict[str, list[float]]:
@@ -143,14 +143,14 @@ class AugmentedProblem(Problem):
         if problem.parameters is not None:
             raise ValueError(
                 f"constants to estimate (--augment) must be asked of a problem that tunes Q and R, but "
-                f"{problem.name} tunes {', '.join(one.name for one in problem.parameters)}"
+                f"{problem.name} tunes {', '.join(parameter.name for parameter in problem.parameters)}"
             )
         plain = problem.model()
         self.problem, self.beliefs = problem, beliefs_of(plain.constants, unknown)
         self.name, self.about = problem.name + "".join(map(_suffix, unknown.items())), problem.about
         self.scale = problem.scale
         self._model = augmented_model(plain, self.beliefs)
-        self._walks = tuple(one.walk_std**2 for one in self.beliefs.values())
+        self._walks = tuple(belief.walk_std**2 for belief in self.beliefs.values())
 
     @cached_property
     def digest(self) -> str:
@@ -160,8 +160,8 @@ class AugmentedProblem(Problem):
     @property
     def held(self) -> dict:
         """What the problem holds, and [std, walk, mean] of each constant, as a tuned file has them."""
-        own = {name: [one.std, one.walk_std, one.mean] for name, one in self.beliefs.items()}
-        return {**self.problem.held, AUGMENTED: own}
+        numbers = {name: [belief.std, belief.walk_std, belief.mean] for name, belief in self.beliefs.items()}
+        return {**self.problem.held, AUGMENTED: numbers}
 
     def model(self, **changes) -> StateSpaceModel:
         """The augmented model, with another Q (n + k), R or factor on the whole P_0."""
@@ -200,10 +200,10 @@ class AugmentedProblem(Problem):
     def _with_walks(self, arguments: Mapping) -> dict:
         """Arguments of the problem's model, with Q (n + k)."""
         q = self.problem.model(**arguments).process_noise_cov
-        whole = np.zeros((len(q) + len(self._walks),) * 2)
-        whole[: len(q), : len(q)] = q
-        whole[range(len(q), len(whole)), range(len(q), len(whole))] = self._walks
-        return {**arguments, "process_noise_cov": rows_argument(whole)}
+        full_q = np.zeros((len(q) + len(self._walks),) * 2)
+        full_q[: len(q), : len(q)] = q
+        full_q[range(len(q), len(full_q)), range(len(q), len(full_q))] = self._walks
+        return {**arguments, "process_noise_cov": rows_argument(full_q)}
 
     def training_seeds(self, seed: int, count: int) -> range:
         """Those of the problem."""
@@ -253,8 +253,8 @@ class AugmentedProblem(Problem):
     seed_word = property(lambda self: self.problem.seed_word)
 
 
-def _suffix(one: tuple[str, Unknown | None]) -> str:
+def _suffix(constant: tuple[str, Unknown | None]) -> str:
     """A constant as part of a problem's name, which `name_and_unknown` reads."""
-    name, belief = one
+    name, belief = constant
     numbers = [number for number in ((belief or ())[:3]) if number is not None]
     return "".join([f"+{name}", *(f":{float(number)!r}".removesuffix(".0") for number in numbers)])

@@ -42,8 +42,12 @@ def checked_problem(problem, name: str | None = None) -> Problem:
     model = problem.model(**problem.untuned)
     if not isinstance(model, StateSpaceModel):
         raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {short_repr(model)}")
-    for kind, ones, others in zip(Quantities._fields, problem.quantities, model.quantities, strict=True):
-        check_quantities(kind.removesuffix("_quantities"), ones, others, f"problem {name}", "its model")
+    for kind, quantities, model_quantities in zip(
+        Quantities._fields, problem.quantities, model.quantities, strict=True
+    ):
+        check_quantities(
+            kind.removesuffix("_quantities"), quantities, model_quantities, f"problem {name}", "its model"
+        )
     data = problem.data(SEEDS)
     check_data(data, model, name)
     check_model(model, data, name)
@@ -73,28 +77,28 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
     if data.states is not None:
         known = np.shape(data.states)[-1] if np.ndim(data.states) == 3 else 0
         parts["states"], wanted["states"] = data.states, (count, steps + 1, min(max(known, 1), model.n))
-    for entry, one in (data.outputs or {}).items():
-        parts[f"output {entry}"], wanted[f"output {entry}"] = one, (count, steps + 1)
-    for entry, one in parts.items():
-        if isinstance(one, np.ma.MaskedArray):
+    for entry, array in (data.outputs or {}).items():
+        parts[f"output {entry}"], wanted[f"output {entry}"] = array, (count, steps + 1)
+    for entry, array in parts.items():
+        if isinstance(array, np.ma.MaskedArray):
             raise ValueError(
                 f"{entry} of problem {name} must be a plain array, NaN where something is missing, "
                 "but got a masked one"
             )
-        if np.shape(one) != wanted[entry]:
+        if np.shape(array) != wanted[entry]:
             raise ValueError(
                 f"{entry} of problem {name} must have the shape {wanted[entry]} of its model, "
-                f"but got {np.shape(one)}"
+                f"but got {np.shape(array)}"
             )
-        finite = np.isfinite(one) if entry != "measurements" else ~np.isinf(one)
+        finite = np.isfinite(array) if entry != "measurements" else ~np.isinf(array)
         if entry != "filter_keys" and data.counted is not None:
             finite |= _not_there(data, entry, finite)
         if not finite.all():
             rule = "finite or NaN" if entry == "measurements" else "finite"
-            run, step, *place = np.argwhere(~finite)[0]
+            run, step, *index = np.argwhere(~finite)[0]
             raise ValueError(
                 f"{entry} of problem {name} must be {rule}, but those of seed {data.seeds[run]} are not from step "
-                f"{step} on{_before(one[run], step, place, model) if entry == 'states' else ''}"
+                f"{step} on{_before(array[run], step, index, model) if entry == 'states' else ''}"
             )
     if not 0 <= data.first_scored <= steps:
         raise ValueError(
@@ -128,11 +132,11 @@ def _not_there(data: Data, entry: str, values: np.ndarray) -> np.ndarray:
     return unseen.reshape(unseen.shape + (1,) * (values.ndim - 2))
 
 
-def _before(states: np.ndarray, step: int, place: Sequence, model: StateSpaceModel) -> str:
+def _before(states: np.ndarray, step: int, index: Sequence, model: StateSpaceModel) -> str:
     """The first state of a run (K+1, n) that is not finite, its value one step earlier, and why."""
-    state = model.states[place[0]]
+    state = model.states[index[0]]
     unit = f" {state.unit}" if state.unit else ""
-    value = f"{state.symbol} was {states[step - 1, place[0]]:.4g}{unit} one step earlier" if step else state.symbol
+    value = f"{state.symbol} was {states[step - 1, index[0]]:.4g}{unit} one step earlier" if step else state.symbol
     return f": {value}; a root or a logarithm may have left its domain, or the plant is unstable"
 
 
@@ -175,35 +179,36 @@ def _check_scale(problem: Problem, data: Data, name: str) -> None:
 
 
 def check_quantities(
-    kind: str, ones: tuple[Quantity, ...], others: tuple[Quantity, ...], owner: str, other: str
+    kind: str, quantities: tuple[Quantity, ...], reference: tuple[Quantity, ...], owner: str, other: str
 ) -> None:
     """Raise ValueError, with the first difference, unless two vectors have the same symbols and units.
 
     Args:
         kind: what the vectors are, such as "measurements".
-        ones: quantities of the first vector.
-        others: those of the second.
+        quantities: quantities of the first vector.
+        reference: those of the second.
         owner: owner of the first vector, for messages ...
         other: ... and of the second.
     """
-    if len(ones) != len(others):
+    if len(quantities) != len(reference):
         raise ValueError(
-            f"{kind} of {owner} and {other} must be as many, but got {_listed(ones)} and {_listed(others)}"
+            f"{kind} of {owner} and {other} must be as many, but got {_listed(quantities)} and "
+            f"{_listed(reference)}"
         )
-    for one, another in zip(ones, others, strict=True):
-        if (one.symbol, one.unit, one.angle) != (another.symbol, another.unit, another.angle):
+    for quantity, expected in zip(quantities, reference, strict=True):
+        if (quantity.symbol, quantity.unit, quantity.angle) != (expected.symbol, expected.unit, expected.angle):
             raise ValueError(
                 f"{kind} of {owner} and {other} must have the same symbols and units, "
-                f"but got {_said(one)} and {_said(another)}"
+                f"but got {_said(quantity)} and {_said(expected)}"
             )
 
 
-def _listed(ones: tuple[Quantity, ...]) -> str:
-    return f"{len(ones)} ({', '.join(one.symbol for one in ones)})"
+def _listed(quantities: tuple[Quantity, ...]) -> str:
+    return f"{len(quantities)} ({', '.join(quantity.symbol for quantity in quantities)})"
 
 
-def _said(one: Quantity) -> str:
-    return f"{one.symbol} [{one.unit}]" + (" (an angle)" if one.angle else "")
+def _said(quantity: Quantity) -> str:
+    return f"{quantity.symbol} [{quantity.unit}]" + (" (an angle)" if quantity.angle else "")
 
 
 # The posterior Cramér-Rao bound of a problem, which is computed once for all commands.
@@ -222,17 +227,17 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
     """
     inputs = np.ascontiguousarray(data.seen.inputs, dtype=np.float64)
     code, sources = gathering_code(model)
-    told = sources, digest_of(model, *model.functions), data.first_scored, truths, inputs.shape
+    parts = sources, digest_of(model, *model.functions), data.first_scored, truths, inputs.shape
     counted = b"" if data.counted is None else np.ascontiguousarray(data.counted).tobytes()
-    follows_from = repr(told).encode() + model.numbers.tobytes() + inputs.tobytes() + counted
+    follows_from = repr(parts).encode() + model.numbers.tobytes() + inputs.tobytes() + counted
 
     def compute() -> np.ndarray:
         variances = posterior_variances(model, inputs, truths=truths)
         if data.counted is None:
             return np.sqrt(data.pooled(variances))
-        taken = sequences_taken(inputs, truths, model)
-        if len(taken) == 1:  # of all sequences, where they are the same
-            variances, taken = np.repeat(variances, len(inputs), axis=0), np.arange(len(inputs))
-        return np.sqrt(data._replace(counted=data.counted[taken]).pooled(variances))
+        sequences = sequences_taken(inputs, truths, model)
+        if len(sequences) == 1:  # of all sequences, where they are the same
+            variances, sequences = np.repeat(variances, len(inputs), axis=0), np.arange(len(inputs))
+        return np.sqrt(data._replace(counted=data.counted[sequences]).pooled(variances))
 
     return cached_numbers("bound", model.n, follows_from, code, compute)

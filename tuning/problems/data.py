@@ -44,9 +44,9 @@ class Data(NamedTuple):
     @property
     def scored(self) -> np.ndarray:
         """Which steps are scored, (B, K + 1) bool."""
-        found = np.ones(self.measurements.shape[:2], dtype=bool) if self.counted is None else self.counted.copy()
-        found[:, : self.first_scored] = False
-        return found
+        scored = np.ones(self.measurements.shape[:2], dtype=bool) if self.counted is None else self.counted.copy()
+        scored[:, : self.first_scored] = False
+        return scored
 
     @property
     def scored_counts(self) -> np.ndarray:
@@ -76,8 +76,8 @@ class Data(NamedTuple):
     @property
     def beginning(self) -> Data:
         """The steps before the first scored one, without truth."""
-        first, seen = self.first_scored, self.seen
-        inputs, measurements = seen.inputs[:, : max(first - 1, 0)], seen.measurements[:, :first]
+        first, observed = self.first_scored, self.seen
+        inputs, measurements = observed.inputs[:, : max(first - 1, 0)], observed.measurements[:, :first]
         return self._replace(inputs=inputs, measurements=measurements, states=None, outputs=None, counted=None)
 
     @property
@@ -86,9 +86,9 @@ class Data(NamedTuple):
         if self.counted is None:
             return self
         times, last = np.arange(self.steps + 1), self.rows[:, None] - 1
-        held = np.minimum(times[:-1], np.maximum(last - 1, 0))[..., None]
+        latest = np.minimum(times[:-1], np.maximum(last - 1, 0))[..., None]
         measurements = where_true(times <= last, self.measurements, np.nan)
-        return self._replace(inputs=np.take_along_axis(self.inputs, held, axis=1), measurements=measurements)
+        return self._replace(inputs=np.take_along_axis(self.inputs, latest, axis=1), measurements=measurements)
 
     def late_scored(self, values: np.ndarray) -> np.ndarray:
         """The late ones of values (B, K + 1, ...) of every step, NaN where a step is not scored."""
@@ -115,8 +115,8 @@ class Data(NamedTuple):
 
         What was measured between is missing, so that a filter predicts over all of it with its own model.
         """
-        kept = np.arange(self.steps + 1) % count == self.first_scored % count
-        return self._replace(measurements=np.where(kept[:, None], self.measurements, np.nan))
+        measured = np.arange(self.steps + 1) % count == self.first_scored % count
+        return self._replace(measurements=np.where(measured[:, None], self.measurements, np.nan))
 
     def slice(self, first: int, last: int) -> Data:
         """The runs from `first` up to, but without, `last`."""
@@ -127,7 +127,9 @@ class Data(NamedTuple):
             measurements=self.measurements[part],
             filter_keys=self.filter_keys[part],
             states=None if self.states is None else self.states[part],
-            outputs=None if self.outputs is None else {name: one[part] for name, one in self.outputs.items()},
+            outputs=None
+            if self.outputs is None
+            else {name: values[part] for name, values in self.outputs.items()},
             counted=None if self.counted is None else self.counted[part],
         )
 
@@ -138,7 +140,9 @@ class Data(NamedTuple):
             inputs=run.inputs[:, : max(rows - 1, 0)],
             measurements=run.measurements[:, :rows],
             states=None if run.states is None else run.states[:, :rows],
-            outputs=None if run.outputs is None else {name: one[:, :rows] for name, one in run.outputs.items()},
+            outputs=None
+            if run.outputs is None
+            else {name: values[:, :rows] for name, values in run.outputs.items()},
             counted=None if run.counted is None else run.counted[:, :rows],
         )
 
@@ -164,8 +168,8 @@ def checked_first_scored_step(value: Any, steps: int) -> int:
 
 def runs_of(data: Data, count: int = 2) -> list[Run]:
     """Keys (1, 2), inputs (1, K, p) and measurements (1, K + 1, m) of the first runs, without padding."""
-    found = [data.one(place) for place in range(min(count, len(data.seeds)))]
-    return [(one.filter_keys, one.inputs, one.measurements) for one in found if one.steps > 1]
+    runs = [data.one(index) for index in range(min(count, len(data.seeds)))]
+    return [(part.filter_keys, part.inputs, part.measurements) for part in runs if part.steps > 1]
 
 
 def where_true(mask: np.ndarray, values: np.ndarray, other: float) -> np.ndarray:
@@ -183,18 +187,18 @@ def padded(arrays: Sequence[np.ndarray], rows: int, fill: float | None = np.nan)
     """
     first = np.asarray(arrays[0])
     out = np.full((len(arrays), rows, *first.shape[1:]), 0.0 if fill is None else fill)
-    for place, array in enumerate(arrays):
+    for index, array in enumerate(arrays):
         count = min(len(array), rows)
-        out[place, :count] = array[:count]
+        out[index, :count] = array[:count]
         if fill is None and count:
-            out[place, count:] = array[count - 1]
+            out[index, count:] = array[count - 1]
     return out
 
 
 def mask_of(lengths: Sequence[int], rows: int) -> np.ndarray | None:
     """Which of `rows` rows exist of runs of these lengths, (B, rows) bool; None where all do."""
-    found = np.arange(rows) < np.asarray(lengths)[:, None]
-    return None if found.all() else found
+    mask = np.arange(rows) < np.asarray(lengths)[:, None]
+    return None if mask.all() else mask
 
 
 def only(counted: np.ndarray | None, known: Any) -> np.ndarray | None:
@@ -216,8 +220,8 @@ def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Esti
     """
     parts = parts_of(filter_, data)
     for first, last in with_progress("runs", parts, [last - first for first, last in parts]):
-        some = data.slice(first, last)
-        yield some, estimates_on(filter_, some)
+        part = data.slice(first, last)
+        yield part, estimates_on(filter_, part)
 
 
 def estimates_on(filter_: Filter, data: Data) -> Estimates:
@@ -225,29 +229,29 @@ def estimates_on(filter_: Filter, data: Data) -> Estimates:
 
     An estimator of another package runs as far as each run goes, for it may have no estimate beyond.
     """
-    seen = data.seen
+    observed = data.seen
     if data.counted is not None and isinstance(filter_, ForeignFilter):
         return _one_by_one(filter_, data)
-    found = run(filter_, seen.filter_keys, seen.inputs, seen.measurements)
+    estimates = run(filter_, observed.filter_keys, observed.inputs, observed.measurements)
     if data.counted is None:
-        return found
-    divergences = found.divergences.copy()
-    for place in np.flatnonzero((divergences > 0) & (data.rows <= data.steps)).tolist():
-        divergences[place] = _alone(filter_, data, place).divergences[0]
-    return found._replace(divergences=divergences)
+        return estimates
+    divergences = estimates.divergences.copy()
+    for index in np.flatnonzero((divergences > 0) & (data.rows <= data.steps)).tolist():
+        divergences[index] = _alone(filter_, data, index).divergences[0]
+    return estimates._replace(divergences=divergences)
 
 
 def _one_by_one(filter_: Filter, data: Data) -> Estimates:
     """Estimates of runs of different lengths, NaN in their padding."""
-    found = [_alone(filter_, data, place) for place in range(len(data.seeds))]
+    runs = [_alone(filter_, data, index) for index in range(len(data.seeds))]
     *fields, restarts = Estimates._fields
-    parts = {name: padded([getattr(one, name)[0] for one in found], data.steps + 1) for name in fields}
-    return Estimates(**parts, **{restarts: np.concatenate([one.divergences for one in found])})
+    parts = {name: padded([getattr(estimates, name)[0] for estimates in runs], data.steps + 1) for name in fields}
+    return Estimates(**parts, **{restarts: np.concatenate([estimates.divergences for estimates in runs])})
 
 
-def _alone(filter_: Filter, data: Data, place: int) -> Estimates:
-    one = data.one(place)
-    return run(filter_, one.filter_keys, one.inputs, one.measurements)
+def _alone(filter_: Filter, data: Data, index: int) -> Estimates:
+    part = data.one(index)
+    return run(filter_, part.filter_keys, part.inputs, part.measurements)
 
 
 def parts_of(filter_: Filter, data: Data) -> list[tuple[int, int]]:

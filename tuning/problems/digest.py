@@ -105,9 +105,9 @@ def _of_imports(function: types.FunctionType, attributes: set[str], of: Of) -> I
         for full in (name, f"{package}.{name}"):  # relative ones are named without the dots
             if full and not is_of_a_library(full):
                 with suppress(Exception):
-                    found = importlib.import_module(full)
-                    if not is_of_a_library(found.__name__):
-                        yield from _of_global(found, attributes, of)
+                    module = importlib.import_module(full)
+                    if not is_of_a_library(module.__name__):
+                        yield from _of_global(module, attributes, of)
                         break
 
 
@@ -116,9 +116,9 @@ def of_class(kind: type, of: Of) -> Iterator[str]:
     yield f"class {kind.__qualname__}"
     yield from of(kind.__bases__)
     if dataclasses.is_dataclass(kind):
-        yield from of([(one.name, one.default, one.default_factory) for one in dataclasses.fields(kind)])
+        yield from of([(field.name, field.default, field.default_factory) for field in dataclasses.fields(kind)])
     if hasattr(kind, "__members__"):
-        yield from of([(name, getattr(one, "value", one)) for name, one in kind.__members__.items()])
+        yield from of([(name, getattr(member, "value", member)) for name, member in kind.__members__.items()])
     for name, member in sorted(vars(kind).items()):
         if name not in NO_MEMBERS and not isinstance(member, DESCRIPTORS) and not _written_by_python(kind, name):
             yield name
@@ -151,9 +151,9 @@ def within(value: Any) -> Any:
     if isinstance(value, functools.partialmethod):
         return value.func, value.args, value.keywords
     for name in ("py_func", "__wrapped__"):  # of numba, of functools
-        found = getattr(value, name, None) if not isinstance(value, type) else None
-        if isinstance(found, types.FunctionType):
-            return found
+        function = getattr(value, name, None) if not isinstance(value, type) else None
+        if isinstance(function, types.FunctionType):
+            return function
     return None
 
 
@@ -170,7 +170,7 @@ def is_of_a_library(module: str | None) -> bool:
         return False
     if is_ours(name) or package in sys.stdlib_module_names:
         return True
-    files = (getattr(sys.modules.get(one), "__file__", None) or "" for one in (name, package))
+    files = (getattr(sys.modules.get(module_name), "__file__", None) or "" for module_name in (name, package))
     return any(folder in file for file in files for folder in INSTALLED)
 
 
@@ -187,18 +187,21 @@ def name_of(value: Any) -> str:
 
 def _read_by(code: types.CodeType, operations: tuple[str, ...]) -> set[str]:
     """Names that code, and the code within it, reads by some operations."""
-    inner = [_read_by(one, operations) for one in code.co_consts if isinstance(one, types.CodeType)]
-    own = {one.argval for one in dis.get_instructions(code) if one.opname in operations}
-    return own.union(*inner)
+    inner = [_read_by(constant, operations) for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    names = {instruction.argval for instruction in dis.get_instructions(code) if instruction.opname in operations}
+    return names.union(*inner)
 
 
 def _names(code: types.CodeType) -> set[str]:
-    inner = [_names(one) for one in code.co_consts if isinstance(one, types.CodeType)]
+    inner = [_names(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*inner)
 
 
 def _code(code: types.CodeType) -> str:
-    constants = [_code(one) if isinstance(one, types.CodeType) else _constant(one) for one in code.co_consts]
+    constants = [
+        _code(constant) if isinstance(constant, types.CodeType) else _constant(constant)
+        for constant in code.co_consts
+    ]
     return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
 
 
@@ -245,8 +248,8 @@ def _policy_of(value: Any) -> Any:
     """The network of an algorithm of Stable-Baselines3 or its contributions; None for anything else."""
     torch: Any = sys.modules["torch"]
     named = any(kind.__name__ == "BaseAlgorithm" for kind in type(value).__mro__)
-    found = getattr(value, "policy", None) if named else None
-    return found if isinstance(found, torch.nn.Module) else None
+    policy = getattr(value, "policy", None) if named else None
+    return policy if isinstance(policy, torch.nn.Module) else None
 
 
 LENGTH = 12  # of the hexadecimal digits of a SHA-256 that are kept
@@ -263,10 +266,10 @@ def digest_of(*values: Any) -> str:
     of torch is hashed by its parameters, a generator of random numbers by its state. Cached properties, addresses,
     and whether a file was run or imported do not count.
     """
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for text in Texts().of(values):
-        found.update(text.encode() + b"\0")
-    return found.hexdigest()[:LENGTH]
+        digest.update(text.encode() + b"\0")
+    return digest.hexdigest()[:LENGTH]
 
 
 class Texts:
@@ -344,7 +347,7 @@ class Texts:
             for key in sorted(value, key=str):
                 yield from self.of((str(key), value[key]))
         else:
-            yield from sorted(" ".join([*Texts().of(key), *Texts().of(held)]) for key, held in value.items())
+            yield from sorted(" ".join([*Texts().of(key), *Texts().of(entry)]) for key, entry in value.items())
 
     def _of_object(self, value: Any) -> Iterator[str]:
         kind = type(value)
@@ -386,21 +389,28 @@ class Texts:
 
 def layers(env: gym.Env) -> list[gym.Env]:
     """An env, the env within it if it is a wrapper, and so on."""
-    found = [env]
-    while isinstance(found[-1], gym.Wrapper):
-        found.append(found[-1].env)
-    return found
+    envs = [env]
+    while isinstance(envs[-1], gym.Wrapper):
+        envs.append(envs[-1].env)
+    return envs
 
 
 def held_by(value: Any) -> dict[str, Any]:
     """What an object holds by name, without values that are cached properties."""
     kinds = type(value).__mro__
     slots = [name for kind in kinds for name in _listed(vars(kind).get("__slots__", ()))]
-    held = {name: getattr(value, name) for name in slots if hasattr(value, name)} | getattr(value, "__dict__", {})
+    values = {name: getattr(value, name) for name in slots if hasattr(value, name)} | getattr(
+        value, "__dict__", {}
+    )
     cached = {
-        name for kind in kinds for name, one in vars(kind).items() if isinstance(one, functools.cached_property)
+        name
+        for kind in kinds
+        for name, member in vars(kind).items()
+        if isinstance(member, functools.cached_property)
     }
-    return {name: one for name, one in held.items() if name not in {*cached, "__dict__", "__weakref__"}}
+    return {
+        name: attribute for name, attribute in values.items() if name not in {*cached, "__dict__", "__weakref__"}
+    }
 
 
 def _listed(slots: Any) -> tuple[str, ...]:
@@ -410,44 +420,44 @@ def _listed(slots: Any) -> tuple[str, ...]:
 # What identifies the env of a problem: its id or function, the classes of its layers, an object's attributes.
 
 
-def env_identity(given: Any, made: gym.Env) -> Any:
+def env_identity(env: Any, instance: gym.Env) -> Any:
     """What `digest_of` takes of an env.
 
     Args:
-        given: the env, its id, or the function that makes it.
-        made: the env, or one that was made of it.
+        env: the env, its id, or the function that makes it.
+        instance: the env, or one that was made of it.
     """
-    found = layers(made)
-    own = tuple(type(layer) for layer in found if not is_of_a_library(type(layer).__module__))
-    if not isinstance(given, gym.Env):
-        return (given, own) if own else given
-    return (_of_spec(given.spec, bool(own)), tuple(map(_arguments, found)), own, _attributes(given, found))
+    envs = layers(instance)
+    classes = tuple(type(layer) for layer in envs if not is_of_a_library(type(layer).__module__))
+    if not isinstance(env, gym.Env):
+        return (env, classes) if classes else env
+    return (_of_spec(env.spec, bool(classes)), tuple(map(_arguments, envs)), classes, _attributes(env, envs))
 
 
-def _of_spec(spec: Any, own: bool) -> Any:
+def _of_spec(spec: Any, has_own_classes: bool) -> Any:
     """The spec of an env as it was made; without the module of a user's class, which may be run or imported."""
     if spec is None:
         return None
-    wrappers = [(one.name, dict(one.kwargs or {})) for one in spec.additional_wrappers]
-    entry = spec.entry_point if isinstance(spec.entry_point, str) and not own else None
+    wrappers = [(wrapper.name, dict(wrapper.kwargs or {})) for wrapper in spec.additional_wrappers]
+    entry = spec.entry_point if isinstance(spec.entry_point, str) and not has_own_classes else None
     return spec.id, entry, dict(spec.kwargs), spec.max_episode_steps, wrappers
 
 
 def _arguments(layer: gym.Env) -> Any:
     """Name and recorded arguments of a wrapper of Gymnasium's or ours."""
-    kept = getattr(layer, "_saved_kwargs", None)
-    return type(layer).__qualname__, kept if isinstance(layer, gym.Wrapper) else None
+    arguments = getattr(layer, "_saved_kwargs", None)
+    return type(layer).__qualname__, arguments if isinstance(layer, gym.Wrapper) else None
 
 
-def _attributes(env: gym.Env, found: list[gym.Env]) -> list[dict[str, str]]:
+def _attributes(env: gym.Env, envs: list[gym.Env]) -> list[dict[str, str]]:
     """Digests of what the layers hold that is not of an episode: the same after resets with two seeds.
 
     Of this project's envs, and of wrappers of other packages, spec and arguments say all.
     """
-    chosen = [one for one in found if not is_of_a_library(type(one).__module__) or _is_foreign_base(one)]
+    chosen = [layer for layer in envs if not is_of_a_library(type(layer).__module__) or _is_foreign_base(layer)]
     if not chosen:
         return []
-    generators, seen = GlobalGenerators(), []
+    generators, digests = GlobalGenerators(), []
     for seed in (0, 1):
         generators.seed(seed)
         try:
@@ -455,10 +465,10 @@ def _attributes(env: gym.Env, found: list[gym.Env]) -> list[dict[str, str]]:
                 env.reset(seed=seed)
         except Exception:  # it will say so when it makes the data
             return []
-        seen.append([{name: digest_of(value) for name, value in _held(one).items()} for one in chosen])
+        digests.append([{name: digest_of(value) for name, value in _held(layer).items()} for layer in chosen])
     return [
-        {name: text for name, text in one.items() if other.get(name) == text}
-        for one, other in zip(*seen, strict=True)
+        {name: text for name, text in first.items() if other.get(name) == text}
+        for first, other in zip(*digests, strict=True)
     ]
 
 

@@ -101,7 +101,7 @@ def measurement_noise(keys: np.ndarray, steps: np.ndarray, cov: np.ndarray) -> n
     """
     size = len(cov)
     blocks = [normal_block(b, steps[None], ADDED_NOISE, keys[:, :1], keys[:, 1:]) for b in range(-(-size // 4))]
-    draws = np.stack([one for block in blocks for one in block][:size], axis=-1)
+    draws = np.stack([draw for block in blocks for draw in block][:size], axis=-1)
     return draws @ covariance_root(cov).T
 
 
@@ -113,14 +113,14 @@ RANDOM = "random"
 LARGEST = 1e3  # random action, where the action space has no limit
 
 
-def checked_policy(given: Policy) -> str | Excitation | Callable:
+def checked_policy(policy: Policy) -> str | Excitation | Callable:
     """A policy unchanged, an excitation for a mapping with its name; ValueError for anything else."""
-    if isinstance(given, Excitation | Mapping):
-        return excitation_of(given)
-    if given != RANDOM and not callable(given) and not hasattr(given, "predict"):
+    if isinstance(policy, Excitation | Mapping):
+        return excitation_of(policy)
+    if policy != RANDOM and not callable(policy) and not hasattr(policy, "predict"):
         rule = "policy must be 'random', a function of the observation, an object with predict, or an excitation"
-        raise ValueError(f"{rule}, but got {short_repr(given)}")
-    return given
+        raise ValueError(f"{rule}, but got {short_repr(policy)}")
+    return policy
 
 
 def chooser(policy: Any, space: gym.spaces.Box, seed: int) -> Callable:
@@ -149,12 +149,12 @@ def _begin(policy: Any, seed: int) -> None:
     reset = getattr(owner, "reset", None)
     if not callable(reset) or isinstance(owner, gym.Env | type):
         return
-    own = {"seed": derived_seed(seed, POLICY)} if "seed" in _names(reset) else {}
+    arguments = {"seed": derived_seed(seed, POLICY)} if "seed" in _names(reset) else {}
     try:
-        inspect.signature(reset).bind(**own)
+        inspect.signature(reset).bind(**arguments)
     except (TypeError, ValueError):  # it asks for more: it is no beginning of an episode
         return
-    reset(**own)
+    reset(**arguments)
 
 
 def _predicted(policy: Any) -> Callable:
@@ -245,17 +245,17 @@ class EnvProblem(AssumedProblem):
         self.env, self.env_arguments = env, dict(env_arguments or {})
         self.state_of, self.measure, self.has_truth = state_of, measure, bool(has_truth)
         self.policy, self._repeats = checked_policy(policy), False
-        made = self._make_env(name)
+        instance = self._make_env(name)
         try:
-            space = _box(made, name)
+            space = _box(instance, name)
             if steps is None:
-                steps = getattr(made.spec, "max_episode_steps", None) or 500
-            own_dt = getattr(made.unwrapped, "dt", None)
+                steps = getattr(instance.spec, "max_episode_steps", None) or 500
+            own_dt = getattr(instance.unwrapped, "dt", None)
             if dt is None and isinstance(own_dt, float):
                 dt = own_dt
-            identity = env_identity(self.env, made)
+            identity = env_identity(self.env, instance)
         finally:
-            self._close(made)
+            self._close(instance)
         super().__init__(
             model,
             steps=steps,
@@ -298,21 +298,21 @@ class EnvProblem(AssumedProblem):
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Runs of the env, one a seed."""
         keys, env = episode_keys(seeds), self._make_env(self.name)
-        given = None
+        excitation = None
         if isinstance(self.policy, Excitation):
             size = int(np.prod(_box(env, self.name).shape))
-            given = self.policy.inputs(keys, self.steps, self._dt or 1.0, size)
+            excitation = self.policy.inputs(keys, self.steps, self._dt or 1.0, size)
         try:
-            levels = [None] * len(seeds) if given is None else given
-            runs = [self._run(env, seed, one) for seed, one in zip(seeds, levels, strict=True)]
+            levels = [None] * len(seeds) if excitation is None else excitation
+            runs = [self._run(env, seed, run_inputs) for seed, run_inputs in zip(seeds, levels, strict=True)]
             if runs and not self._repeats:
                 self._check_repeated(seeds[0], runs[0], self._run(env, seeds[0], levels[0]))
         finally:
             self._close(env)
-        inputs, measurements, found = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
+        inputs, measurements, true_states = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
         if self.noise_cov is not None:
             measurements = measurements + measurement_noise(keys, np.arange(measurements.shape[1]), self.noise_cov)
-        states = found if self.has_truth else None
+        states = true_states if self.has_truth else None
         outputs = None if states is None else self._outputs(states)
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
@@ -345,13 +345,13 @@ class EnvProblem(AssumedProblem):
 
     def _outputs(self, states: np.ndarray) -> dict[str, np.ndarray]:
         model = self.model()
-        whole = states.shape[-1] == model.n
-        return {symbol: model.output(symbol, states) for symbol in model.outputs} if whole else {}
+        is_full = states.shape[-1] == model.n
+        return {symbol: model.output(symbol, states) for symbol in model.outputs} if is_full else {}
 
     def _check_repeated(self, seed: int, first: tuple, again: tuple) -> None:
         """Raise ValueError unless two runs of a seed, with others in between, are the same."""
-        for what, one, other in zip(("inputs", "measurements", "states"), first, again, strict=True):
-            pair = np.array(one, dtype=np.float64), np.array(other, dtype=np.float64)
+        for what, values, other in zip(("inputs", "measurements", "states"), first, again, strict=True):
+            pair = np.array(values, dtype=np.float64), np.array(other, dtype=np.float64)
             room = DIFFERENCE * np.nanmax(np.abs(pair), initial=0.0)
             same = np.isclose(*pair, rtol=0.0, atol=room, equal_nan=True).all(axis=-1)
             if not same.all():
@@ -362,15 +362,15 @@ class EnvProblem(AssumedProblem):
                 )
         self._repeats = True
 
-    def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
+    def _run(self, env: gym.Env, seed: int, excitation: np.ndarray | None) -> tuple[list, list, list]:
         """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode, on seeded generators."""
         generators = GlobalGenerators()
         generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
         env.action_space.seed(derived_seed(seed, ACTION_SPACE))  # a policy may sample it
         with generators.used():
-            return self._episode(env, seed, given)
+            return self._episode(env, seed, excitation)
 
-    def _episode(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
+    def _episode(self, env: gym.Env, seed: int, excitation: np.ndarray | None) -> tuple[list, list, list]:
         space, inputs = _box(env, self.name), []
         begun = env.reset(seed=seed)
         if not isinstance(begun, tuple) or len(begun) != 2:
@@ -378,7 +378,7 @@ class EnvProblem(AssumedProblem):
             raise ValueError(f"{rule}, but returned {short_repr(begun)}")
         observation, info = begun
         measurements, states = [self.measured(observation, info)], [self.state(env, info)]
-        choose = chooser(self.policy if given is None else given, space, seed)
+        choose = chooser(self.policy if excitation is None else excitation, space, seed)
         for k in range(self.steps):
             action = choose(observation)
             action = np.array(action, dtype=space.dtype).reshape(space.shape)  # an env may write into it
@@ -419,14 +419,14 @@ class EnvProblem(AssumedProblem):
             return self.env
         try:
             make = partial(gym.make, self.env) if isinstance(self.env, str) else self.env
-            made = make(**{**self.env_arguments, **(arguments or {})})
+            env = make(**{**self.env_arguments, **(arguments or {})})
         except (gym.error.Error, TypeError, ImportError) as error:
             raise ValueError(
                 f"it must be possible to make the env of problem {name}, but {error_line(error)}"
             ) from error
-        if not isinstance(made, gym.Env):
-            raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {short_repr(made)}")
-        return made
+        if not isinstance(env, gym.Env):
+            raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {short_repr(env)}")
+        return env
 
     def _close(self, env: gym.Env) -> None:
         if env is not self.env:

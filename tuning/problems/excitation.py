@@ -30,9 +30,9 @@ class Excitation(Effect):
     def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
         """Inputs (B, steps, count) for keys (B, 2) and a sample time [s]."""
         for name in ("amplitude", "offset", "low", "high"):
-            given = getattr(self, name, 0.0)
-            if isinstance(given, tuple) and len(given) != count:
-                raise ValueError(f"{name} must be one number, or one for each of {count} inputs, but got {given}")
+            level = getattr(self, name, 0.0)
+            if isinstance(level, tuple) and len(level) != count:
+                raise ValueError(f"{name} must be one number, or one for each of {count} inputs, but got {level}")
         each = [self.input(keys, steps, dt, number) for number in range(count)]
         return np.stack(each, axis=2) if each else np.zeros((len(keys), steps, 0))
 
@@ -47,16 +47,16 @@ class Excitation(Effect):
 
 def limits_about(offset: Any, amplitude: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Plus and minus an amplitude about an offset, each (count,)."""
-    middle, half = (np.array(np.broadcast_to(one, count), dtype=np.float64) for one in (offset, amplitude))
+    middle, half = (np.array(np.broadcast_to(value, count), dtype=np.float64) for value in (offset, amplitude))
     return middle - half, middle + half
 
 
-def excitation_of(given: Excitation | Mapping) -> Excitation:
+def excitation_of(excitation: Excitation | Mapping) -> Excitation:
     """An excitation as it is, or from a mapping with its name; ValueError for an unknown one."""
-    (found,) = EXCITATIONS.make([given])
-    if not isinstance(found, Excitation):
-        raise TypeError(f"an excitation must be a subclass of Excitation, but got {type(found).__name__}")
-    return found
+    (result,) = EXCITATIONS.make([excitation])
+    if not isinstance(result, Excitation):
+        raise TypeError(f"an excitation must be a subclass of Excitation, but got {type(result).__name__}")
+    return result
 
 
 @EXCITATIONS.register("steps")
@@ -119,7 +119,7 @@ class Levels(Excitation):
         share, length, *_ = uniforms(keys, np.arange(steps // self.shortest + 1), number)
         lengths = self.shortest + np.floor((self.longest - self.shortest + 1) * length).astype(np.int64)
         ends = np.cumsum(lengths, axis=1)
-        piece = np.stack([np.searchsorted(one, np.arange(steps), side="right") for one in ends])
+        piece = np.stack([np.searchsorted(run_ends, np.arange(steps), side="right") for run_ends in ends])
         low, high = level_of(self.low, number), level_of(self.high, number)
         return low + (high - low) * np.take_along_axis(share, piece, axis=1)
 
@@ -179,13 +179,13 @@ class Dwells(Excitation):
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
-        part, place = np.divmod(np.arange(steps), self.ramp + self.dwell)
+        part, position = np.divmod(np.arange(steps), self.ramp + self.dwell)
         share = uniforms(keys, np.arange(part[-1] + 2), number)
-        place = np.maximum(place - self.dwell, 0) / self.ramp
+        position = np.maximum(position - self.dwell, 0) / self.ramp
         chance, level, *_ = share
         amplitude = level_of(self.amplitude, number)
-        found = np.where(chance < self.zeros, 0.0, amplitude * (2.0 * level - 1.0))
-        return found[:, part] + place * (found[:, part + 1] - found[:, part])
+        amplitudes = np.where(chance < self.zeros, 0.0, amplitude * (2.0 * level - 1.0))
+        return amplitudes[:, part] + position * (amplitudes[:, part + 1] - amplitudes[:, part])
 
 
 def held_levels(keys: np.ndarray, amplitude: float, hold: int, steps: int, number: int = 0) -> np.ndarray:
@@ -199,12 +199,14 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, number: int = 0) -> tuple[np.n
     return uniform_block(number, draws[None, :], EXCITATION, keys[:, :1], keys[:, 1:])
 
 
-def levels(name: str, given: Any, *, signed: bool = False) -> Level:
+def levels(name: str, values: Any, *, signed: bool = False) -> Level:
     """One level for all inputs, or one each; ValueError unless finite and, if not signed, not negative."""
     check: Callable[[str, Any], float] = finite if signed else partial(positive, zero_allowed=True)
-    return tuple(check(name, one) for one in given) if isinstance(given, list | tuple) else check(name, given)
+    return (
+        tuple(check(name, value) for value in values) if isinstance(values, list | tuple) else check(name, values)
+    )
 
 
-def level_of(given: Level, number: int) -> float:
+def level_of(level: Level, number: int) -> float:
     """The level of one input."""
-    return given[number] if isinstance(given, tuple) else given
+    return level[number] if isinstance(level, tuple) else level

@@ -68,15 +68,15 @@ def find_in(known: Mapping[str, S], kind: type[S], owner: str, name: str) -> S:
         ValueError: for an unknown name, a file that `read_scenario` refuses, or one of another plant.
     """
     if isinstance(name, str) and name.endswith(".toml"):
-        found = read_scenario(name)
-        if not isinstance(found, kind):
-            raise ValueError(f"scenario must be {owner}, but {name} is of plant {found.plant_kind!r}")
-        return found
-    own = any_case(name, known)
-    if not isinstance(own, str) or own not in known:
+        scenario = read_scenario(name)
+        if not isinstance(scenario, kind):
+            raise ValueError(f"scenario must be {owner}, but {name} is of plant {scenario.plant_kind!r}")
+        return scenario
+    known_name = any_case(name, known)
+    if not isinstance(known_name, str) or known_name not in known:
         rule = f"scenario must be one of {', '.join(known)}, or a file that ends in .toml"
         raise ValueError(f"{rule}, but got {short_repr(name)}{meant(name, known)}")
-    return known[own]
+    return known[known_name]
 
 
 def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
@@ -90,14 +90,14 @@ def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
     Raises:
         ValueError: states the rule and the value, with the file.
     """
-    own = dict(content) if isinstance(content, Mapping) else {}
-    room = _room(own, file)
+    entries = dict(content) if isinstance(content, Mapping) else {}
+    room = _room(entries, file)
     known = _fields(room.Scenario)
-    if not isinstance(content, Mapping) or not set(own) <= set(known):
+    if not isinstance(content, Mapping) or not set(entries) <= set(known):
         raise ValueError(
             f"a scenario in a file must be a mapping of {', '.join(known)}, but {file} has {short_repr(content)}"
         )
-    return _made(lambda: _checked(room.Scenario(name=name, **own)), own, file)
+    return _made(lambda: _checked(room.Scenario(name=name, **entries)), entries, file)
 
 
 def _room(content: dict, path: str | Path):

@@ -29,9 +29,9 @@ def find_problem(name: str) -> Problem:
     if unknown:
         return augmented(find_problem(name), unknown)
     known = built_in()  # whose names may have a colon, too
-    own = any_case(name, known)
-    if isinstance(own, str) and own in known:
-        return known[own].find_scenario(own)
+    known_name = any_case(name, known)
+    if isinstance(known_name, str) and known_name in known:
+        return known[known_name].find_scenario(known_name)
     if is_code(name):
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):
@@ -44,39 +44,40 @@ def find_problem(name: str) -> Problem:
 def _module_meant(name: Any) -> str:
     """The end of a message on the name of a module in the working folder; empty if there is none."""
     plain = name.removesuffix(".py") if isinstance(name, str) else ""
-    there = plain.isidentifier() and Path(f"{plain}.py").is_file()
-    return f"; did you mean '{plain}:problem'?" if there else ""
+    exists = plain.isidentifier() and Path(f"{plain}.py").is_file()
+    return f"; did you mean '{plain}:problem'?" if exists else ""
 
 
 def find_same(name: str, digest: str) -> Problem:
     """A problem by its name, which must be the same as in another process: ValueError for another digest."""
-    found = find_problem(name)
-    if found.digest != digest:
+    problem = find_problem(name)
+    if problem.digest != digest:
         raise ValueError(
-            f"problem {name} must be the same in all processes, of digest {digest}, but here it has {found.digest}"
+            f"problem {name} must be the same in all processes, of digest {digest}, but here it has "
+            f"{problem.digest}"
         )
-    return found
+    return problem
 
 
-def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
+def find_given(name, problems: Sequence[Problem], where: str | Path) -> Problem:
     """A problem that a file or a storage names: one of the user's or, unless it is code, one found by its name.
 
     Nothing is imported that a file or a storage names.
 
     Args:
         name: the problem's name.
-        given: problems given by the user.
+        problems: those of the user.
         where: the source of the name, for errors.
 
     Raises:
         ValueError: if there is no such problem, or it is code that is not given.
     """
-    for one in given:
-        if one.name == name:
-            return one
+    for problem in problems:
+        if problem.name == name:
+            return problem
     plain, unknown = name_and_unknown(name) if isinstance(name, str) else (name, {})
     if unknown:
-        return augmented(find_given(plain, given, where), unknown)
+        return augmented(find_given(plain, problems, where), unknown)
     known = built_in()
     if isinstance(name, str) and (any_case(name, known) in known or name.endswith(".toml")):
         return find_problem(name)
@@ -91,15 +92,15 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
 
 
 def _from_module(name: str) -> Problem:
-    found = object_named(name, "problem")
-    if not isinstance(found, Problem) and callable(found):
+    problem = object_named(name, "problem")
+    if not isinstance(problem, Problem) and callable(problem):
         try:
-            found = found()
+            problem = problem()
         except Exception as error:
             raise ValueError(
                 f"a function must return a problem without arguments, but {name!r} raised {error_line(error)}"
             ) from error
-    return named(checked_problem(found, name), name)
+    return named(checked_problem(problem, name), name)
 
 
 def named(problem: Problem, name: str) -> Problem:

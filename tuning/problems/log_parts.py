@@ -60,26 +60,27 @@ class Parts(NamedTuple):
 
     def sentences(self) -> list[str]:
         """The lost rows, in words; empty if there are none."""
-        said = []
+        sentences = []
         if self.empty:
             are, have = ("is", "has") if self.empty == 1 else ("are", "have")
-            said.append(
+            sentences.append(
                 f"{self.empty} of {self.empty + len(self.blocks)} blocks {are} left out and in no score: "
                 f"{'it' if self.empty == 1 else 'they'} {have} no measurements, or too few."
             )
         if self.short_pieces:
-            one = self.short_pieces == 1
-            said.append(
-                f"{self.short_pieces} piece{'' if one else 's'} of a run between gaps {'is' if one else 'are'} "
-                f"shorter than a lead-in and a block, {self.lead + self.shortest} rows, and left out."
+            is_single = self.short_pieces == 1
+            sentences.append(
+                f"{self.short_pieces} piece{'' if is_single else 's'} of a run between gaps "
+                f"{'is' if is_single else 'are'} shorter than a lead-in and a block, {self.lead + self.shortest} "
+                "rows, and left out."
             )
         if self.is_short:
-            said.append(
+            sentences.append(
                 f"The logs are short: a lead-in has {self.lead} rows, a block {self.shortest} scored ones or more "
                 f"({LEAD} and {SHORTEST} are usual), so the model's prior counts in the score and intervals are "
                 f"wide."
             )
-        return said
+        return sentences
 
 
 def parts_of(
@@ -127,8 +128,8 @@ def parts_of(
     ]
     for rows, least in SIZES if shortest is None else ((LEAD, at_least("shortest", shortest, 1)),):
         try:
-            found = _parts(logs, pieces, rows if lead is None else lead, least, blocks, held_out, sizes, known)
-            return found._replace(is_short=shortest is None and least < SHORTEST)
+            parts = _parts(logs, pieces, rows if lead is None else lead, least, blocks, held_out, sizes, known)
+            return parts._replace(is_short=shortest is None and least < SHORTEST)
         except ValueError as error:
             refused = error
     raise refused
@@ -154,30 +155,30 @@ def _parts(
         counts = _counts(long, lead, blocks)
         cut = [block for piece, count in zip(long, counts, strict=True) for block in _cut(piece, lead, count)]
     if known is not None:
-        rows = [known[one.run][one.first + lead : one.first + one.rows] for one in cut]
-        cut = [block for block, there in zip(cut, rows, strict=True) if there.any()]
+        rows = [known[block.run][block.first + lead : block.first + block.rows] for block in cut]
+        cut = [block for block, mask in zip(cut, rows, strict=True) if mask.any()]
     measured = np.array([_measured(logs, block, lead) for block in cut])
     usual = np.median(measured[measured > 0]) if measured.any() else 0.0
     all_blocks = [block for block, share in zip(cut, measured, strict=True) if share and share * SHARE >= usual]
-    held = _held(logs, all_blocks, held_out)
-    held_blocks = [block for block, out in zip(all_blocks, held, strict=True) if out]
-    left = [block for block, out in zip(all_blocks, held, strict=True) if not out]
+    is_held_out = _held(logs, all_blocks, held_out)
+    held_blocks = [block for block, out in zip(all_blocks, is_held_out, strict=True) if out]
+    left = [block for block, out in zip(all_blocks, is_held_out, strict=True) if not out]
     choosing = left[EVERY_THIRD - 1 :: EVERY_THIRD] if sizes else []
     if len(choosing) < FEWEST_APART:
         choosing = []
     training = [block for block in left if block not in choosing]
-    for some, what in ((training, "to learn from"), (held_blocks, "held out")):
-        if len(some) < FEWEST:
+    for part, what in ((training, "to learn from"), (held_blocks, "held out")):
+        if len(part) < FEWEST:
             raise ValueError(
                 f"there must be at least {FEWEST} blocks with measurements {what}, but "
-                f"{', '.join(log.name for log in logs)} give {len(some)}: give more "
+                f"{', '.join(log.name for log in logs)} give {len(part)}: give more "
                 f"logs, longer ones or more blocks"
             )
     ends = np.cumsum([len(training), len(choosing), len(held_blocks)]).tolist()
     ranges = range(0, ends[0]), range(ends[0], ends[1]), range(ends[1], ends[2])
-    whole = (*training, *choosing, *held_blocks)
+    ordered = (*training, *choosing, *held_blocks)
     empty, short = len(cut) - len(all_blocks), len(pieces) - len(long)
-    return Parts(whole, *ranges, lead, shortest, empty=empty, short_pieces=short)
+    return Parts(ordered, *ranges, lead, shortest, empty=empty, short_pieces=short)
 
 
 def _check_lengths(logs: Sequence[Log], pieces: Sequence[Piece], lead: int, shortest: int, count: int) -> None:
@@ -214,7 +215,9 @@ def _cut_equally(piece: Piece, lead: int, length: int) -> list[Block]:
 def _counts(pieces: Sequence[Piece], lead: int, blocks: int) -> list[int]:
     """The number of blocks of each piece, of so many of each run."""
     scored = [piece.rows - lead for piece in pieces]
-    of_runs = [sum(r for piece, r in zip(pieces, scored, strict=True) if piece.run == one.run) for one in pieces]
+    of_runs = [
+        sum(r for piece, r in zip(pieces, scored, strict=True) if piece.run == other.run) for other in pieces
+    ]
     return [max(1, round(blocks * rows / all_rows)) for rows, all_rows in zip(scored, of_runs, strict=True)]
 
 
@@ -245,17 +248,19 @@ def _held(logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str
         return [logs[block.run].name in held_out for block in blocks]
     if len(logs) >= EVERY_THIRD:
         return [block.run % EVERY_THIRD == EVERY_THIRD - 1 for block in blocks]
-    return [place % EVERY_THIRD == EVERY_THIRD - 1 for place in range(len(blocks))]
+    return [i % EVERY_THIRD == EVERY_THIRD - 1 for i in range(len(blocks))]
 
 
 # Requirements on the recorded runs of a problem: one sample time, and separate held-out runs.
 
 
-def checked_logs(given: Any) -> tuple[Log, ...]:
+def checked_logs(user_logs: Any) -> tuple[Log, ...]:
     """Logs of one problem as a tuple; ValueError unless they have one sample time and different names."""
-    logs = (given,) if isinstance(given, Log) else tuple(given) if isinstance(given, Sequence) else ()
+    logs = (
+        (user_logs,) if isinstance(user_logs, Log) else tuple(user_logs) if isinstance(user_logs, Sequence) else ()
+    )
     if not logs or not all(isinstance(log, Log) for log in logs):
-        raise ValueError(f"logs must be some thruster_env.logs.log.Log, but got {short_repr(given)}")
+        raise ValueError(f"logs must be some thruster_env.logs.log.Log, but got {short_repr(user_logs)}")
     check_times(logs)
     names = [log.name for log in logs]
     if len(set(names)) < len(names):
@@ -267,8 +272,10 @@ def check_times(logs: Sequence[Log]) -> None:
     """Raise ValueError unless all logs have the same sample time, all on grids or all on their own stamps."""
     for log in logs[1:]:
         if (log.stamps is None) != (logs[0].stamps is None):
-            own, other = (logs[0], log) if log.stamps is None else (log, logs[0])
-            raise ValueError(f"logs must all lie on grids or none, but {own.name} does not and {other.name} does")
+            stamped, gridded = (logs[0], log) if log.stamps is None else (log, logs[0])
+            raise ValueError(
+                f"logs must all lie on grids or none, but {stamped.name} does not and {gridded.name} does"
+            )
         if not same_dt(log.dt, logs[0].dt):
             first, dt = logs[0].name, f"{logs[0].dt:g}"
             how = "put them on one grid" if log.stamps is None else "give both the same"
@@ -278,11 +285,11 @@ def check_times(logs: Sequence[Log]) -> None:
             )
 
 
-def check_apart(learning: Sequence[Log], held: Sequence[Log]) -> None:
+def check_apart(learning: Sequence[Log], held_out: Sequence[Log]) -> None:
     """Raise ValueError if a training and a held-out run have rows in common, as a copy or a part of one has."""
-    found = shared_by(learning, held) if learning and held else None
-    if found is not None:
+    pair = shared_by(learning, held_out) if learning and held_out else None
+    if pair is not None:
         raise ValueError(
-            f"held-out runs must have no rows in common with the others, but {found[1].name} has some of "
-            f"{found[0].name}"
+            f"held-out runs must have no rows in common with the others, but {pair[1].name} has some of "
+            f"{pair[0].name}"
         )

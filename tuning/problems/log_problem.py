@@ -108,8 +108,8 @@ class LogProblem(AssumedProblem):
         )
         self.parts: Parts = cut()
         self._holds = hold_gaps
-        proving = {self.parts.blocks[place].run for place in self.parts.held_out}
-        learning = {self.parts.blocks[place].run for place in (*self.parts.training, *self.parts.sizes)} - proving
+        proving = {self.parts.blocks[index].run for index in self.parts.held_out}
+        learning = {self.parts.blocks[index].run for index in (*self.parts.training, *self.parts.sizes)} - proving
         if apart:
             check_apart([self.logs[run] for run in sorted(learning)], [self.logs[run] for run in sorted(proving)])
         self._content = content
@@ -129,9 +129,9 @@ class LogProblem(AssumedProblem):
         for log in self.logs:
             check_quantities("input", log.input_quantities, model.input_quantities, f"log {log.name}", "the model")
             check_quantities("measurement", log.measured, model.measurements, f"log {log.name}", "the model")
-        found = [log.true_states(model) if truth else None for log in self.logs]
-        known = [states for states in found if states is not None]
-        self._states = known if len(known) == len(found) else None
+        by_log = [log.true_states(model) if truth else None for log in self.logs]
+        known = [states for states in by_log if states is not None]
+        self._states = known if len(known) == len(by_log) else None
         if self._states is None and self._scale is not None:
             raise ValueError(f"a scale must come with logs of all true states, but {self.name} lacks them")
         if self._states is not None:
@@ -156,26 +156,26 @@ class LogProblem(AssumedProblem):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Findings in the logs, and their rows that are in no block."""
-        found = remarks_on(self.recorded)
+        remarks = remarks_on(self.recorded)
         if self._in_steps:
-            found.append(ON_STAMPS)
+            remarks.append(ON_STAMPS)
         if any(len(log.pieces) > 1 for log in self.logs):
-            found.append(f"{AT_GAPS[self._holds]}.")
+            remarks.append(f"{AT_GAPS[self._holds]}.")
         if self._start == MEASUREMENT:
-            found.append(MEASURED)
-        return (*found, *self.parts.sentences())
+            remarks.append(MEASURED)
+        return (*remarks, *self.parts.sentences())
 
     def model(self, **changes) -> StateSpaceModel:
         """The assumed model with some changes, and with the prior covariance of the start."""
-        found = self._of_dt(**changes)
-        return in_any_steps(found, self.logs[0].dt) if self._in_steps else found
+        model = self._of_dt(**changes)
+        return in_any_steps(model, self.logs[0].dt) if self._in_steps else model
 
     def _of_dt(self, **changes) -> StateSpaceModel:
         """The same for a step of the sample time."""
-        found = super().model(**changes)
+        model = super().model(**changes)
         if self._first is None:
-            return found
-        return found.replace(prior_cov=cov_of_measured_starts(found, self._first))
+            return model
+        return model.replace(prior_cov=cov_of_measured_starts(model, self._first))
 
     def training_seeds(self, seed: int, count: int) -> range:
         """Numbers of all training blocks, for any count."""
@@ -195,7 +195,7 @@ class LogProblem(AssumedProblem):
 
     def long_runs(self, seed: int) -> list[Run]:
         """The two longest logs with training blocks, whole, or between gaps where runs are cut at these."""
-        training = {self.parts.blocks[place].run for place in (*self.parts.training, *self.parts.sizes)}
+        training = {self.parts.blocks[index].run for index in (*self.parts.training, *self.parts.sizes)}
         pieces = {run: max(self._pieces(run), key=lambda piece: piece[1]) for run in sorted(training)}
         longest = sorted(pieces, key=lambda run: -pieces[run][1])[:2]
         runs = []
@@ -258,14 +258,14 @@ class LogProblem(AssumedProblem):
                 f"blocks of problem {self.name} must be numbered 0 to {known - 1}, but got {wrong[0]}"
             )
         model, rows, blocks = self.model(), self.steps + 1, [self.parts.blocks[seed] for seed in seeds]
-        places = [(block.run, slice(block.first, block.first + block.rows)) for block in blocks]
-        inputs = padded([self.logs[run].inputs[some][: rows - 1] for run, some in places], rows - 1, None)
-        measurements = padded([self.logs[run].measurements[some] for run, some in places], rows)
+        slices = [(block.run, slice(block.first, block.first + block.rows)) for block in blocks]
+        inputs = padded([self.logs[run].inputs[part][: rows - 1] for run, part in slices], rows - 1, None)
+        measurements = padded([self.logs[run].measurements[part] for run, part in slices], rows)
         counted = mask_of([block.rows for block in blocks], rows)
         data = Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, counted=counted)
         if self._states is None:
             return data
-        states = padded([self._states[run][some] for run, some in places], rows)
+        states = padded([self._states[run][part] for run, part in slices], rows)
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         counted = only(counted, ~np.isnan(states).any(axis=-1))
         return data._replace(states=states, outputs=outputs, counted=counted)
@@ -307,5 +307,5 @@ def _name(logs: Sequence[Log]) -> str:
 
 def _first_measured(measurements: np.ndarray) -> np.ndarray:
     """The first value (B, m) of each channel of measurements (B, K + 1, m); NaN where there is none."""
-    places = (~np.isnan(measurements)).argmax(axis=1)
-    return np.take_along_axis(measurements, places[:, None], axis=1)[:, 0]
+    first = (~np.isnan(measurements)).argmax(axis=1)
+    return np.take_along_axis(measurements, first[:, None], axis=1)[:, 0]

@@ -101,16 +101,16 @@ class ModelProblem(AssumedProblem):
 
     def _shared_states(self, model: StateSpaceModel) -> list[int]:
         """Indices in the truth of the assumed model's first states."""
-        places = {state.symbol: place for place, state in enumerate(self.truth.states)}
-        known = [state.symbol in places for state in model.states]
+        indices = {state.symbol: i for i, state in enumerate(self.truth.states)}
+        known = [state.symbol in indices for state in model.states]
         if not known[0] or any(later and not before for before, later in zip(known, known[1:], strict=False)):
-            symbols = ", ".join(places)
+            symbols = ", ".join(indices)
             raise ValueError(
                 f"states of the assumed model must begin with some of the truth's, {symbols}, "
                 f"but got {', '.join(state.symbol for state in model.states)}"
             )
-        shared = [places[state.symbol] for state in model.states if state.symbol in places]
-        pair = model.states[: len(shared)], tuple(self.truth.states[place] for place in shared)
+        shared = [indices[state.symbol] for state in model.states if state.symbol in indices]
+        pair = model.states[: len(shared)], tuple(self.truth.states[i] for i in shared)
         check_quantities("states", *pair, "the assumed model", "the truth")
         return shared
 
@@ -146,9 +146,9 @@ class ModelProblem(AssumedProblem):
         if np.isnan(scale).any():
             with np.errstate(all="ignore"):
                 parts = estimates_in_parts(OpenLoop(model=self.truth), data)
-                angles = [self.truth.shape.state_angles[place] for place in self._shared]
-                pairs = [(found.means[..., self._shared], one) for one, found in parts]
-                errors = [difference(means, one.known_states, angles)[:, one.late] for means, one in pairs]
+                angles = [self.truth.shape.state_angles[i] for i in self._shared]
+                pairs = [(estimates.means[..., self._shared], part) for part, estimates in parts]
+                errors = [difference(means, part.known_states, angles)[:, part.late] for means, part in pairs]
                 scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
@@ -181,14 +181,14 @@ class ModelProblem(AssumedProblem):
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest of each input, as far as the problem's inputs tell; none where one stands still."""
-        found = None
+        ends = None
         if isinstance(self.inputs, Excitation):
-            found = self.inputs.limits(self.truth.inputs)
+            ends = self.inputs.limits(self.truth.inputs)
         elif isinstance(self.inputs, np.ndarray):
-            found = self.inputs.min(axis=0), self.inputs.max(axis=0)
-        low, high = (0.0, 0.0) if found is None else found
-        moved = np.broadcast_to(np.less(low, high), self.truth.inputs)
-        return np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
+            ends = self.inputs.min(axis=0), self.inputs.max(axis=0)
+        low, high = (0.0, 0.0) if ends is None else ends
+        moves = np.broadcast_to(np.less(low, high), self.truth.inputs)
+        return np.where(moves, low, -np.inf), np.where(moves, high, np.inf)
 
     def _inputs_of(self, seeds: tuple[int, ...]) -> np.ndarray:
         shape = len(seeds), self.steps, self.truth.inputs
@@ -198,10 +198,10 @@ class ModelProblem(AssumedProblem):
             return self.inputs.inputs(episode_keys(seeds), self.steps, self._dt or 1.0, self.truth.inputs)
         if isinstance(self.inputs, np.ndarray):
             return np.ascontiguousarray(np.broadcast_to(self.inputs, shape))
-        found = as_floats(self.inputs(seeds, self.steps)).copy()
-        if found.shape != shape:
-            raise ValueError(f"inputs of problem {self.name} must have the shape {shape}, but got {found.shape}")
-        return found
+        inputs = as_floats(self.inputs(seeds, self.steps)).copy()
+        if inputs.shape != shape:
+            raise ValueError(f"inputs of problem {self.name} must have the shape {shape}, but got {inputs.shape}")
+        return inputs
 
 
 class NamedArguments:
@@ -214,7 +214,7 @@ class NamedArguments:
     @property
     def __signature__(self) -> Signature:
         """Q, R, the factor on P_0 and the problem's parameters."""
-        names = *NOISE, PRIOR, *(one.name for one in self._problem.parameters or ())
+        names = *NOISE, PRIOR, *(parameter.name for parameter in self._problem.parameters or ())
         return Signature(
             [SignatureParameter(name, SignatureParameter.KEYWORD_ONLY, default=None) for name in names]
         )
@@ -224,20 +224,20 @@ class NamedArguments:
         return self._problem.model(**changes)
 
 
-def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Callable | None:
+def _checked_inputs(inputs: Inputs, count: int) -> np.ndarray | Excitation | Callable | None:
     """The inputs as an array (K, p), an excitation or a function; ValueError for others."""
-    if given is None and count == 0:
+    if inputs is None and count == 0:
         return None
-    if isinstance(given, Excitation | Mapping):
-        return excitation_of(given)
-    if callable(given):
-        return given
+    if isinstance(inputs, Excitation | Mapping):
+        return excitation_of(inputs)
+    if callable(inputs):
+        return inputs
     try:
-        array = as_floats(given).copy()
+        array = as_floats(inputs).copy()
         array = array[:, None] if array.ndim == 1 and count == 1 else array
         if array.ndim != 2 or array.shape[1] != count or not len(array) or not np.isfinite(array).all():
             raise ValueError
     except (TypeError, ValueError):
         rule = f"inputs must be finite numbers (K, {count}), an excitation, or a function of (seeds, steps)"
-        raise ValueError(f"{rule}, but got {short_repr(given)}") from None
+        raise ValueError(f"{rule}, but got {short_repr(inputs)}") from None
     return array

@@ -118,10 +118,10 @@ class Parameter:
 
     def set(self, choice, value):
         """The same choice with another number, and what is tied to it."""
-        for place, number in self.held:
-            choice = place.set(choice, number)
-        for place, factor in self.tied:
-            choice = place.set(choice, factor * value)
+        for location, number in self.held:
+            choice = location.set(choice, number)
+        for location, factor in self.tied:
+            choice = location.set(choice, factor * value)
         return self.place.set(choice, value)
 
 
@@ -145,22 +145,27 @@ class Coordinates:
     def __init__(self, free: Sequence[Parameter]):
         """Raise ValueError unless there are parameters with distinct names."""
         self.free = tuple(free)
-        self.names = tuple(one.name for one in self.free)
+        self.names = tuple(parameter.name for parameter in self.free)
         if not self.free or len(set(self.names)) < len(self.names):
             raise ValueError(
                 f"free parameters must be some, each named once, but got {short_repr(list(self.names))}"
             )
-        if any(one.integer for one in self.free):
-            whole = ", ".join(one.name for one in self.free if one.integer)
-            raise ValueError(f"free parameters must not be whole numbers, but got {whole}")
-        self.log = np.array([one.log for one in self.free])
-        self.units = np.array([1.0 if one.log else PART * (one.high - one.low) for one in self.free])
-        self.low, self.high = self.of([one.low for one in self.free]), self.of([one.high for one in self.free])
+        if any(parameter.integer for parameter in self.free):
+            integers = ", ".join(parameter.name for parameter in self.free if parameter.integer)
+            raise ValueError(f"free parameters must not be whole numbers, but got {integers}")
+        self.log = np.array([parameter.log for parameter in self.free])
+        self.units = np.array(
+            [1.0 if parameter.log else PART * (parameter.high - parameter.low) for parameter in self.free]
+        )
+        self.low, self.high = (
+            self.of([parameter.low for parameter in self.free]),
+            self.of([parameter.high for parameter in self.free]),
+        )
 
     def of(self, values: Sequence[float] | np.ndarray) -> np.ndarray:
         """Coordinates of values (p,)."""
-        given = np.asarray(values, dtype=np.float64)
-        return np.where(self.log, np.log(np.where(self.log, given, 1.0)), given) / self.units
+        array = np.asarray(values, dtype=np.float64)
+        return np.where(self.log, np.log(np.where(self.log, array, 1.0)), array) / self.units
 
     def values(self, at: np.ndarray) -> np.ndarray:
         """Values (p,) at coordinates."""
@@ -175,24 +180,25 @@ class Coordinates:
         """Derivative of each value by its coordinate, (p,)."""
         return np.where(self.log, self.values(at), 1.0) * self.units
 
-    def neighbours(self, at: np.ndarray, place: int, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def neighbours(self, at: np.ndarray, index: int, step: float) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates a step above and below in one place; at an end of the range both are within it."""
-        middle, steps = np.array(at, dtype=np.float64), step * np.eye(len(at))[place]
-        middle[place] = np.clip(middle[place], self.low[place] + step, self.high[place] - step)
+        middle, steps = np.array(at, dtype=np.float64), step * np.eye(len(at))[index]
+        middle[index] = np.clip(middle[index], self.low[index] + step, self.high[index] - step)
         return middle + steps, middle - steps
 
-    def start(self, given: dict[str, float] | None = None) -> np.ndarray:
+    def start(self, start_values: dict[str, float] | None = None) -> np.ndarray:
         """Coordinates of given values, of the defaults of parameters without; ValueError outside the range."""
-        given = given or {}
-        unknown = sorted(set(given) - set(self.names))
+        start_values = start_values or {}
+        unknown = sorted(set(start_values) - set(self.names))
         if unknown:
             raise ValueError(f"a start must name free parameters, {', '.join(self.names)}, but got {unknown}")
         values = []
-        for one in self.free:
-            value = finite(f"the start of {one.name}", given.get(one.name, one.start))
-            if not one.low <= value <= one.high:
+        for parameter in self.free:
+            value = finite(f"the start of {parameter.name}", start_values.get(parameter.name, parameter.start))
+            if not parameter.low <= value <= parameter.high:
                 raise ValueError(
-                    f"the start of {one.name} must be within {one.low:g} and {one.high:g}, but got {value:g}"
+                    f"the start of {parameter.name} must be within {parameter.low:g} and "
+                    f"{parameter.high:g}, but got {value:g}"
                 )
             values.append(value)
         return self.of(values)

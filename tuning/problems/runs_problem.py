@@ -62,14 +62,14 @@ class RunsProblem(LogProblem):
             raise ValueError(
                 f"runs must be a list of runs, each a mapping or a tuple of arrays, but got {short_repr(runs)}"
             )
-        made = model if isinstance(model, StateSpaceModel) else _made(model, parameters)
-        logs = [log_of(run, made, dt, f"run {place}") for place, run in enumerate(runs)]
+        assumed = model if isinstance(model, StateSpaceModel) else _made(model, parameters)
+        logs = [log_of(run, assumed, dt, f"run {i}") for i, run in enumerate(runs)]
         super().__init__(
             logs,
             model,
             lead=checked_first_scored_step(first_scored_step, max(log.steps for log in logs)),
             blocks=1,
-            held_out=None if held_out is None else [f"run {place}" for place in held_out],
+            held_out=None if held_out is None else [f"run {i}" for i in held_out],
             shortest=1,
             start=start,
             scale=scale,
@@ -87,12 +87,14 @@ class RunsProblem(LogProblem):
 
 def _made(model: Any, parameters: Sequence[Parameter] | None) -> StateSpaceModel:
     """The model of a function at the starts of its parameters, of which inputs and measurements are needed."""
-    found = model(**{one.name: one.start for one in parameters or ()}) if callable(model) else model
-    if not isinstance(found, StateSpaceModel):
+    assumed = (
+        model(**{parameter.name: parameter.start for parameter in parameters or ()}) if callable(model) else model
+    )
+    if not isinstance(assumed, StateSpaceModel):
         raise ValueError(
             f"model must be a StateSpaceModel, or a function that makes one, but got {short_repr(model)}"
         )
-    return found
+    return assumed
 
 
 def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, name: str = "run") -> Log:
@@ -120,15 +122,17 @@ def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, nam
         got = short_repr(unknown[0]) if unknown else "no measurements"
         raise ValueError(f"{name} must have measurements, and may have inputs and states, but got {got}")
     measurements = _columns("measurements", run["measurements"], model.m, name)
-    given = run.get("inputs")
+    user_inputs = run.get("inputs")
     inputs = (
-        np.zeros((len(measurements) - 1, 0)) if given is None else _columns("inputs", given, model.inputs, name)
+        np.zeros((len(measurements) - 1, 0))
+        if user_inputs is None
+        else _columns("inputs", user_inputs, model.inputs, name)
     )
     references, referred = {}, {}
     if run.get("states") is not None:
         states = _columns("states", run["states"], model.n, name)
-        for i, one in enumerate(model.states):
-            references[f"{STATE}:{one.symbol}"], referred[f"{STATE}:{one.symbol}"] = states[:, i], one
+        for i, state in enumerate(model.states):
+            references[f"{STATE}:{state.symbol}"], referred[f"{STATE}:{state.symbol}"] = states[:, i], state
     if inputs.shape != (len(measurements) - 1, model.inputs):
         raise ValueError(
             f"inputs of {name} must have one row fewer than its measurements and one column per input, "
@@ -137,10 +141,10 @@ def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, nam
     return Log(name, dt, inputs, measurements, model.input_quantities, model.measurements, references, referred)
 
 
-def _columns(what: str, given: Any, count: int, name: str) -> np.ndarray:
+def _columns(what: str, values: Any, count: int, name: str) -> np.ndarray:
     """Numbers as (rows, count); a single column may be (rows,)."""
-    found = as_floats(given)
-    found = found[:, None] if found.ndim == 1 and count == 1 else found
-    if found.ndim != 2 or found.shape[1] != count:
-        raise ValueError(f"{what} of {name} must have {count} columns, as the model has, but got {found.shape}")
-    return found
+    array = as_floats(values)
+    array = array[:, None] if array.ndim == 1 and count == 1 else array
+    if array.ndim != 2 or array.shape[1] != count:
+        raise ValueError(f"{what} of {name} must have {count} columns, as the model has, but got {array.shape}")
+    return array

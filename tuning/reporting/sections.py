@@ -22,7 +22,7 @@ from tuning.evaluation.evaluate import check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.versions import versions
-from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, without_truth, worth
+from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
 from tuning.problems.augmented import within
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.plant_packages import built_in
@@ -72,7 +72,7 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
     The covariance is checked by the mean NEES; without truth by the mean NIS.
     """
     places = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
-    gains = [f"{worth(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
+    gains = [f"{tuning_effect(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
     subject = "On held-out runs the tuned filter" if chosen else "Tuning"
     parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:

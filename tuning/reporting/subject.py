@@ -63,7 +63,7 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
     content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path, problems)
     name, plan = (
         str(content["study"].get("name")),
-        _plan(content["study"], path, partial(problem_in, content, path=path, given=problems)),
+        _plan(content["study"], path, partial(problem_in, content, path=path, problems=problems)),
     )
     study = _load(name, storage)
     if study is not None and study.user_attrs.get("identity") != plan.identity:
@@ -94,7 +94,7 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
         where = public_url(storage)
         raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
     where = f"study {name!r}"
-    plan = _plan(study.user_attrs.get("identity"), where, partial(find_given, given=problems, where=where))
+    plan = _plan(study.user_attrs.get("identity"), where, partial(find_given, problems=problems, where=where))
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")

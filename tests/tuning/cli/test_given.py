@@ -5,7 +5,7 @@ import pytest
 from tests import altitude_problem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.write import write_log
-from tuning.evaluation.baselines import given
+from tuning.evaluation.baselines import given_noise
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments.identification import TRUTH, record
 
@@ -15,7 +15,7 @@ ALTITUDE = "tests.altitude_problem:problem"
 def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, thruster):  # noqa: F811
     told = as_json("evaluate", "--given", "--problem", ALTITUDE, "--seeds", 12)
     problem = altitude_problem.problem()
-    mine = given("ekf", problem)
+    mine = given_noise("ekf", problem)
     assert told["filter"]["name"] == "ekf" and told["filter"]["model"] == altitude_problem.GIVEN == mine.model
     found = evaluate_held_out(mine, problem, 0, 12).tuned
     assert told["given"]["score"] == pytest.approx(list(found.score), rel=1e-9)
