@@ -38,7 +38,7 @@ __all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "
 def __getattr__(name: str) -> Any:
     """A function, whose module is imported when it is asked for: `import tuning` alone is light."""
     if name in __all__:
-        return getattr(import_module(f"tuning.api.{name}"), name)
+        return getattr(import_module(f"tuning.api.{'study' if name == 'tune' else name}"), name)
     raise AttributeError(f"module 'tuning' has no attribute {name!r}")
 
 

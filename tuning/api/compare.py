@@ -357,7 +357,7 @@ def contenders_of(
     for name, size in sizes.items():
         if name is not None and not filter_type(name).has_ensemble:
             raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
-        at_least("ensemble_size", number, 2)
+        at_least("ensemble_size", size, 2)
 
     def size_of(name: Any) -> int | None:
         return sizes[name] if name in sizes else sizes.get(None)
