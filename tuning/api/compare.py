@@ -354,10 +354,10 @@ def contenders_of(
         seed: of the study whose training runs scale the scaled default.
         trials: of the study by which filters are known.
     """
-    for name, size in sizes.items():
+    for name, members in sizes.items():
         if name is not None and not filter_type(name).has_ensemble:
-            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
-        at_least("ensemble_size", size, 2)
+            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {members}")
+        at_least("ensemble_size", members, 2)
 
     def size_of(name: Any) -> int | None:
         return sizes[name] if name in sizes else sizes.get(None)

@@ -373,7 +373,7 @@ def with_budget(plan: Plan) -> Plan:
     states = len(plan.scenarios[0].quantities.states)
     budget = DEFAULT_BUDGET * states**2
     warnings.warn(
-        f"--filter auto got no --budget: a step may take {budget:g} microseconds of one core, the "
+        f"filter 'auto' got no budget (--budget): a step may take {budget:g} microseconds of one core, the "
         f"default of {states} states",
         stacklevel=3,
     )

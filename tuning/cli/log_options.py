@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -23,10 +23,9 @@ from tuning.cli.options import (
     SensorOption,
     spelt,
 )
-from tuning.logs.problem import log_problem
-from tuning.problems.find import find_problem
-from tuning.problems.problem import Problem
-from tuning.thruster.logs import of_preset
+
+if TYPE_CHECKING:
+    from tuning.problems.problem import Problem
 
 
 def with_groups(command: Callable) -> Callable:
@@ -191,6 +190,10 @@ def problems_of(
     names: Sequence[str] | None, logs: BlockOptions, reading: GridOptions, default: str
 ) -> tuple[Problem, ...]:
     """The problems of a study: logs with their options, or problems by name."""
+    from tuning.logs.problem import log_problem  # these import Optuna
+    from tuning.problems.find import find_problem
+    from tuning.thruster.logs import of_preset
+
     options = {**reading.named(), **logs.named()}
     given = {name: value for name, value in options.items() if value is not None}
     if logs.log:
