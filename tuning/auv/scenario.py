@@ -116,18 +116,20 @@ class Scenario(BaseScenario):
     def own_checks(self) -> dict:
         """Noise, and the scale of the model's states."""
         one_of("states", self.states, tuple(MODELS))
-        own = {
+        checked = {
             "scale": self.checked_scale(self.count),
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, len(STATES)).tolist(),
         }
-        given = self.measurement_noise_cov
-        if given is None:  # those of the instruments, so that the scenario lists them
-            own["measurement_noise_cov"] = np.diag(make_plant(sensors=self.sensors).measurement_noise_cov).tolist()
-            return own
-        if not isinstance(given, list | tuple) or not 1 <= len(given) <= MAX_CHANNELS:
+        variances = self.measurement_noise_cov
+        if variances is None:  # those of the instruments, so that the scenario lists them
+            checked["measurement_noise_cov"] = np.diag(
+                make_plant(sensors=self.sensors).measurement_noise_cov
+            ).tolist()
+            return checked
+        if not isinstance(variances, list | tuple) or not 1 <= len(variances) <= MAX_CHANNELS:
             rule = f"measurement_noise_cov must be 1 to {MAX_CHANNELS} variances, one for each channel"
-            raise ValueError(f"{rule}, but got {short_repr(given)}")
-        return own | {"measurement_noise_cov": [positive("measurement_noise_cov", one) for one in given]}
+            raise ValueError(f"{rule}, but got {short_repr(variances)}")
+        return checked | {"measurement_noise_cov": [positive("measurement_noise_cov", v) for v in variances]}
 
     @property
     def count(self) -> int:
@@ -142,8 +144,17 @@ class Scenario(BaseScenario):
     @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same vehicle, `SegorogeniAUV-v0`."""
-        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step", "states"}
-        names = [entry.name for entry in fields(self) if entry.name not in own]
+        of_scenario = {
+            "name",
+            "about",
+            "scale",
+            "parameter_factors",
+            "excitation",
+            "steps",
+            "first_scored_step",
+            "states",
+        }
+        names = [entry.name for entry in fields(self) if entry.name not in of_scenario]
         return {name: plain(getattr(self, name)) for name in names}
 
     @cached_property
@@ -153,8 +164,8 @@ class Scenario(BaseScenario):
 
     def model(self, **changes) -> StateSpaceModel:
         """What the filter assumes; changes are arguments of `thruster_env.auv.model.model_of_plant`."""
-        held = {"states": self.states, "parameter_factors": dict(self.parameter_factors) or None}
-        return model_of_plant(self.plant, **{**held, **changes})
+        fixed = {"states": self.states, "parameter_factors": dict(self.parameter_factors) or None}
+        return model_of_plant(self.plant, **{**fixed, **changes})
 
     @property
     def held(self) -> dict:
@@ -184,9 +195,9 @@ class Scenario(BaseScenario):
     @property
     def true(self) -> dict:
         """Model arguments of the filter that knows the vehicle's Q and R."""
-        own = tuple(self.process_noise_cov[: self.count])
+        of_vehicle = tuple(self.process_noise_cov[: self.count])
         of_current = np.diag(model_of_plant(self.plant, states=self.states).process_noise_cov)[len(STATES) :]
-        return {**super().true, "process_noise_cov": (*own, *of_current.tolist())}
+        return {**super().true, "process_noise_cov": (*of_vehicle, *of_current.tolist())}
 
     @property
     def scale_about(self) -> str:
@@ -203,9 +214,9 @@ class Scenario(BaseScenario):
         exact, missing = model_of_plant(self.plant, states=self.states), np.isnan(data.seen.measurements)
         total, scored, inputs = np.zeros(exact.n), data.scored, data.seen.inputs
         for first in range(0, len(data.seeds), RUNS_AT_ONCE):
-            some = slice(first, first + RUNS_AT_ONCE)
-            covs = path_bound(exact, inputs[some], missing[some])
-            covs = covs[:, data.late] if data.counted is None else covs[scored[some]][None]
+            block = slice(first, first + RUNS_AT_ONCE)
+            covs = path_bound(exact, inputs[block], missing[block])
+            covs = covs[:, data.late] if data.counted is None else covs[scored[block]][None]
             variances = np.einsum("bkii->bki", covs)
             total = total + wrapped_variances(variances, exact.shape.state_angles).sum(axis=(0, 1))
         return np.sqrt(total / scored.sum())
@@ -214,15 +225,15 @@ class Scenario(BaseScenario):
         """Truth and measurements under the excitation's thrusts and planes."""
         keys, plant = episode_keys(seeds), self.plant
         commands = commands_of(self.excitation, plant, keys, self.steps)
-        found = simulate(plant, keys, commands).checked(f"the plant of scenario {self.name}")
+        simulation = simulate(plant, keys, commands).checked(f"the plant of scenario {self.name}")
         inputs = commands
         if self.states == "velocities":
-            inputs = np.concatenate([commands, found.states[:, :-1, 6:8]], axis=2)
-        whole = np.concatenate([found.states, found.current], axis=2)
-        states = np.ascontiguousarray(whole[..., : self.count])
+            inputs = np.concatenate([commands, simulation.states[:, :-1, 6:8]], axis=2)
+        all_states = np.concatenate([simulation.states, simulation.current], axis=2)
+        states = np.ascontiguousarray(all_states[..., : self.count])
         model = self.model()
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
-        measurements = np.where(found.valid, found.measurements, np.nan)  # NaN: missing
+        measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # NaN: missing
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
 

@@ -36,7 +36,7 @@ def suite_with(name: str, channels: tuple[str, ...], effect: dict) -> dict[str, 
     """Sensors of a suite, with one more effect on some channels, as a scenario takes them."""
     effects = make_plant(sensors=name).sensors.items()
     return {
-        channel: [*(one.as_mapping() for one in chain), *([effect] if channel in channels else [])]
+        channel: [*(before.as_mapping() for before in chain), *([effect] if channel in channels else [])]
         for channel, chain in effects
     }
 

@@ -110,8 +110,10 @@ class Published(NamedTuple):
     @property
     def label(self) -> str:
         """Filter and parameters in words."""
-        given = {**self.numbers, **self.model}.items()
-        return ", ".join([self.filter, *(NUMBERS.get(name, f"{name} {{0:g}}").format(one) for name, one in given)])
+        settings = {**self.numbers, **self.model}.items()
+        return ", ".join(
+            [self.filter, *(NUMBERS.get(name, f"{name} {{0:g}}").format(value) for name, value in settings)]
+        )
 
 
 def find_benchmark(name: str) -> Benchmark:
@@ -143,18 +145,16 @@ def against_published(
     """
 
     def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
-        data, found = problem.data(seeds), []
-        for one in published:
-            filter_ = make_filter(one.filter, model(**one.model), **one.numbers)
+        data, rows = problem.data(seeds), []
+        for row in published:
+            filter_ = make_filter(row.filter, model(**row.model), **row.numbers)
             estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
             errors = state_errors(filter_, estimates, data)[:, data.late]
             pooled, lost = np.sqrt(np.square(errors).mean()), estimates.divergences.sum()
             scores = mean_of_roots(errors)
             runs = float(np.median(scores)), float(scores.std(ddof=1))
-            found.append(
-                Row(one.label, one.value, mean_interval(scores), float(pooled), int(lost), *runs, one.why)
-            )
-            on_row(found[-1])
-        return found
+            rows.append(Row(row.label, row.value, mean_interval(scores), float(pooled), int(lost), *runs, row.why))
+            on_row(rows[-1])
+        return rows
 
     return rows

@@ -114,7 +114,7 @@ def read_table(path) -> BollardTable:
     return table
 
 
-def _numbers(row: dict, place: str) -> list[float]:
+def _numbers(row: dict, line: str) -> list[float]:
     """The values of COLUMNS in a row."""
     try:
         values = [float(row[name]) for name in COLUMNS]
@@ -122,7 +122,7 @@ def _numbers(row: dict, place: str) -> list[float]:
         values = [math.nan]
     if not all(map(math.isfinite, values)):
         raise ValueError(
-            f"{place}: {', '.join(COLUMNS)} must be numbers, but are {short_repr([row[n] for n in COLUMNS])}"
+            f"{line}: {', '.join(COLUMNS)} must be numbers, but are {short_repr([row[n] for n in COLUMNS])}"
         )
     return values
 
@@ -194,11 +194,11 @@ def bollard_forces(p: ThrusterParameters) -> np.ndarray:
     return np.array([np.abs(f) / s.omega_m**2 for f, s in zip(forces, states, strict=True)])
 
 
-def predict(found: Identified, table: BollardTable) -> Prediction:
+def predict(identified: Identified, table: BollardTable) -> Prediction:
     """Steady states of the thruster in every row: K_h Q + K1 omega_m = K2 |V_s|, a quadratic in omega_m."""
-    p = found.thruster
+    p = identified.thruster
     thrust, torque = bollard_forces(p)[table.ahead.astype(int)].T
-    drive = p.voltage_gain * np.abs(found.pulse_widths.source_voltage(table.pulse_width, table.supply))
+    drive = p.voltage_gain * np.abs(identified.pulse_widths.source_voltage(table.pulse_width, table.supply))
     load = p.load_gain * torque
     speed = 2 * drive / (p.motor_damping + (p.motor_damping**2 + 4 * load * drive) ** 0.5)
     throttle = np.abs(table.pulse_width - CENTRE) / SPAN
@@ -227,14 +227,14 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
 
     rows = table.select(~is_held_out(table, held_out))
 
-    def found(numbers) -> Identified:
+    def identified_by(numbers) -> Identified:
         values = [float(number) for number in numbers]
         changes: dict[str, Any] = dict(zip(FITTED, values[:5], strict=True))
         thruster = inferred._replace(**changes)
         return Identified(thruster, PulseWidthMap(*values[5:]))
 
     def errors(numbers):
-        guess = predict(found(numbers), rows)
+        guess = predict(identified_by(numbers), rows)
         return np.concatenate(
             [
                 np.log(guess.thrust_from_speed / rows.thrust),
@@ -257,7 +257,7 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
         ftol=1e-12,
         gtol=1e-12,
     )
-    return found(fit.x)
+    return identified_by(fit.x)
 
 
 def is_held_out(table: BollardTable, held_out: Sequence[float]) -> np.ndarray:
@@ -271,9 +271,9 @@ def is_held_out(table: BollardTable, held_out: Sequence[float]) -> np.ndarray:
     return np.isin(table.supply, held_out)
 
 
-def relative_errors(found: Identified, table: BollardTable, held_out: Sequence[float]) -> dict:
+def relative_errors(identified: Identified, table: BollardTable, held_out: Sequence[float]) -> dict:
     """Median and 90th percentile of relative errors [-], by quantity, then group of rows, then direction."""
-    guess, out = predict(found, table), is_held_out(table, held_out)
+    guess, out = predict(identified, table), is_held_out(table, held_out)
     ratios = {
         "thrust from measured speed": guess.thrust_from_speed / table.thrust,
         "thrust from pulse width and supply": guess.thrust / table.thrust,
@@ -315,19 +315,19 @@ astern, whose median error at measured speed is 3.03 % at the held-out voltages.
 PRESET = Identified(T200, T200_PULSE_WIDTHS)
 
 
-def identified_numbers(found: Identified) -> dict[str, float]:
+def identified_numbers(identified: Identified) -> dict[str, float]:
     """The seven numbers of a fit by name."""
-    return {name: getattr(found.thruster, name) for name in FITTED} | found.pulse_widths._asdict()
+    return {name: getattr(identified.thruster, name) for name in FITTED} | identified.pulse_widths._asdict()
 
 
-def coefficients(found: Identified, table: BollardTable) -> dict[str, dict[str, float]]:
+def coefficients(identified: Identified, table: BollardTable) -> dict[str, dict[str, float]]:
     """Bollard coefficients K_T = T/(rho n^2 D^4) and K_Q = Q/(rho n^2 D^5), n in turns a second, by direction.
 
     Beside the model's they are the medians of the table, where Q is the motor's current times K1/K2.
     """
-    p = found.thruster
+    p = identified.thruster
     unit = p.density * p.diameter**4 / (2 * math.pi) ** 2  # thrust over K_T omega_m^2
-    guess = predict(found, table)
+    guess = predict(identified, table)
     astern, ahead = bollard_forces(p)
     by_direction = {}
     for name, rows, (thrust, torque) in (("ahead", table.ahead, ahead), ("astern", ~table.ahead, astern)):
@@ -347,9 +347,9 @@ def study(path, held_out: Sequence[float] = HELD_OUT) -> dict:
     Raises ValueError if the file is no such table or the held-out voltages are not in it.
     """
     table = read_table(path)
-    found = identify(table, held_out, T200)
-    numbers, preset = identified_numbers(found), identified_numbers(PRESET)
-    errors = relative_errors(found, table, held_out)
+    identified = identify(table, held_out, T200)
+    numbers, preset = identified_numbers(identified), identified_numbers(PRESET)
+    errors = relative_errors(identified, table, held_out)
     return {
         "fitted_voltages": sorted(set(np.unique(table.supply).tolist()) - set(held_out)),
         "held_out_voltages": sorted(set(held_out)),
@@ -358,7 +358,7 @@ def study(path, held_out: Sequence[float] = HELD_OUT) -> dict:
         "matches_preset": bool(
             np.allclose(list(numbers.values()), list(preset.values()), rtol=AGREEMENT, atol=0.0)
         ),
-        "coefficients": coefficients(found, table),
+        "coefficients": coefficients(identified, table),
         "errors": errors,
         "preset_errors": relative_errors(PRESET, table, held_out),
         "goals": GOALS,

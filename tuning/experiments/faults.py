@@ -79,8 +79,8 @@ def drifting(z: np.ndarray, sigma: float, rng: np.random.Generator) -> None:
 
 def stuck(z: np.ndarray, sigma: float, rng: np.random.Generator) -> None:
     """One reading, again and again, whenever there is one."""
-    there = ~np.isnan(z)
-    z[:] = np.where(there, z[np.arange(len(z)), there.argmax(axis=1)][:, None], np.nan)
+    present = ~np.isnan(z)
+    z[:] = np.where(present, z[np.arange(len(z)), present.argmax(axis=1)][:, None], np.nan)
 
 
 def noisy(z: np.ndarray, sigma: float, rng: np.random.Generator) -> None:
@@ -104,13 +104,13 @@ def delays(plant: Plant, runs: int = RUNS, monitor: Monitor | None = None) -> di
     model = problem.model(**(problem.true or {}))
     filter_ = make_filter("ekf", model)
     sigma, rng = math.sqrt(model.measurement_noise_cov[plant.channel, plant.channel]), np.random.default_rng(0)
-    found = {"none": _delay(filter_, data, data.measurements, plant.channel, monitor)}
+    by_fault = {"none": _delay(filter_, data, data.measurements, plant.channel, monitor)}
     for name, spoil in FAULTS.items():
         z = data.measurements.copy()
         spoil(z[:, BEGIN:, plant.channel], sigma, rng)
-        found[name] = _delay(filter_, data, z, plant.channel, monitor)
-    found[LOST_BLADES] = _delay(filter_, data, _weakened(plant, model, data), plant.channel, monitor)
-    return found
+        by_fault[name] = _delay(filter_, data, z, plant.channel, monitor)
+    by_fault[LOST_BLADES] = _delay(filter_, data, _weakened(plant, model, data), plant.channel, monitor)
+    return by_fault
 
 
 def _weakened(plant: Plant, model: StateSpaceModel, data: Data) -> np.ndarray:
@@ -118,19 +118,19 @@ def _weakened(plant: Plant, model: StateSpaceModel, data: Data) -> np.ndarray:
     weak, inputs = plant.weakened(model, data.inputs)
     assert data.states is not None  # of a problem with truth
     z = data.measurements.copy()
-    for place, (states, seed) in enumerate(zip(data.states, data.seeds, strict=True)):
+    for run_index, (states, seed) in enumerate(zip(data.states, data.seeds, strict=True)):
         begun = weak.replace(prior_mean=states[BEGIN], prior_cov=1e-300 * np.eye(model.n))
-        found = simulate(begun, filter_keys([seed]), inputs[place : place + 1, BEGIN:]).measurements[0]
-        z[place, BEGIN:] = np.where(np.isnan(z[place, BEGIN:]), np.nan, found)
+        simulated = simulate(begun, filter_keys([seed]), inputs[run_index : run_index + 1, BEGIN:]).measurements[0]
+        z[run_index, BEGIN:] = np.where(np.isnan(z[run_index, BEGIN:]), np.nan, simulated)
     return z
 
 
 def _delay(filter_: Filter, data: Data, z: np.ndarray, channel: int, monitor: Monitor) -> Delay:
     estimates = run(filter_, filter_keys(data.seeds), data.inputs, z)
     readings, tests = [], []
-    for v, s, seen in zip(estimates.innovations, estimates.innovation_covs, z, strict=True):
-        after = [one for one in monitor.alarms(v, s, seen) if one.step >= BEGIN]
-        count = np.isfinite(seen[BEGIN : after[0].step + 1, channel]).sum() if after else math.inf
+    for v, s, measured in zip(estimates.innovations, estimates.innovation_covs, z, strict=True):
+        after = [alarm for alarm in monitor.alarms(v, s, measured) if alarm.step >= BEGIN]
+        count = np.isfinite(measured[BEGIN : after[0].step + 1, channel]).sum() if after else math.inf
         readings.append(max(float(count), 1.0))
         tests += [after[0].test] if after else []
     most = max(TESTS, key=tests.count) if tests else ""
@@ -157,14 +157,14 @@ def shifts(plant: Plant) -> list[float]:
 
 def markdown(runs: int = RUNS) -> str:
     """The table of delays."""
-    found = [delays(plant, runs) for plant in PLANTS]
-    best = [[f"{best_delay(one):.1f}" for one in shifts(plant)] for plant in PLANTS]
+    by_plant = [delays(plant, runs) for plant in PLANTS]
+    best = [[f"{best_delay(shift):.1f}" for shift in shifts(plant)] for plant in PLANTS]
     rows = []
-    for place, name in enumerate(found[0]):
+    for i, name in enumerate(by_plant[0]):
         cells = [name if name != "none" else "no fault"]
-        for one, theory in zip(found, best, strict=True):
-            of_bias = theory[place - 1] if 0 < place <= len(BIASES) else ""
-            cells += [f"{one[name].median:g}", f"{one[name].found:.0%}", one[name].first, of_bias]
+        for of_plant, theory in zip(by_plant, best, strict=True):
+            of_bias = theory[i - 1] if 0 < i <= len(BIASES) else ""
+            cells += [f"{of_plant[name].median:g}", f"{of_plant[name].found:.0%}", of_plant[name].first, of_bias]
         rows.append([cell.replace("inf", "none") for cell in cells])
     heads = [
         f"{plant.name}: {what}" for plant in PLANTS for what in ("readings", "found", "first test", "best CUSUM")

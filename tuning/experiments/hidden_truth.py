@@ -39,7 +39,7 @@ class Hidden(NamedTuple):
     def rmse_ratios(self) -> np.ndarray:
         """RMSE of the study without truth over that with truth, (n,), by state."""
         pairs = zip(self.blind_evaluation.rmse, self.seen_evaluation.rmse, strict=True)
-        return np.array([blind.value / seen.value for blind, seen in pairs])
+        return np.array([blind.value / informed.value for blind, informed in pairs])
 
 
 def logs_of(problem: Problem, seed: int = 0, count: int = RUNS) -> list[Log]:
@@ -48,8 +48,8 @@ def logs_of(problem: Problem, seed: int = 0, count: int = RUNS) -> list[Log]:
     if dt is None:
         raise ValueError(f"logs must have a sample time, but problem {problem.name} has none")
     return [
-        Log(f"run{place}", dt, inputs, measurements, model.input_quantities, model.measurements)
-        for place, (inputs, measurements) in enumerate(zip(data.inputs, data.measurements, strict=True))
+        Log(f"run{i}", dt, inputs, measurements, model.input_quantities, model.measurements)
+        for i, (inputs, measurements) in enumerate(zip(data.inputs, data.measurements, strict=True))
     ]
 
 
@@ -75,7 +75,7 @@ def hide_truth(
     blind_problem = LogProblem(logs_of(problem, seed, runs), problem.model(), blocks=1, name="logs")
     plans = Plan(filter_name, (problem,), seed), Plan(filter_name, (blind_problem,), seed, ("likelihood",))
     studies = ((open_study(f"hidden-{filter_name}", plan), plan) for plan in plans)
-    seen, blind = (run_study(study, plan, trials).or_interrupted().choice for study, plan in studies)
+    informed, blind = (run_study(study, plan, trials).or_interrupted().choice for study, plan in studies)
     data = problem.data(problem.held_out_seeds(seed, held_out))
-    by_seen, by_blind = (evaluate(one.filter(problem), data, problem.scale) for one in (seen, blind))
-    return Hidden(seen, blind, by_seen, by_blind)
+    by_seen, by_blind = (evaluate(choice.filter(problem), data, problem.scale) for choice in (informed, blind))
+    return Hidden(informed, blind, by_seen, by_blind)

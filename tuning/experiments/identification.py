@@ -65,9 +65,9 @@ class Coverage(NamedTuple):
 def record(seed: int, runs: int = 6, steps: int = 500) -> list[Log]:
     """Logs of the known thruster."""
     plant = make_plant(PRESET)
-    own: dict[str, Any] = {name: TRUTH[name] for name in OWN}
+    parameters: dict[str, Any] = {name: TRUTH[name] for name in OWN}
     model = logged_model(
-        preset=plant.parameters._replace(**own),
+        preset=plant.parameters._replace(**parameters),
         sensors=SENSORS,
         substeps=FINE,
         ambient_velocity=TRUTH["ambient_velocity"],
@@ -93,12 +93,12 @@ def repetition(seed: int, *, starts: int = 2, runs: int = 6, steps: int = 500) -
     return identify(family.data, family.model, family.free, starts=starts, seed=seed, against=False)
 
 
-def coverage(found: Sequence[Identification]) -> list[Coverage]:
+def coverage(results: Sequence[Identification]) -> list[Coverage]:
     """The estimates of each parameter compared with the truth."""
     rows = []
     for name, truth in TRUTH.items():
-        values = np.array([one.values[name] for one in found])
-        errors = np.array([one.standard_errors[name] for one in found])
+        values = np.array([result.values[name] for result in results])
+        errors = np.array([result.standard_errors[name] for result in results])
         within = int((np.abs(values - truth) <= WITHIN * errors).sum())
         scatter = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
         rows.append(Coverage(name, truth, float(values.mean()), scatter, float(errors.mean()), within))
@@ -108,8 +108,8 @@ def coverage(found: Sequence[Identification]) -> list[Coverage]:
 def report(rows: Sequence[Coverage], repetitions: int) -> str:
     """A table of Markdown, and how many of all intervals hold the truth."""
     columns = ["parameter", "truth", "mean", "scatter", "stated error", f"within 2, of {repetitions}"]
-    cells = [[one.name, *(f"{value:.4g}" for value in one[1:5]), str(one.within)] for one in rows]
-    total = sum(one.within for one in rows)
+    cells = [[row.name, *(f"{value:.4g}" for value in row[1:5]), str(row.within)] for row in rows]
+    total = sum(row.within for row in rows)
     part = total / (repetitions * len(rows))
     return (
         markdown_table(columns, cells) + f"\n\n{total} of {repetitions * len(rows)} ({part:.1%}) hold the truth.\n"
@@ -118,11 +118,11 @@ def report(rows: Sequence[Coverage], repetitions: int) -> str:
 
 def study(repetitions: int, tell: Callable[[int], None] = lambda done: None, **options) -> list[Identification]:
     """All repetitions."""
-    found = []
+    results = []
     for seed in range(repetitions):
-        found.append(repetition(seed, **options))
+        results.append(repetition(seed, **options))
         tell(seed + 1)
-    return found
+    return results
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,8 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"identification: {error}", file=sys.stderr)
         return 2
-    found = study(count, lambda done: print(f"{done} of {count}", file=sys.stderr))
-    print(report(coverage(found), count))
+    results = study(count, lambda done: print(f"{done} of {count}", file=sys.stderr))
+    print(report(coverage(results), count))
     return 0
 
 

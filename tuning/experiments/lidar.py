@@ -53,7 +53,7 @@ class Run(NamedTuple):
 
 def drawn(count: int, seed: int = 0) -> list[Run]:
     """Some targets."""
-    rng, found = np.random.default_rng([seed, count]), []
+    rng, runs = np.random.default_rng([seed, count]), []
     for _ in range(count):
         speed, course = rng.uniform(*SPEEDS), rng.uniform(0.0, 2.0 * np.pi)
         states = [np.array([*rng.uniform(-FIELD, FIELD, 2), speed * np.cos(course), speed * np.sin(course)])]
@@ -67,8 +67,8 @@ def drawn(count: int, seed: int = 0) -> list[Run]:
         path = np.array(states)
         distance = np.hypot(path[:, 0], path[:, 1]) + rng.normal(0.0, RANGE, len(path))
         angle = np.arctan2(path[:, 1], path[:, 0]) + rng.normal(0.0, BEARING, len(path))
-        found.append(Run(path, distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])))
-    return found
+        runs.append(Run(path, distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])))
+    return runs
 
 
 def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
@@ -81,11 +81,11 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
         runs: the last of them are held out.
         held_out: how many.
     """
-    seen = []
-    for one in runs:
-        first = one.measurements[0]
-        states = one.states - np.concatenate([first, [0.0, 0.0]])
-        seen.append({"measurements": one.measurements - first, "states": states})
+    logs = []
+    for target in runs:
+        first = target.measurements[0]
+        states = target.states - np.concatenate([first, [0.0, 0.0]])
+        logs.append({"measurements": target.measurements - first, "states": states})
     g = np.vstack([0.5 * np.eye(2), np.eye(2)])
     model = affine_model(
         a=A,
@@ -100,7 +100,7 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
     )
     start = {"process_noise_cov": (25.0, 25.0, 100.0, 100.0), "measurement_noise_cov": (400.0, 400.0)}
     return RunsProblem(
-        seen,
+        logs,
         model,
         held_out=range(len(runs) - held_out, len(runs)),
         scale=(1.0, 1.0, np.inf, np.inf),
@@ -153,7 +153,7 @@ class Row(NamedTuple):
         generator, (draws, runs) = np.random.default_rng(0), self.steps.shape
         of_draws = generator.integers(draws, size=(RESAMPLES, draws))[..., None]
         of_runs = generator.integers(runs, size=(RESAMPLES, draws, runs))
-        ours, theirs = (one.squares[of_draws, of_runs].sum(axis=(1, 2)) for one in (self, other))
+        ours, theirs = (row.squares[of_draws, of_runs].sum(axis=(1, 2)) for row in (self, other))
         return Interval(self.mse / other.mse, *np.quantile(ours / theirs, (0.025, 0.975)).tolist())
 
     @classmethod
@@ -161,9 +161,9 @@ class Row(NamedTuple):
         """One way on all draws: means of what is not of a run."""
         columns = zip(*rows, strict=True)
         names, choices, seconds, squares, steps, *means = (list(column) for column in columns)
-        together = np.concatenate(squares), np.concatenate(steps)
-        nis, nees, likelihood = (float(np.mean(one)) for one in means)
-        return cls(names[0], sum(choices, ()), float(np.mean(seconds)), *together, nis, nees, likelihood)
+        joined = np.concatenate(squares), np.concatenate(steps)
+        nis, nees, likelihood = (float(np.mean(column)) for column in means)
+        return cls(names[0], sum(choices, ()), float(np.mean(seconds)), *joined, nis, nees, likelihood)
 
 
 def compared(
@@ -173,8 +173,8 @@ def compared(
     ways: Mapping[str, tuple[str, Mapping[str, bool]]] = WAYS,
 ) -> list[Row]:
     """All ways, and OKF itself where it is installed, on the same runs of some draws."""
-    found = [of_draw(learn, test, seed, ways) for seed in range(draws)]
-    return [Row.pooled(rows) for rows in zip(*found, strict=True)]
+    by_draw = [of_draw(learn, test, seed, ways) for seed in range(draws)]
+    return [Row.pooled(rows) for rows in zip(*by_draw, strict=True)]
 
 
 def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapping[str, bool]]]) -> list[Row]:
@@ -200,16 +200,18 @@ def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapp
 
 def row_of(name: str, choice: Choice, seconds: float, problem: RunsProblem, held_out) -> Row:
     """A choice on held-out runs."""
-    found: Evaluation = evaluate(choice.filter(problem), held_out, problem.scale)
+    evaluation: Evaluation = evaluate(choice.filter(problem), held_out, problem.scale)
     steps = held_out.scored_counts
-    squares = steps * np.array([mse(one[None], found.scale) for one in found.mean_squares])
-    nis, nees = found.nis.value / found.expected_nis, found.nees.value / len(found.rmse)
-    return Row(name, (choice,), seconds, squares[None], steps[None], nis, nees, found.log_likelihood)
+    squares = steps * np.array(
+        [mse(run_squares[None], evaluation.scale) for run_squares in evaluation.mean_squares]
+    )
+    nis, nees = evaluation.nis.value / evaluation.expected_nis, evaluation.nees.value / len(evaluation.rmse)
+    return Row(name, (choice,), seconds, squares[None], steps[None], nis, nees, evaluation.log_likelihood)
 
 
 def is_installed() -> bool:
     """Whether OKF's package is there, with what it imports and does not declare."""
-    return all(importlib.util.find_spec(one) is not None for one in ("okf", "pandas", "seaborn", "torch"))
+    return all(importlib.util.find_spec(package) is not None for package in ("okf", "pandas", "seaborn", "torch"))
 
 
 def okf_itself(runs: list[Run], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -221,7 +223,13 @@ def okf_itself(runs: list[Run], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     np.random.seed(seed)  # its batches are drawn from NumPy's global generator
     model = OptimizedFilter(**model_args(), optimize=True, model_name="OKF")
     with contextlib.redirect_stdout(io.StringIO()):
-        train(model, [one.measurements for one in runs], [one.states for one in runs], to_save=False, verbose=0)
+        train(
+            model,
+            [target.measurements for target in runs],
+            [target.states for target in runs],
+            to_save=False,
+            verbose=0,
+        )
     return model.get_Q(), model.get_R()
 
 
@@ -232,8 +240,8 @@ def markdown(rows: list[Row]) -> str:
     cells = []
     for row in rows:
         ratio = row.over(first)
-        said = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]" if row is not first else "1"
-        numbers = f"{row.seconds:.1f}", f"{row.mse:.1f}", said, f"{row.nis:.2f}", f"{row.nees:.2f}"
+        ratio_text = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]" if row is not first else "1"
+        numbers = f"{row.seconds:.1f}", f"{row.mse:.1f}", ratio_text, f"{row.nis:.2f}", f"{row.nees:.2f}"
         cells.append([row.name, *numbers, f"{row.log_likelihood:.3f}"])
     return markdown_table(heads, cells)
 

@@ -52,7 +52,7 @@ def rates(x, u, c):
     return (c.sigma * (x[1] - x[0]), x[0] * (c.rho - x[2]) - x[1], x[0] * x[1] - c.beta * x[2])
 
 
-def seen(x, c):
+def observe(x, c):
     """All three."""
     return (x[0], x[1], x[2])
 
@@ -82,7 +82,7 @@ def model(inflation: float = 1.0, jitter: float = 0.0) -> StateSpaceModel:
     return StateSpaceModel(
         transition=move,
         transition_jacobian=grown_slopes,
-        observe=seen,
+        observe=observe,
         process_noise_cov=[jitter] * 3,
         measurement_noise_cov=[R] * 3,
         prior_mean=START,

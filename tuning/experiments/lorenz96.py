@@ -95,7 +95,7 @@ def grown_slopes(x, u, c):
     return c.growth * (eye + h / 6.0 * (d1 + 2.0 * d2 + 2.0 * d3 + d4))
 
 
-def seen(x, c):
+def observe(x, c):
     """All states."""
     return x
 
@@ -110,7 +110,7 @@ def model(inflation: float = 1.0) -> StateSpaceModel:
     return StateSpaceModel(
         transition=move,
         transition_jacobian=grown_slopes,
-        observe=seen,
+        observe=observe,
         process_noise_cov=np.zeros(STATES),
         measurement_noise_cov=np.full(STATES, R),
         prior_mean=np.eye(STATES)[0],

@@ -88,14 +88,14 @@ def stone_soup_means(
     else:
         predictor, updater = UnscentedKalmanPredictor(motion, **numbers), UnscentedKalmanUpdater(sensor, **numbers)
     means = np.empty((*measurements.shape[:2], 4))
-    for track, found in zip(measurements, means, strict=True):
+    for track, track_means in zip(measurements, means, strict=True):
         state = GaussianState(prior_mean, np.diag(prior_cov), timestamp=START)
         for k, (bearing, distance) in enumerate(track):
             moment = START + datetime.timedelta(seconds=k * dt)
             state = predictor.predict(state, timestamp=moment) if k else state
-            seen = Detection(StateVector([[Bearing(bearing)], [distance]]), timestamp=moment)
-            state = updater.update(SingleHypothesis(state, seen))
-            found[k] = np.ravel(state.mean).astype(float)
+            detection = Detection(StateVector([[Bearing(bearing)], [distance]]), timestamp=moment)
+            state = updater.update(SingleHypothesis(state, detection))
+            track_means[k] = np.ravel(state.mean).astype(float)
     return means
 
 
@@ -155,7 +155,7 @@ def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
 def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
     """Both filters before and after tuning, beside Stone Soup's with the same numbers."""
     check_installed()  # before anything is compiled
-    data, found = problem.data(seeds), []
+    data, table = problem.data(seeds), []
     for word, sigma in (("untuned", SIGMA.start), ("tuned", tuned_sigma())):
         for name, numbers in (("ekf", {}), ("ukf", POINTS)):
             estimates = run(
@@ -172,9 +172,9 @@ def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
                 estimates.divergences.sum(),
             )
             spread = float(np.median(runs)), float(runs.std(ddof=1))
-            found.append(Row(label, float(np.sqrt(theirs.mean())), ours, ours.value, int(lost), *spread, ""))
-            on_row(found[-1])
-    return found
+            table.append(Row(label, float(np.sqrt(theirs.mean())), ours, ours.value, int(lost), *spread, ""))
+            on_row(table[-1])
+    return table
 
 
 def _squares(means: np.ndarray, data) -> np.ndarray:

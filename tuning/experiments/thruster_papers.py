@@ -384,13 +384,13 @@ class Finding(NamedTuple):
 
 def findings(table: PublishedTable, comparisons: list[Comparison]) -> list[Finding]:
     """A paper's table against the comparisons, Kalman filter first, in the comparisons' order."""
-    found = []
+    results = []
     for comparison in comparisons:
         for name, cells, ours in (("kf", table.kf, comparison.kf), ("enkf", table.enkf, comparison.enkf)):
             cell = cells.get((comparison.case, comparison.q))
             if cell is not None:
-                found.append(_finding(name, cell, ours, comparison))
-    return found
+                results.append(_finding(name, cell, ours, comparison))
+    return results
 
 
 def _finding(name: str, cell: PublishedRMSE, ours: Score, comparison: Comparison) -> Finding:
@@ -442,15 +442,15 @@ def general_statements(comparisons: list[Comparison]) -> list[str]:
     ]
 
 
-def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
+def study_statements(table: PublishedTable, findings_: list[Finding]) -> list[str]:
     """Statements that compare a paper's columns with ours, and the remarks on the paper."""
     tunnel, open_bladed = (
-        [f for f in found if f.filter == "enkf" and f.case == case] for case in ("tunnel", "open-bladed")
+        [f for f in findings_ if f.filter == "enkf" and f.case == case] for case in ("tunnel", "open-bladed")
     )
     clean = [f for f in tunnel + open_bladed if not f.published.note]
     unseen = sum(abs(f.published.omega_m / f.published.U_a / UNSEEN_RATIO - 1.0) < 0.01 for f in clean)
     right, right_std = np.mean([f.ours.run_ratio for f in clean], axis=0)
-    kalman = [f for f in found if f.filter == "kf"]
+    kalman = [f for f in findings_ if f.filter == "kf"]
     equal, as_printed = (
         sum(abs(omega_m / flow - 1.0) < EQUAL for omega_m, flow in pairs)
         for pairs in ([f.published.meant for f in kalman], [f.published[:2] for f in kalman])
@@ -478,13 +478,13 @@ def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
     ]
 
 
-def _farthest(found: list[Finding], distance: str) -> float:
+def _farthest(results: list[Finding], distance: str) -> float:
     # A cell with a note is not a value of its row: a copied one belongs to another q.
-    return max(float(np.abs(getattr(f, distance)).max()) for f in found if not f.published.note)
+    return max(float(np.abs(getattr(f, distance)).max()) for f in results if not f.published.note)
 
 
-def _span(found: list[Finding], state: int | None = None) -> str:
-    factors = np.array([f.over_optimum if state is None else f.over_optimum[state] for f in found])
+def _span(results: list[Finding], state: int | None = None) -> str:
+    factors = np.array([f.over_optimum if state is None else f.over_optimum[state] for f in results])
     return f"{factors.min():.1f} to {factors.max():.1f}"
 
 
@@ -537,21 +537,26 @@ def all_series(*, members: int = MEMBERS, seed: int = 0) -> list[Series]:
 
 def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
     """Truth, KF and EnKF over time as PNG: a column for each noise level, a row for each case and state."""
-    cases, levels = list(dict.fromkeys(one.case for one in runs)), list(dict.fromkeys(one.q for one in runs))
+    cases, levels = (
+        list(dict.fromkeys(simulated.case for simulated in runs)),
+        list(dict.fromkeys(simulated.q for simulated in runs)),
+    )
     figure = new_figure((3.3 * len(levels) + 0.6, 2.15 * 2 * len(cases) + 0.6))
     axes = figure.subplots(2 * len(cases), len(levels), sharex=True, sharey="row", squeeze=False)
     tidy(axes.flat)
-    for one in runs:
-        first, column = 2 * cases.index(one.case), levels.index(one.q)
-        errors = one.rmse("kf"), one.rmse("enkf")
+    for simulated in runs:
+        first, column = 2 * cases.index(simulated.case), levels.index(simulated.q)
+        errors = simulated.rmse("kf"), simulated.rmse("enkf")
         for state, (label, unit) in enumerate(STATES):
             axis = axes[first + state, column]
-            for (name, line), values in zip(LINES.items(), (one.truth, one.kf, one.enkf), strict=True):
-                axis.plot(one.time, values[:, state], label=name, **line)
-            said = f"RMSE: KF {errors[0][state]:.3f}, EnKF {errors[1][state]:.3f} {unit}"
-            axis.set_title(f"q = {one.q:g}\n{said}" if first + state == 0 else said, fontsize=9)
+            for (name, line), values in zip(
+                LINES.items(), (simulated.truth, simulated.kf, simulated.enkf), strict=True
+            ):
+                axis.plot(simulated.time, values[:, state], label=name, **line)
+            text = f"RMSE: KF {errors[0][state]:.3f}, EnKF {errors[1][state]:.3f} {unit}"
+            axis.set_title(f"q = {simulated.q:g}\n{text}" if first + state == 0 else text, fontsize=9)
             if column == 0:
-                axis.set_ylabel(f"{one.case}\n{label}\n[{unit}]")
+                axis.set_ylabel(f"{simulated.case}\n{label}\n[{unit}]")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.align_ylabels(axes[:, 0])

@@ -53,8 +53,8 @@ def trials_of(plan: Plan, start: Choice, trials: int) -> Iterator[Trial]:
             return
         last = study.get_trials(deepcopy=False, states=FINISHED)[-1]
         pruned = last.state == TrialState.PRUNED
-        seen = list(last.intermediate_values.values())
-        score = sum(seen) / len(seen) if pruned and seen else last.values[0]
+        scores = list(last.intermediate_values.values())
+        score = sum(scores) / len(scores) if pruned and scores else last.values[0]
         yield Trial(dict(last.params), score, pruned)
 
 
@@ -131,8 +131,8 @@ class Bench:
 
     @property
     def _started(self) -> Choice:
-        own = self.tuned is not None and self.tuned.name == self.filter
-        return self.tuned if own and self.tuned is not None else rule_of_thumb(self.filter, self.problem)
+        is_own = self.tuned is not None and self.tuned.name == self.filter
+        return self.tuned if is_own and self.tuned is not None else rule_of_thumb(self.filter, self.problem)
 
     @cached_property
     def _parameters(self) -> tuple[Parameter, ...]:
@@ -214,8 +214,8 @@ class Bench:
             full_r=any(name.startswith("R") for name in full),
         )
         known = {knob.name: knob for knob in self.knobs}
-        chosen = [name for name, one in plan.parameters().items() if one.first is not None]
-        return plan._replace(where=tuple(f"{one} = {known[one].low!r}..{known[one].high!r}" for one in chosen))
+        chosen = [name for name, parameter in plan.parameters().items() if parameter.first is not None]
+        return plan._replace(where=tuple(f"{name} = {known[name].low!r}..{known[name].high!r}" for name in chosen))
 
     def study(self, values: Mapping[str, float], trials: int = 100) -> Iterator[Trial]:
         """A study from some values on, trial by trial; close the iterator to stop it."""
@@ -236,9 +236,9 @@ class Bench:
 
     def _choice(self, checked: Mapping[str, float]) -> Choice:
         choice = untuned_choice(self.filter, self.problem)
-        for one in self._parameters:
-            if checked[one.name] != neutral(one.name):
-                choice = one.set(choice, checked[one.name])
+        for parameter in self._parameters:
+            if checked[parameter.name] != neutral(parameter.name):
+                choice = parameter.set(choice, checked[parameter.name])
         return choice
 
     def _filter(self, checked: Mapping[str, float]) -> Filter:

@@ -73,16 +73,16 @@ def _found(base: Problem, problem: Problem) -> str:
         content = base.as_mapping()
         if content is None:
             return "\nproblem = ...  # of these logs"
-        files = [one["file"] for one in content["logs"]]
+        files = [log["file"] for log in content["logs"]]
         options = f", {_arguments(content['options'])}" if content["options"] else ""
         return f"from tuning.logs.problem import log_problem\n\nproblem = log_problem({files!r}{options})"
     if base.name not in built_in() and not base.name.endswith(".toml") and ":" not in base.name:
         return f"\nproblem = ...  # {short_repr(base.name)}"
-    found = f"from tuning.problems.find import find_problem\n\nproblem = find_problem({base.name!r})"
+    lines = f"from tuning.problems.find import find_problem\n\nproblem = find_problem({base.name!r})"
     if problem is base:
-        return found
+        return lines
     changes = {name: plain(getattr(problem, name)) for name in CHANGED if _differs(base, problem, name)}
-    return f"{found}.replace({_arguments(changes)})"
+    return f"{lines}.replace({_arguments(changes)})"
 
 
 def _differs(base: Problem, problem: Problem, name: str) -> bool:
@@ -109,8 +109,8 @@ class Map(NamedTuple):
 
 def values_along(knob: Knob, size: int) -> np.ndarray:
     """Values over the range of a knob, on its scale."""
-    found = (np.geomspace if knob.log else np.linspace)(knob.low, knob.high, size)
-    return np.unique(np.rint(found)) if knob.integer else np.clip(found, knob.low, knob.high)
+    values = (np.geomspace if knob.log else np.linspace)(knob.low, knob.high, size)
+    return np.unique(np.rint(values)) if knob.integer else np.clip(values, knob.low, knob.high)
 
 
 def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Filter, Data]], scale) -> Map:
@@ -124,10 +124,10 @@ def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Fil
         scale: of the score, (n,); None without truth.
     """
     xs, ys = values_along(x, size), values_along(y, size)
-    found = np.empty((2, len(ys), len(xs)))
+    figures = np.empty((2, len(ys), len(xs)))
     objective = find_objective(LIKELIHOOD if scale is None else SCORE)
 
     for row, column in np.ndindex(len(ys), len(xs)):
         evaluation = values_of(*case(xs[column].item(), ys[row].item()), scale)
-        found[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
-    return Map(x.name, y.name, xs, ys, *found)
+        figures[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
+    return Map(x.name, y.name, xs, ys, *figures)

@@ -22,10 +22,10 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     """One run's states in their bands and its innovations; NIS, NEES and autocorrelation of all runs."""
     run = min(run, len(view.estimate) - 1)
     panels: list[Callable[[Axes], None]] = []
-    for place, named in enumerate(bench.states[:MOST_STATES]):
-        panels.append(partial(_state, view=view, run=run, place=place, named=named))
-    for place, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
-        panels.append(partial(_innovation, view=view, run=run, place=place, named=named))
+    for i, named in enumerate(bench.states[:MOST_STATES]):
+        panels.append(partial(_state, view=view, run=run, i=i, named=named))
+    for i, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
+        panels.append(partial(_innovation, view=view, run=run, i=i, named=named))
     panels.append(lambda ax: _level(ax, view.time[run], view.nis, view.nis_band, "NIS"))
     if view.nees is not None and view.nees_band is not None:
         nees, band = view.nees, view.nees_band
@@ -33,7 +33,9 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     panels.append(lambda ax: _lags(ax, view))
     rows = -(-len(panels) // 2)
     figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
-    numbers = ",  ".join(f"{name} {one.value:.3g} {one.unit}".rstrip() for name, one in view.figures.items())
+    numbers = ",  ".join(
+        f"{name} {figure_.value:.3g} {figure_.unit}".rstrip() for name, figure_ in view.figures.items()
+    )
     figure.suptitle(f"{title or bench.title}\n{numbers}", fontsize=8)
     axes = figure.subplots(rows, 2, squeeze=False).ravel()
     for ax, draw in zip(axes, panels, strict=False):
@@ -48,19 +50,19 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
     return figure
 
 
-def _state(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
-    mean, half = view.estimate[run, :, place], WITHIN_95 * view.deviation[run, :, place]
+def _state(ax: Axes, view: View, run: int, i: int, named: Quantity) -> None:
+    mean, half = view.estimate[run, :, i], WITHIN_95 * view.deviation[run, :, i]
     ax.fill_between(view.time[run], mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
     if view.truth is not None:
-        ax.plot(view.time[run], view.truth[run, :, place], color=INK, linewidth=0.8)
+        ax.plot(view.time[run], view.truth[run, :, i], color=INK, linewidth=0.8)
     ax.plot(view.time[run], mean, color=ESTIMATE, linewidth=1.0)
     ax.set_ylabel(_labelled(named))
 
 
-def _innovation(ax: Axes, view: View, run: int, place: int, named: Quantity) -> None:
-    half = WITHIN_95 * view.innovation_deviation[run, :, place]
+def _innovation(ax: Axes, view: View, run: int, i: int, named: Quantity) -> None:
+    half = WITHIN_95 * view.innovation_deviation[run, :, i]
     ax.fill_between(view.time[run], -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
-    ax.plot(*present(view.time[run], view.innovation[run, :, place]), color=ESTIMATE, linewidth=0.7)
+    ax.plot(*present(view.time[run], view.innovation[run, :, i]), color=ESTIMATE, linewidth=0.7)
     ax.set_ylabel(f"innovation {_labelled(named)}")
 
 
@@ -87,12 +89,12 @@ def _labelled(named: Quantity) -> str:
 
 def present(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times and values where there is one: between two others that are missing, a line would show none."""
-    there = ~np.isnan(values)
-    return time[there], values[there]
+    known = ~np.isnan(values)
+    return time[known], values[known]
 
 
 def mean_of_runs(values: np.ndarray) -> np.ndarray:
     """The mean over runs (S, K) -> (K,) of what is finite; NaN where nothing is."""
-    there = np.isfinite(values)
-    total = np.where(there, values, 0.0).sum(axis=0)
-    return np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)

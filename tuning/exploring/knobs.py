@@ -55,7 +55,11 @@ def disturbances_of(problem: Problem) -> dict[Disturbance, float]:
     """The disturbances that a problem's plant may have, with their present values; none without a plant."""
     if not isinstance(problem, BaseScenario):
         return {}
-    return {one: _present(one, problem) for one in DISTURBANCES if hasattr(problem, one.place)}
+    return {
+        disturbance: _present(disturbance, problem)
+        for disturbance in DISTURBANCES
+        if hasattr(problem, disturbance.place)
+    }
 
 
 def disturbed(problem: Problem, values: Mapping[str, float]) -> Problem:
@@ -66,17 +70,27 @@ def disturbed(problem: Problem, values: Mapping[str, float]) -> Problem:
         values: by name of the disturbance: sizes in standard deviations of the sensor's noise.
     """
     present = disturbances_of(problem)
-    wanted = {one: values.get(one.name, value) for one, value in present.items()}
-    if not isinstance(problem, BaseScenario) or all(_same(wanted[one], value) for one, value in present.items()):
+    wanted = {disturbance: values.get(disturbance.name, value) for disturbance, value in present.items()}
+    if not isinstance(problem, BaseScenario) or all(
+        _same(wanted[disturbance], value) for disturbance, value in present.items()
+    ):
         return problem
     changes: dict[str, Any] = {}
     deviations = _deviations(problem)
-    if any(not _same(wanted[one], present[one]) for one in present if one.place == SENSORS):
+    if any(
+        not _same(wanted[disturbance], present[disturbance])
+        for disturbance in present
+        if disturbance.place == SENSORS
+    ):
         changes[SENSORS] = {
             channel: _with(effects, wanted, present, SENSORS, deviation)
             for (channel, effects), deviation in zip(_sensors(problem).items(), deviations, strict=True)
         }
-    if any(not _same(wanted[one], present[one]) for one in present if one.place == AMPLIFIER):
+    if any(
+        not _same(wanted[disturbance], present[disturbance])
+        for disturbance in present
+        if disturbance.place == AMPLIFIER
+    ):
         changes[AMPLIFIER] = _with(_amplifier(problem), wanted, present, AMPLIFIER, 1.0)
     return problem.replace(name=f"{problem.name} (changed)", **changes)
 
@@ -85,44 +99,44 @@ def _same(value: float, other: float) -> bool:
     return math.isclose(value, other, rel_tol=1e-9, abs_tol=1e-12)
 
 
-def _with(effects: list[dict], wanted: Mapping, present: Mapping, place: str, deviation: float) -> list[dict]:
+def _with(effects: list[dict], wanted: Mapping, present: Mapping, component: str, deviation: float) -> list[dict]:
     """A chain of effects with the wanted numbers."""
-    chain = {one["name"]: dict(one) for one in effects}
-    for one, value in wanted.items():
-        if one.place != place or (not one.adds and one.effect not in chain):
+    chain = {effect["name"]: dict(effect) for effect in effects}
+    for disturbance, value in wanted.items():
+        if disturbance.place != component or (not disturbance.adds and disturbance.effect not in chain):
             continue
-        if one.adds and value <= 0.0:
-            chain.pop(one.effect, None)
+        if disturbance.adds and value <= 0.0:
+            chain.pop(disturbance.effect, None)
             continue
-        unit = deviation if one.unit == SIGMA else 1.0
-        if one.effect not in chain:
-            sizes = {key: number * deviation for key, number in one.others}
-            chain[one.effect] = {"name": one.effect, **sizes}
-        elif _same(value, present[one]):
+        unit = deviation if disturbance.unit == SIGMA else 1.0
+        if disturbance.effect not in chain:
+            sizes = {key: number * deviation for key, number in disturbance.others}
+            chain[disturbance.effect] = {"name": disturbance.effect, **sizes}
+        elif _same(value, present[disturbance]):
             continue  # to the last digit, and of each channel its own
-        chain[one.effect][one.argument] = value * unit
+        chain[disturbance.effect][disturbance.argument] = value * unit
     return list(chain.values())
 
 
-def _present(one: Disturbance, problem: BaseScenario) -> float:
+def _present(disturbance: Disturbance, problem: BaseScenario) -> float:
     """The number as the scenario has it, of the first channel that has the effect."""
-    if one.place == AMPLIFIER:
+    if disturbance.place == AMPLIFIER:
         chains = [(_amplifier(problem), 1.0)]
     else:
         chains = list(zip(_sensors(problem).values(), _deviations(problem), strict=True))
     for effects, deviation in chains:
         for effect in effects:
-            if effect["name"] == one.effect:
-                value = effect.get(one.argument, one.start)
-                return float(value / deviation if one.unit == SIGMA else value)
-    return one.start
+            if effect["name"] == disturbance.effect:
+                value = effect.get(disturbance.argument, disturbance.start)
+                return float(value / deviation if disturbance.unit == SIGMA else value)
+    return disturbance.start
 
 
 def _sensors(problem: Any) -> dict[str, list[dict]]:
     """The chain of effects of each channel of a scenario."""
-    given = plain(problem.sensors)
-    own = given if isinstance(given, Mapping) else {}
-    return {channel: list(own.get(channel, [])) for channel in problem.plant.channels}
+    sensors = plain(problem.sensors)
+    by_channel = sensors if isinstance(sensors, Mapping) else {}
+    return {channel: list(by_channel.get(channel, [])) for channel in problem.plant.channels}
 
 
 def _amplifier(problem: Any) -> list[dict]:
@@ -132,8 +146,8 @@ def _amplifier(problem: Any) -> list[dict]:
 
 def _deviations(problem: Any) -> list[float]:
     """Standard deviation of each channel's noise."""
-    given = problem.measurement_noise_cov
-    variances = given if isinstance(given, list | tuple) else [given]
+    noise_cov = problem.measurement_noise_cov
+    variances = noise_cov if isinstance(noise_cov, list | tuple) else [noise_cov]
     return [math.sqrt(variance) for variance in variances]
 
 
@@ -164,10 +178,10 @@ def marks_of(name: str, problem: Problem, tuned: Choice | None = None, seed: int
     """The values of knobs, by name, of a filter's baselines and of a tuned filter."""
     same = tuned if tuned is not None and tuned.name == name else None
     known = baselines(name, problem, seed, ensemble_size=None if same is None else baseline_size(same))
-    found = {label: one for label, one in known.items() if label in KNOWN}
+    choices = {label: choice for label, choice in known.items() if label in KNOWN}
     if same is not None:
-        found[TUNED] = same
-    return {label: parameters_of(choice) for label, choice in found.items()}
+        choices[TUNED] = same
+    return {label: parameters_of(choice) for label, choice in choices.items()}
 
 
 def knobs_of(name: str, problem: Problem, marks: Mapping[str, Mapping[str, float]]) -> tuple[Knob, ...]:
@@ -180,46 +194,49 @@ def knobs_of(name: str, problem: Problem, marks: Mapping[str, Mapping[str, float
         problem: what it is on.
         marks: values of knobs, by name, for each label.
     """
-    found = []
-    for one in parameters(name, problem, **everything_of(problem)):
-        own = {label: values[one.name] for label, values in marks.items() if one.name in values}
-        low, high = one.first or (one.low, one.high)
-        low, high = min([low, *own.values()]), max([high, *own.values()])
-        label, group = _called(one, problem)
-        found.append(Knob(one.name, label, one.unit, low, high, one.log, one.integer, group, own))
+    knobs = []
+    for parameter in parameters(name, problem, **everything_of(problem)):
+        marked = {label: values[parameter.name] for label, values in marks.items() if parameter.name in values}
+        low, high = parameter.first or (parameter.low, parameter.high)
+        low, high = min([low, *marked.values()]), max([high, *marked.values()])
+        label, group = _called(parameter, problem)
+        knobs.append(
+            Knob(parameter.name, label, parameter.unit, low, high, parameter.log, parameter.integer, group, marked)
+        )
     for disturbance, value in disturbances_of(problem).items():
         what, high = disturbance, max(disturbance.high, value)
-        found.append(Knob(what.name, what.label, what.unit, 0.0, high, False, False, "disturbances", {}))
-    return tuple(found)
+        knobs.append(Knob(what.name, what.label, what.unit, 0.0, high, False, False, "disturbances", {}))
+    return tuple(knobs)
 
 
-def _called(one: Parameter, problem: Problem) -> tuple[str, str]:
+def _called(parameter: Parameter, problem: Problem) -> tuple[str, str]:
     """Label and group of a parameter."""
-    place, quantities = one.place, problem.quantities
-    if isinstance(place, ProcessVariance):
-        return f"Q of the {quantities.states[place.index].name}", "Q"
-    if isinstance(place, MeasurementVariance):
-        return f"R of the {quantities.measurements[place.index].name}", "R"
-    if isinstance(place, Correlation):
+    position, quantities = parameter.place, problem.quantities
+    if isinstance(position, ProcessVariance):
+        return f"Q of the {quantities.states[position.index].name}", "Q"
+    if isinstance(position, MeasurementVariance):
+        return f"R of the {quantities.measurements[position.index].name}", "R"
+    if isinstance(position, Correlation):
         return (
-            f"correlation in {'Q' if place.covariance == Q else 'R'}, {one.name.rpartition('_')[2]}",
+            f"correlation in {'Q' if position.covariance == Q else 'R'}, {parameter.name.rpartition('_')[2]}",
             "correlations",
         )
-    if place == PRIOR:
+    if position == PRIOR:
         return "factor on the prior covariance", "prior"
-    if isinstance(place, FilterParameter):
-        return place.name.replace("_", " "), "filter"
-    return one.name.replace("_", " "), "model"
+    if isinstance(position, FilterParameter):
+        return position.name.replace("_", " "), "filter"
+    return parameter.name.replace("_", " "), "model"
 
 
 def start_of(knobs: Sequence[Knob], problem: Problem, choice: Choice) -> dict[str, float]:
     """The value of each knob for a choice on a problem."""
-    own, plant = parameters_of(choice), {one.name: value for one, value in disturbances_of(problem).items()}
-    found = {}
+    chosen = parameters_of(choice)
+    plant = {disturbance.name: value for disturbance, value in disturbances_of(problem).items()}
+    values = {}
     for knob in knobs:
-        value = plant.get(knob.name, own.get(knob.name, neutral(knob.name)))
-        found[knob.name] = knob.low if value is None else value
-    return found
+        value = plant.get(knob.name, chosen.get(knob.name, neutral(knob.name)))
+        values[knob.name] = knob.low if value is None else value
+    return values
 
 
 def checked_values(

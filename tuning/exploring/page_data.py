@@ -33,10 +33,12 @@ def page_data(problem: Problem, seeds: int, seed: int, held_out: bool) -> PageDa
         held_out: whether they are those on which a study's choice is evaluated, as `thruster evaluate` does it.
     """
     if isinstance(problem, LogProblem):
-        blocks = [data_of(problem, some(seed, seeds)) for some in (problem.training_seeds, problem.held_out_seeds)]
+        blocks = [
+            data_of(problem, choose(seed, seeds)) for choose in (problem.training_seeds, problem.held_out_seeds)
+        ]
         return PageData(_whole(problem), *blocks)
-    some = problem.held_out_seeds if held_out else problem.training_seeds
-    data = data_of(problem, some(seed, seeds))
+    choose = problem.held_out_seeds if held_out else problem.training_seeds
+    data = data_of(problem, choose(seed, seeds))
     return PageData(data, data, None)
 
 
@@ -54,6 +56,6 @@ def _whole(problem: LogProblem) -> Data:
     )
     if problem.scale is None:
         return data.read_only()
-    states = padded([found for log in logs if (found := log.true_states(model)) is not None], rows)
+    states = padded([truth for log in logs if (truth := log.true_states(model)) is not None], rows)
     known = only(data.counted, ~np.isnan(states).any(axis=-1))
     return data._replace(states=states, counted=known).read_only()

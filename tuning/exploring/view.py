@@ -85,47 +85,47 @@ def _times(filter_: Filter, data: Data, dt: float) -> np.ndarray:
 def _figures(filter_: Filter, page_data: PageData, runs: RunMetrics, problem: Problem) -> dict[str, Figure]:
     """The figures of a bench: those of `tuning.evaluation`, without intervals."""
     data, scale = page_data.counted, problem.scale
-    found = _summed(filter_, data, scale, runs if data is page_data.drawn else None)
-    figures = {**_of_states(found, problem), **_of_innovations(found)}
+    evaluation = _summed(filter_, data, scale, runs if data is page_data.drawn else None)
+    figures = {**_of_states(evaluation, problem), **_of_innovations(evaluation)}
     if page_data.held_out is not None:
-        held = _summed(filter_, page_data.held_out, scale)
-        told = {**_of_states(held, problem), **_of_innovations(held)}
-        figures |= {f"held-out {name}": one for name, one in told.items() if name != "restarts"}
+        held_out = _summed(filter_, page_data.held_out, scale)
+        held_out_figures = {**_of_states(held_out, problem), **_of_innovations(held_out)}
+        figures |= {f"held-out {name}": figure for name, figure in held_out_figures.items() if name != "restarts"}
     return figures
 
 
 def _summed(filter_: Filter, data: Data, scale, runs: RunMetrics | None = None) -> Evaluation:
     """An evaluation without intervals and derived outputs, of metrics that are there or to be found."""
-    found = metrics_of_all(filter_, data, outputs=False, scale=scale) if runs is None else runs
-    return compute_metrics(filter_, found, data, scale, intervals=False, variances=False)
+    metrics = metrics_of_all(filter_, data, outputs=False, scale=scale) if runs is None else runs
+    return compute_metrics(filter_, metrics, data, scale, intervals=False, variances=False)
 
 
-def _of_states(found: Evaluation, problem: Problem) -> dict[str, Figure]:
-    if not found.has_truth:
+def _of_states(evaluation: Evaluation, problem: Problem) -> dict[str, Figure]:
+    if not evaluation.has_truth:
         return {}
     rmse = {
-        f"RMSE {state.symbol}": Figure(one.value, state.unit, LOWER)
-        for state, one in zip(found.states, found.rmse, strict=True)
+        f"RMSE {state.symbol}": Figure(error.value, state.unit, LOWER)
+        for state, error in zip(evaluation.states, evaluation.rmse, strict=True)
     }
-    score = {score_label([problem]).partition(" [")[0]: Figure(found.score.value, "-", LOWER)}
-    nees = Figure(found.nees.value, "-", NEAR, float(len(found.rmse)))
-    rest = {"NEES": nees, "log score": Figure(found.log_score.value, "nat", HIGHER)}
-    return {**rmse, **score, **{name: one for name, one in rest.items() if not np.isnan(one.value)}}
+    score = {score_label([problem]).partition(" [")[0]: Figure(evaluation.score.value, "-", LOWER)}
+    nees = Figure(evaluation.nees.value, "-", NEAR, float(len(evaluation.rmse)))
+    rest = {"NEES": nees, "log score": Figure(evaluation.log_score.value, "nat", HIGHER)}
+    return {**rmse, **score, **{name: figure for name, figure in rest.items() if not np.isnan(figure.value)}}
 
 
-def _of_innovations(found: Evaluation) -> dict[str, Figure]:
-    restarts = {"restarts": Figure(float(found.divergences), "-", LOWER)}
-    if np.isnan(found.log_likelihood):
+def _of_innovations(evaluation: Evaluation) -> dict[str, Figure]:
+    restarts = {"restarts": Figure(float(evaluation.divergences), "-", LOWER)}
+    if np.isnan(evaluation.log_likelihood):
         return restarts
-    nis = Figure(found.nis.value, "-", NEAR, found.expected_nis)
-    return {"NIS": nis, "log-likelihood": Figure(found.log_likelihood, "nat", HIGHER), **restarts}
+    nis = Figure(evaluation.nis.value, "-", NEAR, evaluation.expected_nis)
+    return {"NIS": nis, "log-likelihood": Figure(evaluation.log_likelihood, "nat", HIGHER), **restarts}
 
 
 def _whole(late: np.ndarray, data: Data) -> np.ndarray:
     """Values (S, T) of late steps as those of all steps, NaN before."""
-    found = np.full(data.measurements.shape[:2], np.nan)
-    found[:, data.late] = late
-    return found
+    values = np.full(data.measurements.shape[:2], np.nan)
+    values[:, data.late] = late
+    return values
 
 
 def _there(data: Data, values: np.ndarray) -> np.ndarray:
@@ -149,12 +149,14 @@ def _whiteness(estimates: Estimates, data: Data) -> tuple[np.ndarray, float]:
     """Autocorrelations (m, L) of the scored innovations, and the half-width of their band."""
     late = data.late
     present = ~np.isnan(data.late_scored(data.measurements))
-    found = whiteness(
+    result = whiteness(
         estimates.innovations[:, late],
         estimates.innovation_covs[:, late],
         present,
         min(LAGS, present.shape[1] - 1),
     )
-    widths = np.einsum("lii->il", found.half_widths)
-    told = widths[widths < 1.0]  # of slow sensors some lags have no pairs, and any correlation lies within theirs
-    return np.einsum("lii->il", found.correlations).copy(), float(told.max(initial=0.0)) or 1.0
+    widths = np.einsum("lii->il", result.half_widths)
+    informative = widths[
+        widths < 1.0
+    ]  # of slow sensors some lags have no pairs, and any correlation lies within theirs
+    return np.einsum("lii->il", result.correlations).copy(), float(informative.max(initial=0.0)) or 1.0

@@ -44,7 +44,7 @@ class Profile(NamedTuple):
 
 
 def profiles(
-    found: Identification,
+    identification: Identification,
     names: Sequence[str] | None = None,
     *,
     reach: Sequence[float] = REACH,
@@ -53,7 +53,7 @@ def profiles(
     """Profile likelihoods of parameters; after Ctrl-C those that are done.
 
     Args:
-        found: from `identify`.
+        identification: from `identify`.
         names: names of the parameters; all if None.
         reach: distances in standard errors, to either side, at which a parameter is held, within its range.
         progress: called with the name of each parameter.
@@ -66,47 +66,53 @@ def profiles(
     """
     curves = []
     with stop_on_interrupt() as asked:
-        for name in found.names if names is None else names:
-            index = found.names.index(one_of("a parameter", name, found.names))
+        for name in identification.names if names is None else names:
+            index = identification.names.index(one_of("a parameter", name, identification.names))
             progress(name)
-            points = [(found.at[index], found.log_likelihood)]
+            points = [(identification.at[index], identification.log_likelihood)]
             for sign in (1.0, -1.0):
-                points += _side(found, index, [sign * part for part in reach], asked)
+                points += _side(identification, index, [sign * part for part in reach], asked)
             if asked():
                 break
             at, values = np.array(sorted(points)).T
-            points_at = np.tile(found.at, (len(at), 1))
+            points_at = np.tile(identification.at, (len(at), 1))
             points_at[:, index] = at
-            natural = np.array([found.objective.coordinates.values(row)[index] for row in points_at])
+            natural = np.array([identification.objective.coordinates.values(row)[index] for row in points_at])
             curves.append(Profile(name, natural, values))
     return curves
 
 
-def _side(found: Identification, index: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
+def _side(identification: Identification, index: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
     """Points outwards; the other parameters start in the direction of their correlation with this one."""
-    coordinates, error = found.objective.coordinates, np.sqrt(found.cov[index, index])
-    slope = found.cov[:, index] / found.cov[index, index]
+    coordinates, error = identification.objective.coordinates, np.sqrt(identification.cov[index, index])
+    slope = identification.cov[:, index] / identification.cov[index, index]
     points: list[tuple[float, float]] = []
-    fixed = np.arange(len(found.at)) == index
+    fixed = np.arange(len(identification.at)) == index
     for part in reach:
         move = part * error
-        at = np.clip(found.at + slope * move, coordinates.low, coordinates.high)
-        if asked() or at[index] in [point for point, _ in points] or at[index] == found.at[index]:
+        at = np.clip(identification.at + slope * move, coordinates.low, coordinates.high)
+        if asked() or at[index] in [point for point, _ in points] or at[index] == identification.at[index]:
             break
         maximum = climb(
-            found.objective, at, coordinates.low, coordinates.high, fixed=fixed, iterations=LEGS, stop=asked
+            identification.objective,
+            at,
+            coordinates.low,
+            coordinates.high,
+            fixed=fixed,
+            iterations=LEGS,
+            stop=asked,
         )
         points.append((float(at[index]), maximum.found.value))
     return points
 
 
-def profile_figure(found: Identification, curves: Sequence[Profile]):
+def profile_figure(identification: Identification, curves: Sequence[Profile]):
     """A panel for each profile: how far log L falls, the 95 % line, and the parabola of the standard error."""
     figure, axes = panels(len(curves), 3, (3.0, 2.2), 0.2)
     for axis, profile in zip(axes, curves, strict=True):
-        falls = profile.log_likelihoods - found.log_likelihood
-        parameter = found.objective.coordinates.free[found.names.index(profile.name)]
-        best, error = found.values[profile.name], found.standard_errors[profile.name]
+        falls = profile.log_likelihoods - identification.log_likelihood
+        parameter = identification.objective.coordinates.free[identification.names.index(profile.name)]
+        best, error = identification.values[profile.name], identification.standard_errors[profile.name]
         grid = np.linspace(profile.values[0], profile.values[-1], 100)
         axis.plot(grid, -0.5 * ((grid - best) / error) ** 2, color=RUST, linewidth=1, label="standard error")
         axis.plot(profile.values, falls, "o-", color=BLUE, linewidth=1.2, markersize=3, label="profile")

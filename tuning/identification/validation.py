@@ -75,27 +75,29 @@ def validation_of(
 
 
 def validate(
-    found: Identification, data: Data | Log | Sequence[Data | Log] | None = None
+    identification: Identification, data: Data | Log | Sequence[Data | Log] | None = None
 ) -> dict[str, Validation]:
     """The model at the start and at the identified values, "start" and "identified".
 
     Args:
-        found: from `identify`.
+        identification: from `identify`.
         data: held-out runs; None for those of the identification. If a free parameter moves the data, held-out
             runs must be given as a function of it, too.
     """
-    objective = found.objective
+    objective = identification.objective
     if data is not None:
         objective = objective.with_changes(data=data, starts=None)
     points = {
-        "start": objective.coordinates.of([found.start[name] for name in found.names]),
-        "identified": found.at,
+        "start": objective.coordinates.of([identification.start[name] for name in identification.names]),
+        "identified": identification.at,
     }
     unseen, starts = objective.unseen, objective.starts
     if data is not None:
-        prior_moves = objective.moves_prior(found.at)
+        prior_moves = objective.moves_prior(identification.at)
         starts = (
-            None if prior_moves else starts_of(objective.model_at(found.at), objective.data_at(found.at), unseen)
+            None
+            if prior_moves
+            else starts_of(objective.model_at(identification.at), objective.data_at(identification.at), unseen)
         )
     return {
         name: validation_of(objective.model_at(at), objective.data_at(at), unseen, starts)

@@ -22,7 +22,9 @@ from tuning.identification.result import Identification
 TABLES = ("values", "identified")
 
 
-def write_values(path: str | Path, found: Identification, logs: Sequence[str], dt: float | None = None) -> None:
+def write_values(
+    path: str | Path, identification: Identification, logs: Sequence[str], dt: float | None = None
+) -> None:
     """Write the identified values of a model, and the sample time of its logs [s], if that is known.
 
     Raises:
@@ -33,12 +35,12 @@ def write_values(path: str | Path, found: Identification, logs: Sequence[str], d
     check_not_among(path)
     identified = {
         "logs": [Path(log).name for log in logs],
-        "log_likelihood": found.log_likelihood,
-        "standard_errors": found.standard_errors,
-        "determined": found.determined,
+        "log_likelihood": identification.log_likelihood,
+        "standard_errors": identification.standard_errors,
+        "determined": identification.determined,
         **({} if dt is None else {"dt": float(dt)}),
     }
-    tables: dict[str, Mapping] = {"values": found.values, "identified": identified}
+    tables: dict[str, Mapping] = {"values": identification.values, "identified": identified}
     write_whole(path, as_toml(tables, "Numbers of a model as `thruster identify` found them."))
 
 

@@ -73,8 +73,10 @@ def standings(filters: Mapping[str, Filter], problem: Problem, seeds: Sequence[i
     """Filters by label on held-out seeds of a problem, and on the same with longer runs and larger noise."""
     data = data_of(problem, seeds)
     runs = {HELD_OUT: data, LONGER: twice_as_long(problem, seeds), NOISIER: with_larger_noise(problem, data)}
-    found = []
+    results = []
     for label, filter_ in filters.items():
-        some = {name: evaluate(filter_, one, problem.scale) for name, one in runs.items() if one is not None}
-        found.append(Standing(label, filter_.name, some))
-    return found
+        evaluations = {
+            name: evaluate(filter_, data_, problem.scale) for name, data_ in runs.items() if data_ is not None
+        }
+        results.append(Standing(label, filter_.name, evaluations))
+    return results

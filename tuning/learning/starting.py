@@ -32,9 +32,9 @@ def starting_filter(problem: Problem, data: Data, seed: int) -> tuple[str, Filte
     Returns:
         Its label, such as "ekf scaled default", and the filter.
     """
-    choices = {name: one for name, one in baselines(START, problem, seed).items() if name != ORACLE}
-    filters = {f"{START} {name}": one.filter(problem) for name, one in choices.items()}
-    return min(filters.items(), key=lambda one: values_of(one[1], data, problem.scale).score.value)
+    choices = {name: choice for name, choice in baselines(START, problem, seed).items() if name != ORACLE}
+    filters = {f"{START} {name}": choice.filter(problem) for name, choice in choices.items()}
+    return min(filters.items(), key=lambda entry: values_of(entry[1], data, problem.scale).score.value)
 
 
 def new_estimator(
@@ -70,49 +70,49 @@ def scales_of(filter_: Filter, data: Data) -> Scales:
 
     The gain is that of the corrections K v that are nearest to the filter's, by least squares.
     """
-    seen, model = data.seen, filter_.model
-    estimates = run(filter_, seen.filter_keys, seen.inputs, seen.measurements)
+    runs, model = data.seen, filter_.model
+    estimates = run(filter_, runs.filter_keys, runs.inputs, runs.measurements)
     states = data.known_states
     mean, n = estimates.means, states.shape[-1]
-    innovation = np.where(np.isnan(seen.measurements), 0.0, estimates.innovations)
+    innovation = np.where(np.isnan(runs.measurements), 0.0, estimates.innovations)
     counted = np.isfinite(states).all(axis=-1)
     later = counted[:, 1:]
-    corrected = wrapped_where(mean[:, 1:] - _predicted(model, mean, seen.inputs), model.shape.state_angles)
-    moved = wrapped_where(np.diff(mean, axis=1), model.shape.state_angles)
-    measured = wrapped_where(np.diff(seen.measurements, axis=1), model.shape.measurement_angles)
+    corrected = wrapped_where(mean[:, 1:] - _predicted(model, mean, runs.inputs), model.shape.state_angles)
+    changes = wrapped_where(np.diff(mean, axis=1), model.shape.state_angles)
+    measured = wrapped_where(np.diff(runs.measurements, axis=1), model.shape.measurement_angles)
     error = np.ones(model.n)
     error[:n] = _size(wrapped_where((mean[..., :n] - states)[counted], model.shape.state_angles[:n]))
     truth = states[counted] if n == model.n else mean[counted]
-    _check_measured(seen.measurements, model)
+    _check_measured(runs.measurements, model)
     gain = np.linalg.lstsq(innovation[:, 1:][later], corrected[later], rcond=None)[0].T
-    spread = _large(np.nanstd(seen.measurements, axis=(0, 1)))
+    spread = _large(np.nanstd(runs.measurements, axis=(0, 1)))
     steps = _size(measured[later])
     return Scales(
         truth.mean(axis=0),
         _large(truth.std(axis=0)),
-        _size(moved[later]),
+        _size(changes[later]),
         _size(corrected[later]),
         error,
-        np.nanmean(seen.measurements, axis=(0, 1)),
+        np.nanmean(runs.measurements, axis=(0, 1)),
         spread,
         np.where(np.isnan(steps), spread, steps),  # of a channel that is never measured twice in a row
         _size(innovation[counted]),
-        seen.inputs.mean(axis=(0, 1)),
-        _large(seen.inputs.std(axis=(0, 1))),
+        runs.inputs.mean(axis=(0, 1)),
+        _large(runs.inputs.std(axis=(0, 1))),
         gain,
     )
 
 
 def _check_measured(measurements: np.ndarray, model: StateSpaceModel) -> None:
     """Raise ValueError unless each channel (B, K + 1, m) has measurements, without which it has no scale."""
-    for one, values in zip(model.measurements, np.moveaxis(measurements, -1, 0), strict=True):
+    for channel, values in zip(model.measurements, np.moveaxis(measurements, -1, 0), strict=True):
         if not np.isfinite(values).any():
-            raise ValueError(f"a training must have measurements of each channel, but {one.symbol} has none")
+            raise ValueError(f"a training must have measurements of each channel, but {channel.symbol} has none")
 
 
 def _predicted(model: StateSpaceModel, mean: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     """The predictions (B, K, n) from means (B, K + 1, n) and inputs (B, K, p)."""
-    x, u = (torch.tensor(one).flatten(0, 1) for one in (mean[:, :-1], inputs))
+    x, u = (torch.tensor(values).flatten(0, 1) for values in (mean[:, :-1], inputs))
     return Equations(model).moved(x, u).numpy().reshape(mean[:, 1:].shape)
 
 

@@ -46,8 +46,8 @@ class Loss:
     def __call__(self, track: Track, truth: Tensor, scored: Tensor) -> Tensor:
         """The sum over the runs (B,) that are scored, at a step with true states (B, n)."""
         known = torch.where(scored[:, None], truth, 0.0)
-        whole = torch.nn.functional.pad(known, (0, self._extra))
-        error = self._wrapped(track.mean - whole)[:, self._states]
+        all_states = torch.nn.functional.pad(known, (0, self._extra))
+        error = self._wrapped(track.mean - all_states)[:, self._states]
         if not self._has_covariance:
             return torch.where(scored, (self._weights * error**2).sum(-1), 0.0).sum()
         assert track.cov is not None
@@ -126,7 +126,7 @@ def _train(
         nonlocal best
         with np.errstate(over="ignore"):  # of a network that has got worse
             score = values_of(filter_, validation, scale).score.value
-        is_best = np.isfinite(score) and all(not score >= one.score for one in checks)
+        is_best = np.isfinite(score) and all(not score >= check_.score for check_ in checks)
         if is_best:
             best = copy.deepcopy(estimator.state_dict())
         checks.append(Check(step, float(np.mean(values)) if values else np.nan, score, bool(is_best)))
@@ -162,21 +162,21 @@ def _losses(
 
     Steps before the first one that is scored have no derivatives.
     """
-    seen, scored = data.seen, torch.tensor(data.scored)
-    u, z, truth = (torch.tensor(part) for part in (seen.inputs, seen.measurements, data.known_states))
+    runs, scored = data.seen, torch.tensor(data.scored)
+    u, z, truth = (torch.tensor(part) for part in (runs.inputs, runs.measurements, data.known_states))
     count, times = scored.shape
     first = max(data.first_scored, 1)
     while True:
-        some = torch.tensor(generator.permutation(count)[: settings.batch])
+        batch = torch.tensor(generator.permutation(count)[: settings.batch])
         with torch.no_grad():
-            track = estimator.begin(seen.filter_keys[some], z[some, 0])
+            track = estimator.begin(runs.filter_keys[batch], z[batch, 0])
             for k in range(1, min(first, times)):
-                track = estimator.advance(track, u[some, k - 1], z[some, k])
+                track = estimator.advance(track, u[batch, k - 1], z[batch, k])
         for begin in range(first, times, settings.window):
             steps = slice(begin, begin + settings.window)
             total, track = torch.zeros((), dtype=torch.float64), track.detach()
             for k in range(*steps.indices(times)):
-                track = estimator.advance(track, u[some, k - 1], z[some, k])
-                total = total + loss(track, truth[some, k], scored[some, k])
-            if counted := scored[some, steps].sum():
+                track = estimator.advance(track, u[batch, k - 1], z[batch, k])
+                total = total + loss(track, truth[batch, k], scored[batch, k])
+            if counted := scored[batch, steps].sum():
                 yield total / counted

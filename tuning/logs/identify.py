@@ -61,13 +61,13 @@ def split_runs(
     check_apart(*parts)
     if hold_gaps or any(log.stamps is not None for log in read):
         return parts
-    found = [[piece for log in some for piece in cut_at_gaps(log, SHORTEST_PIECE)] for some in parts]
-    if not found[0]:
+    pieces = [[piece for log in logs_ for piece in cut_at_gaps(log, SHORTEST_PIECE)] for logs_ in parts]
+    if not pieces[0]:
         raise ValueError(
             f"logs must have {SHORTEST_PIECE} rows without a gap (or give hold_gaps, --hold-gaps), but "
             f"{', '.join(log.name for log in parts[0])} do not"
         )
-    return found[0], found[1]
+    return pieces[0], pieces[1]
 
 
 def family_of(
@@ -105,8 +105,8 @@ def family_of(
         return AnyStepFamily(of_preset, logs) if stamped else of_preset
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
-    found = object_named(model, "model") if isinstance(model, str) else model
-    family = LoggedFamily(logs, in_discrete_time(found), list(free), noise=noise, dt=logs[0].dt)
+    offered = object_named(model, "model") if isinstance(model, str) else model
+    family = LoggedFamily(logs, in_discrete_time(offered), list(free), noise=noise, dt=logs[0].dt)
     return AnyStepFamily(family, logs) if stamped else family
 
 
@@ -138,7 +138,9 @@ class AnyStepFamily:
     def __init__(self, plain: Any, logs: Sequence[Log]):
         """Check the model."""
         self.plain, self.free, self.data, self.dt = plain, plain.free, tuple(logs), logs[0].dt
-        moving = next((one.name for one in self.free if one.name.startswith("clock_offset_")), None)
+        moving = next(
+            (parameter.name for parameter in self.free if parameter.name.startswith("clock_offset_")), None
+        )
         if moving is not None:
             raise ValueError(f"parameters on a log's own stamps must not move these, but got {moving}")
         self.model()
@@ -152,53 +154,53 @@ class AnyStepFamily:
         return tuple(logs)
 
 
-def remarks(runs: Sequence[Log], proving: Sequence[Log], found: Identification) -> list[str]:
+def remarks(runs: Sequence[Log], proving: Sequence[Log], result: Identification) -> list[str]:
     """Findings in the logs, remedies, and the meaning of a gate for a filter with these parameters.
 
     Args:
         runs: training runs, or their pieces between gaps.
         proving: held-out ones.
-        found: what was identified.
+        result: what was identified.
     """
     logs = (*runs, *proving)
-    said = remarks_on(logs)
+    sentences = remarks_on(logs)
     if any(log.uncut is not None for log in logs):
-        said.append(
+        sentences.append(
             "Runs are cut at gaps: each piece is a separate run with its own initial state (--hold-gaps, "
             "hold_gaps=True, does not cut)."
         )
-    if has_outliers(runs) and not found.left_out:
-        said.append(
+    if has_outliers(runs) and not result.left_out:
+        sentences.append(
             "Outliers bias the result: --gate 5 (gate=5) leaves out samples beyond five standard deviations."
         )
-    gate = found.objective.gate
+    gate = result.objective.gate
     if gate < math.inf:
-        held_out, seen = "held-out runs count all samples", "the runs it has seen are of the same samples"
-        said.append(
+        held_out, training_note = "held-out runs count all samples", "the runs it has seen are of the same samples"
+        sentences.append(
             "R and Q are those of the samples within the gate: a filter that also meets the outliers needs a "
             f"gate (session(gate={gate:g})), or to be robust (ekf-robust). Figures of "
-            f"{(held_out if proving else seen)}."
+            f"{(held_out if proving else training_note)}."
         )
-    return said
+    return sentences
 
 
 def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
     """Raise ValueError unless ranges of clock offsets are short: without common data any model would fit."""
     most = min(log.times[-1] for log in logs) / OFFSET_SHARE
-    for one in parameters:
-        if one.name.startswith("clock_offset_") and max(-one.low, one.high) > most:
+    for parameter in parameters:
+        if parameter.name.startswith("clock_offset_") and max(-parameter.low, parameter.high) > most:
             raise ValueError(
-                f"the range of {one.name} must be within a quarter of the shortest log, {most:g} s, but is from "
-                f"{one.low:g} to {one.high:g}"
+                f"the range of {parameter.name} must be within a quarter of the shortest log, {most:g} s, but is "
+                f"from {parameter.low:g} to {parameter.high:g}"
             )
 
 
-def write_found(path: str | Path, found: Identification, family: Any, logs: Sequence[str]) -> None:
+def write_found(path: str | Path, result: Identification, family: Any, logs: Sequence[str]) -> None:
     """Write the preset file of a thruster, or the values of a model.
 
     Args:
         path: path of a file that ends in .toml.
-        found: from `tuning.identification.identify`.
+        result: from `tuning.identification.identify`.
         family: from `family_of`.
         logs: names of the training runs.
 
@@ -209,6 +211,6 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
         raise ValueError(f"a file of identified parameters must end in .toml, but got {short_repr(str(path))}")
     family = family.plain if isinstance(family, AnyStepFamily) else family
     if isinstance(family, ModelFamily):
-        write_values(path, found, logs, getattr(family, "dt", None))  # of a family of logs
+        write_values(path, result, logs, getattr(family, "dt", None))  # of a family of logs
     else:
-        logs_package().write_identified(path, found, family, logs)
+        logs_package().write_identified(path, result, family, logs)

@@ -42,16 +42,18 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
     return logs, None, model
 
 
-def _is_model(one: Any) -> bool:
+def _is_model(candidate: Any) -> bool:
     """Whether something is a model, what makes or offers one, code, or a thruster's preset, but no log."""
-    if isinstance(one, str | Path):
-        if Path(one).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
+    if isinstance(candidate, str | Path):
+        if Path(candidate).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
-        return is_code(str(one)) or logs_package().is_preset(one)
+        return is_code(str(candidate)) or logs_package().is_preset(candidate)
     return (
-        isinstance(one, StateSpaceModel | ContinuousModel) or hasattr(one, "state_space_model") or _makes_one(one)
+        isinstance(candidate, StateSpaceModel | ContinuousModel)
+        or hasattr(candidate, "state_space_model")
+        or _makes_one(candidate)
     )
 
 
-def _makes_one(one: Any) -> bool:
-    return callable(one) and not isinstance(one, Log) and not hasattr(one, "columns")
+def _makes_one(candidate: Any) -> bool:
+    return callable(candidate) and not isinstance(candidate, Log) and not hasattr(candidate, "columns")

@@ -51,17 +51,17 @@ def log_problem(
     Raises:
         ValueError: states the rule and the value.
     """
-    runs, held = runs_by_name(logs, held_out)
+    runs, held_names = runs_by_name(logs, held_out)
     if not runs:
         raise ValueError(
             "a problem of logs must have at least one, in (model, logs) or by --log FILE, but got none"
         )
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
-    recorded = without_rescaled(recorded, held) if apart else recorded
+    recorded = without_rescaled(recorded, held_names) if apart else recorded
     runs = {log.name: runs[log.name] for log in recorded}
     model = read_for(recorded[0], pairs[0][1])[1]()
-    cuts: dict[str, Any] = {"held_out": held, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
+    cuts: dict[str, Any] = {"held_out": held_names, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
     cuts["start"] = start
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
     return LogProblem(recorded, model, **cuts, apart=apart, content=_content(runs, options, cuts))
@@ -72,37 +72,37 @@ def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[
     runs: dict[str, Any] = {}
     for log in listed(logs):
         _add(runs, name_of(log, len(runs)), log)
-    held = []
+    names = []
     for log in listed(held_out):
-        name = next((known for known, one in runs.items() if _is_same(one, log)), name_of(log, len(runs)))
+        name = next((known for known, run in runs.items() if _is_same(run, log)), name_of(log, len(runs)))
         if not (isinstance(log, str) and name in runs):
             _add(runs, name, log)
-        held.append(name)
-    return runs, list(dict.fromkeys(held))
+        names.append(name)
+    return runs, list(dict.fromkeys(names))
 
 
-def without_rescaled(logs: Sequence[Log], held: Sequence[str]) -> list[Log]:
+def without_rescaled(logs: Sequence[Log], held_names: Sequence[str]) -> list[Log]:
     """The logs without those that are the content of a held-out one under another name.
 
     Args:
         logs: recorded runs.
-        held: names of the held-out ones.
+        held_names: names of the held-out ones.
 
     Raises:
         ValueError: if nothing is left to learn from.
     """
-    proving = {log.digest for log in logs if log.name in held}
-    left = [log for log in logs if log.name in held or log.digest not in proving]
-    if held and all(log.name in held for log in left):
+    proving = {log.digest for log in logs if log.name in held_names}
+    left = [log for log in logs if log.name in held_names or log.digest not in proving]
+    if held_names and all(log.name in held_names for log in left):
         raise ValueError("at least one log must be left to learn from, but all are held out")
     return left
 
 
-def _is_same(one: Any, other: Any) -> bool:
+def _is_same(first: Any, other: Any) -> bool:
     """Whether two runs are one object, or paths of one file."""
-    if isinstance(one, str | PathLike) and isinstance(other, str | PathLike):
-        return Path(one).resolve() == Path(other).resolve()
-    return one is other
+    if isinstance(first, str | PathLike) and isinstance(other, str | PathLike):
+        return Path(first).resolve() == Path(other).resolve()
+    return first is other
 
 
 def listed(logs: Any) -> list:
@@ -118,11 +118,11 @@ def _add(runs: dict[str, Any], name: str, log: Any) -> None:
     runs.setdefault(name, log)
 
 
-def name_of(log: Any, place: int) -> str:
+def name_of(log: Any, index: int) -> str:
     """Name of a log: its path, its own name, or for a table its number."""
     if isinstance(log, Log):
         return log.name
-    return str(log) if isinstance(log, str | PathLike) else f"run{place + 1}"
+    return str(log) if isinstance(log, str | PathLike) else f"run{index + 1}"
 
 
 def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[str, Any]) -> dict | None:
@@ -134,8 +134,8 @@ def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[
         plain[name] = texts(plain.get(name))
     plain["preset"] = None if plain.get("preset") is None else str(plain["preset"])
     plain["sensors"] = None if plain.get("sensors") is None else list(plain["sensors"])
-    kept = {name: plain[name] for name in options if plain[name] is not None}
-    return {"options": {**kept, **cuts}}
+    set_options = {name: plain[name] for name in options if plain[name] is not None}
+    return {"options": {**set_options, **cuts}}
 
 
 def problems_in(file: Path, model: str | None = None, preset: str | Path | None = None) -> list[Problem]:
@@ -154,7 +154,7 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
     """
     if not file.is_file():
         return []
-    found: list[Problem] = []
+    problems: list[Problem] = []
     of_file = read_tuned_file(file)
     for name, entry in of_file["problems"].items():
         content = entry.get("content") if isinstance(entry, dict) else None
@@ -163,7 +163,7 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
         if not isinstance(content, dict) or "logs" not in content:
             continue
         try:
-            paths = [one["file"] for one in content["logs"]]
+            paths = [log["file"] for log in content["logs"]]
             options = dict(content["options"])
             if not all(isinstance(path, str) for path in paths) or set(options) - {*OPTIONS, *CUTS}:
                 raise TypeError
@@ -177,15 +177,15 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
         options |= {} if preset is None else {"preset": str(preset)}
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
-            said = f"logs in a tuned file must be those of {short_repr(name)}"
-            raise ValueError(f"{said}, but {file} has {problem.name}")
-        found.append(named(problem, name))
-    if preset is not None and not found and str(preset) != tune_options(of_file).get("preset"):
+            rule = f"logs in a tuned file must be those of {short_repr(name)}"
+            raise ValueError(f"{rule}, but {file} has {problem.name}")
+        problems.append(named(problem, name))
+    if preset is not None and not problems and str(preset) != tune_options(of_file).get("preset"):
         raise ValueError(
             f"preset (--preset) must be that of the tuned file, but got {preset}, and {file} was made with "
             f"{made_with(of_file)}, whose contents it holds: leave --preset out"
         )
-    return found
+    return problems
 
 
 def _check_logs_are_there(paths: Sequence[str], file: Path) -> None:

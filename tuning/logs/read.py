@@ -60,9 +60,9 @@ def read_named(
         "stamps": stamps,
     }
     if isinstance(path, Log):
-        given = next((key for key, value in options.items() if value not in (None, {})), None)
-        if given is not None:
-            raise ValueError(f"{given} must come with a file or a table, but {path.name} is a Log already")
+        option = next((key for key, value in options.items() if value not in (None, {})), None)
+        if option is not None:
+            raise ValueError(f"{option} must come with a file or a table, but {path.name} is a Log already")
     elif name is not None:
         options["name"] = name
     if model is not None:
@@ -86,27 +86,27 @@ def read_named(
     return log, room.Preset(whose, sensors, log.dt)
 
 
-def pairs(option: str, given: Named) -> dict[str, Any]:
+def pairs(option: str, named: Named) -> dict[str, Any]:
     """A mapping, from a mapping or from texts NAME=VALUE; ValueError for another form, or a repeated name."""
-    if isinstance(given, Mapping):
-        return dict(given)
-    if isinstance(given, str) or not isinstance(given, Sequence | None):
-        raise ValueError(f"{option} must be a mapping by name, or texts NAME=VALUE, but got {short_repr(given)}")
-    found: dict[str, str] = {}
-    for text in given or []:
+    if isinstance(named, Mapping):
+        return dict(named)
+    if isinstance(named, str) or not isinstance(named, Sequence | None):
+        raise ValueError(f"{option} must be a mapping by name, or texts NAME=VALUE, but got {short_repr(named)}")
+    values: dict[str, str] = {}
+    for text in named or []:
         name, equals, value = text.partition("=")
-        if not (name and equals and value) or name in found:
-            rule = "be given once for each name" if name in found else "have the form NAME=VALUE"
+        if not (name and equals and value) or name in values:
+            rule = "be given once for each name" if name in values else "have the form NAME=VALUE"
             raise ValueError(f"{option} must {rule}, but got {short_repr(text)}")
-        found[name.strip()] = value.strip()
-    return found
+        values[name.strip()] = value.strip()
+    return values
 
 
-def texts(given: Named) -> list[str] | None:
+def texts(named: Named) -> list[str] | None:
     """The same as texts NAME=VALUE, as in files; None for nothing."""
-    if given is None:
+    if named is None:
         return None
-    return [f"{name}={value}" for name, value in given.items()] if isinstance(given, Mapping) else list(given)
+    return [f"{name}={value}" for name, value in named.items()] if isinstance(named, Mapping) else list(named)
 
 
 def _seconds(name: str, value: Any) -> float:
@@ -134,13 +134,13 @@ def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, An
     return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
 
 
-def check_model(named, given: str | None, file: str | Path) -> None:
+def check_model(named, trusted: str | None, file: str | Path) -> None:
     """Raise ValueError unless the caller gives exactly the code that a file names."""
-    if named is None and given is not None:
+    if named is None and trusted is not None:
         raise ValueError(
-            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(given)}"
+            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(trusted)}"
         )
-    if named != given:
+    if named != trusted:
         raise ValueError(
             f"the model of logs must be given if it is code, "
             f"but {file} only names {short_repr(named)}: use --model "

@@ -31,8 +31,8 @@ class ClassicalPolicy:
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Actions (n, p) in [-1, 1] for observations (n, d), and the controller's state."""
-        seen = np.asarray(observation)[..., self.skipped :]
-        inputs, state = self.controller.predict(seen, state, episode_start)
+        observed = np.asarray(observation)[..., self.skipped :]
+        inputs, state = self.controller.predict(observed, state, episode_start)
         return (inputs - self.middle) / self.half, state
 
     def replace_last_actions(self, state: np.ndarray, actions: np.ndarray) -> None:

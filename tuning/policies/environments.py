@@ -46,15 +46,15 @@ def make_environments(
     else:
         venv = DummyVecEnv([lambda: make_single(setup, render_mode) for _ in seeds])
     observed = find_observation_set(setup.observe)
-    one: Any = make_single(setup).env
+    single: Any = make_single(setup).env
     if observed.pairs:
-        venv = ShowHistory(venv, observed.pairs, one.unwrapped.appended_entries)
+        venv = ShowHistory(venv, observed.pairs, single.unwrapped.appended_entries)
     plant = plant_of(setup.task)
     if observed.shows_state and plant.output is not None:
-        model = one.unwrapped.state_space_model() if observed.is_true else one.filter.model
+        model = single.unwrapped.state_space_model() if observed.is_true else single.filter.model
         venv = ShowOutput(venv, model, plant.output)
     if setup.controller is not None:
-        venv = CorrectController(venv, plant.corrected(setup.controller, one), setup.share)
+        venv = CorrectController(venv, plant.corrected(setup.controller, single), setup.share)
     seed_episodes(venv, seeds)
     return VecMonitor(venv)
 
@@ -66,10 +66,10 @@ def seed_episodes(venv: VecEnv, seeds: Sequence[int]) -> None:
 
 def native_of(venv: VecEnv) -> NativeVecEnv:
     """The native envs within wrappers; ValueError for single ones."""
-    found = venv.unwrapped
-    if not isinstance(found, NativeVecEnv):
-        raise ValueError(f"envs must be native, but got {type(found).__name__}")
-    return found
+    native = venv.unwrapped
+    if not isinstance(native, NativeVecEnv):
+        raise ValueError(f"envs must be native, but got {type(native).__name__}")
+    return native
 
 
 def episode_steps(env_id: str) -> int:
@@ -94,10 +94,10 @@ def make_single(setup: TrainingConfiguration, render_mode: str | None = None) ->
 def _filter_arguments(setup: TrainingConfiguration, filter_name: str) -> dict:
     """Arguments of the wrapper; where the filter assumes another plant than the env's, a model of that one."""
     arguments = dict(setup.filter_arguments)
-    own = {name: arguments.pop(name) for name in filter_type(filter_name).numbers if name in arguments}
+    numbers = {name: arguments.pop(name) for name in filter_type(filter_name).numbers if name in arguments}
     if setup.assumed_plant is None:
-        return {"model_arguments": arguments, **own}
-    return {"model": plant_of(setup.task).model(**{**setup.assumed_plant, **arguments}), **own}
+        return {"model_arguments": arguments, **numbers}
+    return {"model": plant_of(setup.task).model(**{**setup.assumed_plant, **arguments}), **numbers}
 
 
 def _vector_env(setup: TrainingConfiguration, count: int, endless: bool) -> gym.vector.VectorEnv:

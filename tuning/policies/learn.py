@@ -28,10 +28,10 @@ from tuning.policies.saved import (
     load,
     mend,
     read_configuration,
+    read_saved,
     remove,
     reopen,
     save,
-    whole,
 )
 from tuning.policies.score import score
 from tuning.policies.setup import TrainingConfiguration
@@ -182,11 +182,11 @@ class _Evaluation(EvalCallback):
             path.with_name(f".{EVALUATIONS}")
         )  # under another name: a full disk then destroys no earlier ones
         if steps and path.is_file():
-            before = whole(path, _evaluations_in)
-            kept = before["timesteps"] <= steps
-            self.evaluations_timesteps = before["timesteps"][kept].tolist()
-            self.evaluations_results = before["results"][kept].tolist()
-            self.evaluations_length = before["ep_lengths"][kept].tolist()
+            before = read_saved(path, _evaluations_in)
+            earlier = before["timesteps"] <= steps
+            self.evaluations_timesteps = before["timesteps"][earlier].tolist()
+            self.evaluations_results = before["results"][earlier].tolist()
+            self.evaluations_length = before["ep_lengths"][earlier].tolist()
             self.returns = [float(np.mean(row)) for row in self.evaluations_results]
             self.best_mean_reward = max(self.returns, default=-np.inf)
 

@@ -43,8 +43,8 @@ class SavedPolicy(NamedTuple):
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Actions (n, 1) in [-1, 1] for observations (n, d), and the policy's state."""
-        seen = self.normalisation.normalize_obs(np.asarray(observation))
-        return self.model.predict(seen, state, episode_start, deterministic)
+        normalised = self.normalisation.normalize_obs(np.asarray(observation))
+        return self.model.predict(normalised, state, episode_start, deterministic)
 
 
 def save(folder: Path, setup: TrainingConfiguration, model: BaseAlgorithm, replay: bool = False) -> None:
@@ -117,8 +117,8 @@ def find_saved(path: str | Path) -> Path:
 
 def latest_checkpoint(folder: Path) -> Path | None:
     """The checkpoint with the most steps in a training's folder."""
-    found = [path for path in (folder / CHECKPOINTS).glob("*") if path.name.isdigit()]
-    return max(found, key=lambda path: int(path.name), default=None)
+    checkpoints = [path for path in (folder / CHECKPOINTS).glob("*") if path.name.isdigit()]
+    return max(checkpoints, key=lambda path: int(path.name), default=None)
 
 
 def reopen(folder: Path, steps: int) -> None:
@@ -155,37 +155,37 @@ def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
     """
     setup = read_configuration(folder)
     kind = find_algorithm(setup.algo).load_class()
-    normalisation: VecNormalize = whole(folder / NORMALISATION, _normalisation)
-    shape, given = box_of(normalisation.observation_space).shape, box_of(venv.observation_space).shape
-    if shape != given:
+    normalisation: VecNormalize = read_saved(folder / NORMALISATION, _normalisation)
+    shape, env_shape = box_of(normalisation.observation_space).shape, box_of(venv.observation_space).shape
+    if shape != env_shape:
         rule = f"a policy trained on observe={setup.observe!r} must see {shape[0]} numbers"
-        raise ValueError(f"{rule}, but the env shows {given[0]}")
+        raise ValueError(f"{rule}, but the env shows {env_shape[0]}")
     normalisation.set_venv(venv)
     normalisation.training, normalisation.norm_reward = training, training
-    model = whole(
+    model = read_saved(
         folder / POLICY, lambda path: kind.load(path, env=normalisation if training else None, device="cpu")
     )
     if model.observation_space.shape != shape or model.action_space.shape != venv.action_space.shape:
         raise ValueError(f"policy and normalisation must belong together, but those of {folder} differ in size")
     if training and (folder / REPLAY).is_file():
-        whole(folder / REPLAY, model.load_replay_buffer)
+        read_saved(folder / REPLAY, model.load_replay_buffer)
     return SavedPolicy(setup, model, normalisation)
 
 
 def _normalisation(path: Path) -> VecNormalize:
     """As `VecNormalize.load`, but without envs, since their observations may differ."""
-    found = pickle.loads(path.read_bytes())
-    if not isinstance(found, VecNormalize):
-        raise ValueError(f"it holds {type(found).__name__}")
-    return found
+    normalisation = pickle.loads(path.read_bytes())
+    if not isinstance(normalisation, VecNormalize):
+        raise ValueError(f"it holds {type(normalisation).__name__}")
+    return normalisation
 
 
-def whole(path: Path, read: Callable[[Path], Any]) -> Any:
+def read_saved(path: Path, read: Callable[[Path], Any]) -> Any:
     """The result of `read` for a file; ValueError for any error of a damaged one."""
     try:
         return read(path)
     except FileNotFoundError:
         raise ValueError(f"a saved policy must have a {path.name}, but {path} is missing") from None
     except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {reason}") from None

@@ -41,9 +41,9 @@ def check_configuration(setup: TrainingConfiguration) -> None:
         one_of("controller", setup.controller, plant.correctable)
         plant.check_observes(setup.controller, setup.observe)
     positive("share", setup.share)
-    own = () if observed.filter is None else (*filter_type(observed.filter).numbers, *plant.model_arguments)
+    accepted = () if observed.filter is None else (*filter_type(observed.filter).numbers, *plant.model_arguments)
     _check_known("env_arguments", setup.env_arguments, plant.env_arguments)
-    _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)
+    _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, accepted)
     if setup.assumed_plant is not None:
         _check_known("assumed_plant", setup.assumed_plant, plant.env_arguments)
     known = (*HYPERPARAMETERS, *algorithm.hyperparameters)
@@ -51,15 +51,15 @@ def check_configuration(setup: TrainingConfiguration) -> None:
     _check_known("policy_kwargs", setup.hyperparameters.get("policy_kwargs", {}), POLICY_ARGUMENTS)
 
 
-def _check_known(name: str, given, known: Iterable[str]) -> None:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{name} must be a mapping, but got {short_repr(given)}")
-    unknown = [key for key in given if key not in known]
+def _check_known(name: str, arguments, known: Iterable[str]) -> None:
+    if not isinstance(arguments, Mapping):
+        raise ValueError(f"{name} must be a mapping, but got {short_repr(arguments)}")
+    unknown = [key for key in arguments if key not in known]
     if unknown:
         raise ValueError(
             f"{name} must be among {', '.join(known) or 'none'}, but got {', '.join(map(repr, unknown))}"
         )
-    for key, value in given.items():
+    for key, value in arguments.items():
         _check_data(f"{name}, {key}", value)
 
 
@@ -174,18 +174,20 @@ def make_configuration(
             f"filter arguments must come with an observation set that has a filter, but got {observe!r}"
         )
     assumed = {name: value for name, value in plain(scenario.held).items() if value}
-    given = {**observed.numbers, **assumed} if observed.filter is not None else {}
+    arguments = {**observed.numbers, **assumed} if observed.filter is not None else {}
     if tuned is not None:
         content = read_tuned_file(tuned)
-        found = content["filter"]
-        if AUGMENTED in found["model"]:
+        tuned_filter = content["filter"]
+        if AUGMENTED in tuned_filter["model"]:
             raise ValueError(
                 f"a policy's filter must have the plant's states, but {tuned} has constants as states"
             )
-        one_of("filter of the tuned file", found["name"], () if observed.filter is None else (observed.filter,))
+        one_of(
+            "filter of the tuned file", tuned_filter["name"], () if observed.filter is None else (observed.filter,)
+        )
         scenario.check_tuned_for(content.get("plant"), tuned)
-        given |= {**found["numbers"], **found["model"]}
-    given |= filter_arguments or {}
+        arguments |= {**tuned_filter["numbers"], **tuned_filter["model"]}
+    arguments |= filter_arguments or {}
     return TrainingConfiguration(
         observe=observe,
         algo=algo,
@@ -193,7 +195,7 @@ def make_configuration(
         scenario=scenario.name,
         env_id=chosen.env_id,
         env_arguments={**scenario.plant_arguments, **chosen.arguments},
-        filter_arguments=given,
+        filter_arguments=arguments,
         steps=at_least("steps", algorithm.steps if steps is None else steps, 1, MOST_STEPS),
         seed=at_least("seed", seed, 0),
         num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1, MOST_ENVS),

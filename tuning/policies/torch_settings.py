@@ -91,7 +91,7 @@ def _evaluate(x: Tensor) -> Tensor:
 @contextmanager
 def numpys_tanh(network: nn.Module) -> Iterator[None]:
     """Within this context each `torch.nn.Tanh` of a network is NumPy's; saved files do not record it."""
-    found = [
+    activations = [
         (parent, name, child)
         for parent in network.modules()
         for name, child in parent.named_children()
@@ -99,11 +99,11 @@ def numpys_tanh(network: nn.Module) -> Iterator[None]:
     ]
     quick = NumpyTanh()
     try:
-        for parent, name, _ in found:
+        for parent, name, _ in activations:
             setattr(parent, name, quick)
         yield
     finally:
-        for parent, name, child in found:
+        for parent, name, child in activations:
             setattr(parent, name, child)
 
 

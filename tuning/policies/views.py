@@ -72,17 +72,17 @@ class ShowHistory(VecEnvWrapper):
 
     def step_wait(self):
         """Step the envs."""
-        found, rewards, dones, infos = self.venv.step_wait()
-        observations = np.asarray(found)
+        raw, rewards, dones, infos = self.venv.step_wait()
+        observations = np.asarray(raw)
         last = observations.copy()
         for i in np.flatnonzero(dones):
             last[i] = infos[i]["terminal_observation"]
         self._past[:, 1:] = self._past[:, :-1].copy()
         self._past[:, 0] = np.concatenate([last[:, : self._measured], self._actions], axis=1)
-        shown = self._visible(last)
+        visible = self._visible(last)
         for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"] = shown[i].copy()
-        return (self._begin(dones, observations) if dones.any() else shown), rewards, dones, infos
+            infos[i]["terminal_observation"] = visible[i].copy()
+        return (self._begin(dones, observations) if dones.any() else visible), rewards, dones, infos
 
     def _begin(self, which: np.ndarray, observations: np.ndarray) -> np.ndarray:
         self._past[which] = 0.0

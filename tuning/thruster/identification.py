@@ -58,7 +58,7 @@ class ThrusterFamily:
     Args:
         logs: logs with the plant's inputs and channels.
         plant: the start of all parameters, and the values of the held ones.
-        seen: start of the recorder's parameters: dead band, bias and lag.
+        recorder: start of the recorder's parameters: dead band, bias and lag.
         free: names of free parameters.
         noise: whether Q and R are free, too.
 
@@ -67,10 +67,10 @@ class ThrusterFamily:
     """
 
     def __init__(
-        self, logs: Sequence[Log], plant: Plant, seen: Recorder, free: Sequence[str], *, noise: bool = True
+        self, logs: Sequence[Log], plant: Plant, recorder: Recorder, free: Sequence[str], *, noise: bool = True
     ):
         """Find the parameters by name."""
-        self.logs, self.plant, self.seen = tuple(logs), plant, seen
+        self.logs, self.plant, self.recorder = tuple(logs), plant, recorder
         if plant.linear is not None:
             raise ValueError("an identified thruster must follow the equations of motion, but this one is linear")
         known = self.known
@@ -94,38 +94,38 @@ class ThrusterFamily:
     @cached_property
     def known(self) -> dict[str, Parameter]:
         """Every parameter that may be free, with its range about its start."""
-        plant, seen, found = self.plant, self.seen, {}
+        plant, recorder, parameters = self.plant, self.recorder, {}
         for name, unit in UNITS.items():
-            found[name] = _about(name, getattr(plant.parameters, name), unit)
+            parameters[name] = _about(name, getattr(plant.parameters, name), unit)
         flow = plant.ambient_velocity
         ends = min(-FASTEST_FLOW, 2 * flow), max(FASTEST_FLOW, 2 * flow)
-        found["ambient_velocity"] = Parameter("ambient_velocity", *ends, "m/s", log=False, default=flow)
+        parameters["ambient_velocity"] = Parameter("ambient_velocity", *ends, "m/s", log=False, default=flow)
         reach, first = DEAD_PART * plant.max_voltage, DEAD_START * plant.max_voltage
-        low, high = (max(-reach, seen.dead_band_low) or -first), (min(reach, seen.dead_band_high) or first)
-        found["dead_band"] = Parameter("dead_band", 0.0, reach, "V", log=False, default=high)
-        found["dead_band_low"] = Parameter("dead_band_low", -reach, 0.0, "V", log=False, default=low)
-        found["dead_band_high"] = Parameter("dead_band_high", 0.0, reach, "V", log=False, default=high)
+        low, high = (max(-reach, recorder.dead_band_low) or -first), (min(reach, recorder.dead_band_high) or first)
+        parameters["dead_band"] = Parameter("dead_band", 0.0, reach, "V", log=False, default=high)
+        parameters["dead_band_low"] = Parameter("dead_band_low", -reach, 0.0, "V", log=False, default=low)
+        parameters["dead_band_high"] = Parameter("dead_band_high", 0.0, reach, "V", log=False, default=high)
         dt = plant.dt
         offset = max(OFFSETS * dt, LEAST_OFFSET)
         model = model_of_plant(plant)
-        for place, (channel, quantity) in enumerate(zip(plant.channels, model.measurements, strict=True)):
-            largest = max(np.nanmax(np.abs(log.measurements[:, place]), initial=0.0) for log in self.logs)
-            bias, at = BIAS_PART * (largest or 1.0), dict(seen.bias).get(channel, 0.0)
+        for i, (channel, quantity) in enumerate(zip(plant.channels, model.measurements, strict=True)):
+            largest = max(np.nanmax(np.abs(log.measurements[:, i]), initial=0.0) for log in self.logs)
+            bias, at = BIAS_PART * (largest or 1.0), dict(recorder.bias).get(channel, 0.0)
             name = f"bias_{channel}"
-            found[name] = Parameter(
+            parameters[name] = Parameter(
                 name, min(-bias, 2 * at), max(bias, 2 * at), quantity.unit, log=False, default=at
             )
-            name, lag = f"lag_{channel}", dict(seen.lag).get(channel, LAG_START * dt)
-            found[name] = Parameter(name, 0.0, max(LONGEST_LAG * dt, lag), "s", log=False, default=lag)
+            name, lag = f"lag_{channel}", dict(recorder.lag).get(channel, LAG_START * dt)
+            parameters[name] = Parameter(name, 0.0, max(LONGEST_LAG * dt, lag), "s", log=False, default=lag)
             name = f"clock_offset_{channel}"
-            found[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
+            parameters[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
         q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)
-        units = [one.unit for one in (*model.states, *model.measurements)]
+        units = [quantity.unit for quantity in (*model.states, *model.measurements)]
         for name, variance, unit in zip(self.noise_names, (*q, *r), units, strict=True):
             ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
             if variance > 0:
-                found[name] = Parameter(name, *ends, squared(unit), default=float(variance))
-        return found
+                parameters[name] = Parameter(name, *ends, squared(unit), default=float(variance))
+        return parameters
 
     @property
     def data(self):
@@ -134,7 +134,7 @@ class ThrusterFamily:
 
     def shifted(self, logs: Sequence[Log]):
         """Some logs for this family: unchanged, or a function of the free clock offsets."""
-        offsets = tuple(one.name for one in self.free if one.name.startswith("clock_offset_"))
+        offsets = tuple(parameter.name for parameter in self.free if parameter.name.startswith("clock_offset_"))
         return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
 
     def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
@@ -158,13 +158,13 @@ class ThrusterFamily:
 
     def model(self, **values: float) -> StateSpaceModel:
         """The model for values of the free parameters without clock offsets; its ranges stay, which is fast."""
-        plant, seen = self.plant_at(values), self._recorder(values)
+        plant, recorder = self.plant_at(values), self._recorder(values)
         constants = plant.constants
-        step, biases, lags = constants.substep, dict(seen.bias), dict(seen.lag)
-        further = {"dead_band_low": seen.dead_band_low, "dead_band_high": seen.dead_band_high}
-        for place, channel in enumerate(plant.channels):
-            further[f"bias_{place}"] = biases.get(channel, 0.0)
-            further[f"kept_{place}"], further[f"after_{place}"] = lag_weights(lags.get(channel, 0.0), step)
+        step, biases, lags = constants.substep, dict(recorder.bias), dict(recorder.lag)
+        further = {"dead_band_low": recorder.dead_band_low, "dead_band_high": recorder.dead_band_high}
+        for i, channel in enumerate(plant.channels):
+            further[f"bias_{i}"] = biases.get(channel, 0.0)
+            further[f"kept_{i}"], further[f"after_{i}"] = lag_weights(lags.get(channel, 0.0), step)
         q = self._base.process_noise_cov.copy()
         q[:2, :2] = plant.process_noise_cov
         before: Any = self._base.constants  # a NamedTuple
@@ -175,7 +175,7 @@ class ThrusterFamily:
         )
 
     def _noise(self, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        found = []
+        covs = []
         for cov, names in (
             (self.plant.process_noise_cov, self.noise_names[:2]),
             (self.plant.measurement_noise_cov, self.noise_names[2:]),
@@ -183,16 +183,16 @@ class ThrusterFamily:
             before = np.diag(cov)
             after = [values.get(name, variance) for name, variance in zip(names, before, strict=True)]
             factors = np.sqrt(np.divide(after, before, out=np.ones(len(before)), where=before > 0))
-            found.append(cov * np.outer(factors, factors))
-        return found[0], found[1]
+            covs.append(cov * np.outer(factors, factors))
+        return covs[0], covs[1]
 
     def _recorder(self, values: Mapping[str, float]) -> Recorder:
-        known, seen = self.known, self.seen
+        known, recorder = self.known, self.recorder
         half = values.get("dead_band")
-        low, high = seen.dead_band_low, seen.dead_band_high
+        low, high = recorder.dead_band_low, recorder.dead_band_high
         low = values.get("dead_band_low", low) if half is None else -half
         high = values.get("dead_band_high", high) if half is None else half
-        bias, lag = dict(seen.bias), dict(seen.lag)
+        bias, lag = dict(recorder.bias), dict(recorder.lag)
         for channel in self.plant.channels:
             if f"bias_{channel}" in values:
                 bias[channel] = values[f"bias_{channel}"]
@@ -223,12 +223,12 @@ class ShiftedLogs:
         An interpolated sample has weights w and 1 - w of its neighbours, and its noise w^2 + (1 - w)^2 of their
         variance. A likelihood without this factor would prefer offsets of half a sample.
         """
-        found = {}
+        factors = {}
         for name, seconds in offsets.items():
             channel = name.removeprefix("clock_offset_")
             parts = [_left(log, f"measurement:{channel}", seconds) for log in self.logs]
-            found[channel] = float(np.mean(np.concatenate(parts)))
-        return found
+            factors[channel] = float(np.mean(np.concatenate(parts)))
+        return factors
 
     def _shifted(self, log: Log, offsets: Mapping[str, float]) -> Log:
         for name, seconds in offsets.items():
@@ -237,7 +237,9 @@ class ShiftedLogs:
             log = at_offset(log, channel, seconds)
             if dense:
                 rows = log.measurements.copy()
-                rows[1::2, [one.symbol for one in log.measured].index(channel.partition(":")[2])] = np.nan
+                rows[1::2, [quantity.symbol for quantity in log.measured].index(channel.partition(":")[2])] = (
+                    np.nan
+                )
                 log = replace(log, measurements=rows)
         return log
 

@@ -78,8 +78,8 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
             f"preset (--preset) must come with scenarios of the thruster's equations, but got {problem.name}"
         )
     name = f"{problem.name} ({preset})"
-    made = problem.replace(preset=preset, name=name, scale=problem.scale)
-    return made.replace(scale=tuple(float(one) for one in computed_scale(made, sequences)))
+    changed = problem.replace(preset=preset, name=name, scale=problem.scale)
+    return changed.replace(scale=tuple(float(value) for value in computed_scale(changed, sequences)))
 
 
 def family_of_preset(
@@ -106,58 +106,58 @@ def family_of_preset(
     arguments["max_voltage"] = float(max(largest, 1.0))
     if sensors:
         arguments["sensors"] = tuple(sensors)
-    plant, seen = logged_plant(**arguments)
-    return ThrusterFamily(logs, plant, seen, list(free) or list(FREE), noise=noise)
+    plant, recorder = logged_plant(**arguments)
+    return ThrusterFamily(logs, plant, recorder, list(free) or list(FREE), noise=noise)
 
 
-def preset_of(found: Any, family: Any, logs: Sequence[str]):
+def preset_of(identification: Any, family: Any, logs: Sequence[str]):
     """The identified thruster as the content of a preset file, `thruster_env.thruster.preset_file.PresetFile`.
 
     Args:
-        found: from `tuning.identification.identify`.
+        identification: from `tuning.identification.identify`.
         family: its `ThrusterFamily`.
         logs: names of the runs.
     """
     from thruster_env.thruster.preset_file import PresetFile
 
-    plant, seen = family.plant_at(found.values), family.recorder_at(found.values)
+    plant, recorder = family.plant_at(identification.values), family.recorder_at(identification.values)
     offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
     offsets |= {
         name.removeprefix("clock_offset_"): value + offsets[name.removeprefix("clock_offset_")]
-        for name, value in found.values.items()
+        for name, value in identification.values.items()
         if name.startswith("clock_offset_")
     }
     offsets = {channel: value for channel, value in offsets.items() if value}
     variances = plant.measurement_noise_cov.diagonal().tolist()
-    recorder: Mapping[str, Any] = {
+    content: Mapping[str, Any] = {
         "dt": plant.dt,
         "sensors": list(plant.channels),
         "ambient_velocity": plant.ambient_velocity,
         "process_noise_cov": plant.process_noise_cov.diagonal().tolist(),
         "measurement_noise_cov": dict(zip(plant.channels, variances, strict=True)),
-        "bias": dict(seen.bias),
-        "lag": dict(seen.lag),
+        "bias": dict(recorder.bias),
+        "lag": dict(recorder.lag),
         "clock_offset": offsets,
     }
     identified = {
         "logs": [Path(log).name for log in logs],
-        "log_likelihood": found.log_likelihood,
-        "standard_errors": found.standard_errors,
-        "determined": found.determined,
+        "log_likelihood": identification.log_likelihood,
+        "standard_errors": identification.standard_errors,
+        "determined": identification.determined,
         "largest_voltage": float(max(np.abs(log.inputs).max() for log in family.logs)),
     }
-    kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
-    return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)
+    stored = {name: value for name, value in content.items() if value not in ({}, 0.0)}
+    return PresetFile(plant.parameters, (recorder.dead_band_low, recorder.dead_band_high), stored, identified)
 
 
 def _taken_off(logs: Sequence[Log], channel: str) -> float:
     """The clock offset with which all logs were read; 0 if they differ, since they then belong to the logs."""
-    found = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
-    return found.pop() if len(found) == 1 else 0.0
+    offsets = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
+    return offsets.pop() if len(offsets) == 1 else 0.0
 
 
-def write_identified(path: str | Path, found: Any, family: Any, logs: Sequence[str]) -> None:
+def write_identified(path: str | Path, identification: Any, family: Any, logs: Sequence[str]) -> None:
     """Write the identified thruster as a preset file; arguments are those of `preset_of`."""
     from thruster_env.thruster.preset_file import write_preset
 
-    write_preset(path, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
+    write_preset(path, preset_of(identification, family, logs), "A thruster as `thruster identify` found it.")

@@ -176,9 +176,9 @@ class Scenario(BaseScenario):
     @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
-        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"}
+        of_scenario = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"}
         left_out = {"system"} if self.system is None else {"preset", "uncertainty"}
-        names = [entry.name for entry in fields(self) if entry.name not in own | left_out]
+        names = [entry.name for entry in fields(self) if entry.name not in of_scenario | left_out]
         return {name: plain(getattr(self, name)) for name in names}
 
     @cached_property
@@ -264,11 +264,13 @@ class Scenario(BaseScenario):
         )
 
 
-def _variances(given, channels: int) -> float | tuple[float, ...]:
+def _variances(variances, channels: int) -> float | tuple[float, ...]:
     """R as a scenario stores it: the variance of one channel, or one variance for each of several."""
-    if channels == 1 and not isinstance(given, list | tuple | np.ndarray):
-        return positive("measurement_noise_cov", given)
-    each = tuple(positive("measurement_noise_cov", v) for v in vector("measurement_noise_cov", given, channels))
+    if channels == 1 and not isinstance(variances, list | tuple | np.ndarray):
+        return positive("measurement_noise_cov", variances)
+    each = tuple(
+        positive("measurement_noise_cov", v) for v in vector("measurement_noise_cov", variances, channels)
+    )
     return each[0] if channels == 1 else each
 
 

@@ -27,9 +27,9 @@ def update(model, x, P, z):
     cannot branch (`if`) on their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and
     R; `model.own` has the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
     """
-    seen = present(z)
-    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
-    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    measured = present(z)
+    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     L, M, step = root(P), root(R), None
     for _ in range(model.own.iterations):
@@ -39,7 +39,7 @@ def update(model, x, P, z):
         spread = sym(L @ diagonal(inverse_weights(model, forward_quotient(L, step))) @ L.T)
         K = divide(spread @ H.T, sym(H @ spread @ H.T) + sym(noise))
         step = K @ v
-    return wrap(x + step, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
+    return wrap(x + step, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 def inverse_weights(model, e):

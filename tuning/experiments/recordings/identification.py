@@ -82,7 +82,7 @@ WHOLE = (*STATIC, *FLOW, *INERTIA)
 
 
 def _without(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    return tuple(one for one in WHOLE if one not in parameters)
+    return tuple(parameter for parameter in WHOLE if parameter not in parameters)
 
 
 CHOSEN = "flow and inertia"
@@ -111,7 +111,7 @@ def identified(
     The filter uses the tachometer only; the load cell's channel is predicted (`identify`).
     """
     return identify(
-        [one.log(structure.ambient) for one in runs],
+        [recording.log(structure.ambient) for recording in runs],
         structure.model,
         structure.free,
         predicted=[LOAD_CELL.symbol],
@@ -130,13 +130,13 @@ def thrusts(model: StateSpaceModel, runs: Sequence[Recording], ambient: bool = F
         runs: recorded.
         ambient: whether the measured ambient flow is an input.
     """
-    data = runs_of([one.log(ambient) for one in runs])
-    seen = on_line(model)
+    data = runs_of([recording.log(ambient) for recording in runs])
+    on_line_model = on_line(model)
     estimates = run(
-        ExtendedKalmanFilter(model=seen), data.filter_keys, data.inputs, data.measurements[..., :1].copy()
+        ExtendedKalmanFilter(model=on_line_model), data.filter_keys, data.inputs, data.measurements[..., :1].copy()
     )
-    found = seen.output("T", estimates.means)
-    return [found[place, : len(one.times)] for place, one in enumerate(runs)]
+    thrust = on_line_model.output("T", estimates.means)
+    return [thrust[i, : len(recording.times)] for i, recording in enumerate(runs)]
 
 
 # Results of all identifications, stored in a file one by one, so that an interrupted study can be continued.
@@ -176,22 +176,22 @@ def identify_all(
         progress: called with a task's name, the number of finished tasks, and the number of all tasks.
     """
     digest = digest_of(
-        tuple(run.log(True).digest for run in runs), [(*one,) for one in STRUCTURES.values()], starts
+        tuple(run.log(True).digest for run in runs), [(*structure,) for structure in STRUCTURES.values()], starts
     )
-    kept = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    found = kept["tasks"] if kept.get("digest") == digest else {}
+    stored = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    results = stored["tasks"] if stored.get("digest") == digest else {}
     tasks = tasks_of(runs)
     for number, task in enumerate(tasks):
         if progress is not None:
             progress(task.name, number, len(tasks))
-        if task.name in found:
+        if task.name in results:
             continue
-        some = [one for one in runs if one.name != task.held_out]
+        learning = [recording for recording in runs if recording.name != task.held_out]
         first = task == Task(CHOSEN)
-        learnt = identified(STRUCTURES[task.structure], some, starts if first else 1)
+        learnt = identified(STRUCTURES[task.structure], learning, starts if first else 1)
         if learnt.interrupted:
             raise KeyboardInterrupt
-        found[task.name] = {
+        results[task.name] = {
             "values": learnt.values,
             "standard_errors": learnt.standard_errors,
             "determined": learnt.determined,
@@ -199,5 +199,5 @@ def identify_all(
             "agreement": [learnt.agreement, len(learnt.optima)],
             "sentences": learnt.sentences(),
         }
-        write_whole(file, json.dumps({"digest": digest, "tasks": found}, indent=1))
-    return found
+        write_whole(file, json.dumps({"digest": digest, "tasks": results}, indent=1))
+    return results

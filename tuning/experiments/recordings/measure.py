@@ -51,8 +51,8 @@ def error(estimate: np.ndarray, run: Recording, offset: float, window: int = WIN
 
 def rmse(estimate: np.ndarray, run: Recording, offset: float | None = None, window: int = WINDOW) -> float:
     """Root mean square of `error`, at the run's clock offset unless another one is given."""
-    found = error(estimate, run, run.offset if offset is None else offset, window)
-    return float(np.sqrt((found**2).mean()))
+    errors = error(estimate, run, run.offset if offset is None else offset, window)
+    return float(np.sqrt((errors**2).mean()))
 
 
 def settled_rmse(estimate: np.ndarray, run: Recording, window: int = WINDOW) -> float:
@@ -106,16 +106,16 @@ def estimates_of(runs: Sequence[Recording], held_out: Mapping[str, Mapping] | No
 
 def left_out(structure: str, runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[np.ndarray]:
     """Thrust on each run by a structure that was identified without that run."""
-    one, found = STRUCTURES[structure], []
+    chosen, estimates = STRUCTURES[structure], []
     for run in runs:
         values = tasks[Task(structure, run.name).name]["values"]
-        found += thrusts(one.model(**values), [run], one.ambient)
-    return found
+        estimates += thrusts(chosen.model(**values), [run], chosen.ambient)
+    return estimates
 
 
 def structure_ratios(structure: str, runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[Ratios]:
     """Ratios to the recorder's own estimate on each run, left out of the identification."""
-    return [ratios(one, run) for one, run in zip(left_out(structure, runs, tasks), runs, strict=True)]
+    return [ratios(estimate, run) for estimate, run in zip(left_out(structure, runs, tasks), runs, strict=True)]
 
 
 def _static(run: Recording) -> np.ndarray:
@@ -150,14 +150,14 @@ class Regime(NamedTuple):
 
 def regimes(model: StateSpaceModel, runs: Sequence[Recording], factors: Sequence[float] = FACTORS) -> list[Regime]:
     """The extended Kalman filter with each factor on Q after reversals."""
-    seen, found = on_line(model), []
+    tachometer_model, results = on_line(model), []
     for factor in factors:
-        parts = [_filtered(seen, run, factor) for run in runs]
+        parts = [_filtered(tachometer_model, run, factor) for run in runs]
         squares = np.concatenate([part[1] for part in parts])
         values = [ratios(part[0], run).averaged for part, run in zip(parts, runs, strict=True)]
         likelihood = sum(part[2] for part in parts)
-        found.append(Regime(factor, likelihood, float(squares.mean()), float(np.mean(values))))
-    return found
+        results.append(Regime(factor, likelihood, float(squares.mean()), float(np.mean(values))))
+    return results
 
 
 def after_reversal(command: np.ndarray) -> np.ndarray:

@@ -19,26 +19,26 @@ REACH, STEP = 0.15, 0.001  # range of offsets to either side of zero, and its st
 EDGES = 0.2  # left out at both ends, so that the shifted series covers all samples [s]
 
 
-def clock_offset(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> float:
-    """The offset s [s] of least sum of squares of here(t) - there(t + s).
+def clock_offset(times: np.ndarray, here: np.ndarray, other: np.ndarray) -> float:
+    """The offset s [s] of least sum of squares of here(t) - other(t + s).
 
     Args:
         times: stamps (K,) [s], the same for both series, each by its own clock.
         here: samples by the reference clock.
-        there: samples by the other clock, which are interpolated linearly.
+        other: samples by the other clock, which are interpolated linearly.
     """
     counted = (times >= times[0] + EDGES) & (times <= times[-1] - EDGES) & np.isfinite(here)
     offsets = np.arange(-REACH, REACH + STEP / 2, STEP)
-    known = np.isfinite(there)
-    shifted = (np.interp(times[counted] + s, times[known], there[known]) for s in offsets)
-    return float(offsets[np.argmin([((here[counted] - one) ** 2).mean() for one in shifted])])
+    known = np.isfinite(other)
+    shifted = (np.interp(times[counted] + s, times[known], other[known]) for s in offsets)
+    return float(offsets[np.argmin([((here[counted] - series) ** 2).mean() for series in shifted])])
 
 
-def offset_by_halves(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> tuple[float, float]:
+def offset_by_halves(times: np.ndarray, here: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """The offset of each half of a run: their difference shows the accuracy."""
     middle = len(times) // 2
     halves = slice(None, middle), slice(middle, None)
-    first, last = (clock_offset(times[half], here[half], there[half]) for half in halves)
+    first, last = (clock_offset(times[half], here[half], other[half]) for half in halves)
     return first, last
 
 
@@ -114,8 +114,8 @@ def read_recording(file: Path) -> Recording:
     tachometer = column["tachometer"].copy()
     tachometer[0] = np.nan
     both = column["times"], tachometer, column["other_tachometer"]
-    own = _own_thrust(file.stem, column["speed"], np.nan_to_num(column["axial"]))
-    none = bool(np.isnan(own).all())
+    own_thrust = _own_thrust(file.stem, column["speed"], np.nan_to_num(column["axial"]))
+    none = bool(np.isnan(own_thrust).all())
     return Recording(
         name=file.stem,
         times=column["times"],
@@ -123,7 +123,7 @@ def read_recording(file: Path) -> Recording:
         flow=_smoothed(column["flow"]),
         tachometer=tachometer,
         load=column["load"],
-        own=column["desired"] if none else own,
+        own=column["desired"] if none else own_thrust,
         own_is_desired=none,
         desired=column["desired"],
         offset=clock_offset(*both),
@@ -140,8 +140,8 @@ def _own_thrust(name: str, n: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _smoothed(flow: np.ndarray) -> np.ndarray:
     """The ambient flow by a first-order lag over samples within the gate."""
-    found = np.zeros(len(flow))
+    smoothed = np.zeros(len(flow))
     for k in range(1, len(flow)):
         wrong = not abs(flow[k]) <= GATE
-        found[k] = found[k - 1] + (0.0 if wrong else FLOW_RATE * (flow[k] - found[k - 1]))
-    return found
+        smoothed[k] = smoothed[k - 1] + (0.0 if wrong else FLOW_RATE * (flow[k] - smoothed[k - 1]))
+    return smoothed

@@ -31,33 +31,35 @@ def tables_of(
     runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
 ) -> dict[str, Table]:
     """All tables by name, in their order; those of structures and parameters where these were identified again."""
-    made = {
+    tables = {
         "ratios": Table(RATIO_HEADER, ratio_rows(runs, estimates)),
         "estimators": Table(["run", *estimates], baseline_rows(runs, estimates)),
         "clocks": Table(CLOCK_HEADER, clock_rows(runs)),
     }
     if tasks is not None:
-        made["structures"] = Table(LADDER_HEADER, ladder_rows(runs, tasks))
-        made["numbers"] = Table(NUMBER_HEADER, number_rows(runs, tasks))
-    return made
+        tables["structures"] = Table(LADDER_HEADER, ladder_rows(runs, tasks))
+        tables["numbers"] = Table(NUMBER_HEADER, number_rows(runs, tasks))
+    return tables
 
 
 def ratio_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:
     """Our error over that of the recorder's own, on each run and on average."""
-    found = [ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)]
+    all_ratios = [ratios(estimate, run) for estimate, run in zip(estimates[OURS], runs, strict=True)]
     rows = []
-    for run, one, ours in zip(runs, found, estimates[OURS], strict=True):
+    for run, of_run, ours in zip(runs, all_ratios, estimates[OURS], strict=True):
         mark = " (desired)" if run.own_is_desired else ""
-        own = f"{rmse(run.own, run):.2f}{mark}"
-        rows.append([run.name, own, f"{rmse(ours, run):.2f}", *(f"{value:.2f}" for value in one)])
-    return [*rows, [MEAN, "", "", *(f"{value:.2f}" for value in np.mean(found, axis=0))]]
+        own_rmse = f"{rmse(run.own, run):.2f}{mark}"
+        rows.append([run.name, own_rmse, f"{rmse(ours, run):.2f}", *(f"{value:.2f}" for value in of_run)])
+    return [*rows, [MEAN, "", "", *(f"{value:.2f}" for value in np.mean(all_ratios, axis=0))]]
 
 
 def baseline_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:
     """RMSE of every estimator over 0.2 s on each run: all rows, then settled ones [N]."""
     rows = []
-    for place, run in enumerate(runs):
-        cells = [f"{rmse(one[place], run):.2f}/{settled_rmse(one[place], run):.2f}" for one in estimates.values()]
+    for i, run in enumerate(runs):
+        cells = [
+            f"{rmse(estimate[i], run):.2f}/{settled_rmse(estimate[i], run):.2f}" for estimate in estimates.values()
+        ]
         rows.append([run.name, *cells])
     return rows
 
@@ -71,8 +73,8 @@ def ladder_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list
     """The errors of each structure, on runs left out of the identification."""
     rows = []
     for name, structure in STRUCTURES.items():
-        found = np.array(structure_ratios(name, runs, tasks))
-        cells = found[:, 0].max(), found[:, 0].mean(), found[:, 2].max()
+        errors = np.array(structure_ratios(name, runs, tasks))
+        cells = errors[:, 0].max(), errors[:, 0].mean(), errors[:, 2].max()
         likelihood = tasks[Task(name).name]["log_likelihood"]
         rows.append([structure.about, *(f"{value:.2f}" for value in cells), f"{likelihood:.0f}"])
     return rows
@@ -80,19 +82,21 @@ def ladder_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list
 
 def number_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[list[str]]:
     """The chosen parameters, their standard errors, and their range when one run is left out."""
-    whole, rows = tasks[Task(CHOSEN).name], []
-    for one in STRUCTURES[CHOSEN].free:
-        value, error = whole["values"][one.name], whole["standard_errors"][one.name]
-        others = [tasks[Task(CHOSEN, run.name).name]["values"][one.name] for run in runs]
-        name = one.name if whole["determined"][one.name] else f"{one.name} (not determined)"
-        rows.append([name, f"{value:.4g}", f"{error:.2g}", f"{min(others):.4g} to {max(others):.4g}", one.unit])
+    with_all, rows = tasks[Task(CHOSEN).name], []
+    for parameter in STRUCTURES[CHOSEN].free:
+        value, error = with_all["values"][parameter.name], with_all["standard_errors"][parameter.name]
+        left_out = [tasks[Task(CHOSEN, run.name).name]["values"][parameter.name] for run in runs]
+        name = parameter.name if with_all["determined"][parameter.name] else f"{parameter.name} (not determined)"
+        rows.append(
+            [name, f"{value:.4g}", f"{error:.2g}", f"{min(left_out):.4g} to {max(left_out):.4g}", parameter.unit]
+        )
     return rows
 
 
 def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
     """The table of ratios in one sentence."""
-    found = np.array([ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)])
-    averaged, best, raw = found.T
+    all_ratios = np.array([ratios(estimate, run) for estimate, run in zip(estimates[OURS], runs, strict=True)])
+    averaged, best, raw = all_ratios.T
     return [
         f"Averaged over 0.2 s the error of the estimated thrust is on average {averaged.mean():.2f} times that of "
         f"the recorder's own, at most {averaged.max():.2f}; with the best clocks at most {best.max():.2f}; "

@@ -87,7 +87,7 @@ def found_problems(names: Sequence[str]) -> list[Problem]:
     Raises:
         ValueError: for a problem that is not there, or has no truth to be judged by.
     """
-    found = []
+    problems = []
     for name in names:
         try:
             problem = find_problem(name)
@@ -100,8 +100,8 @@ def found_problems(names: Sequence[str]) -> list[Problem]:
             ) from error
         if problem.scale is None:
             raise ValueError(f"a problem of the panel must have true states, but {name} has none")
-        found.append(problem)
-    return found
+        problems.append(problem)
+    return problems
 
 
 def run_panel(panel: Panel, folder: Path, on_case: OnCase = lambda text, done, count: None) -> list[Case]:
@@ -152,16 +152,18 @@ def tuned_case(problem: Problem, name: str, trials: int, seed: int) -> Case:
     return compared(name_of(problem), name, study.held_out.comparison.evaluations, seconds, gave_way)
 
 
-def compared(problem: str, name: str, found: Mapping[str, Evaluation], seconds: float, gave_way: str = "") -> Case:
+def compared(
+    problem: str, name: str, evaluations: Mapping[str, Evaluation], seconds: float, gave_way: str = ""
+) -> Case:
     """A case from the evaluations of the tuned filter and its baselines on the same held-out seeds."""
-    one = found[TUNED]
+    tuned = evaluations[TUNED]
     paired = {
-        label: Paired(score_ratio(one, other), chance_if_no_worse(one, other))
-        for label, other in found.items()
+        label: Paired(score_ratio(tuned, other), chance_if_no_worse(tuned, other))
+        for label, other in evaluations.items()
         if label != TUNED
     }
-    nis = one.nis.value / one.expected_nis
-    return Case(problem, name, one.score.value, nis, one.divergences, gave_way, paired, seconds)
+    nis = tuned.nis.value / tuned.expected_nis
+    return Case(problem, name, tuned.score.value, nis, tuned.divergences, gave_way, paired, seconds)
 
 
 def name_of(problem: Problem) -> str:

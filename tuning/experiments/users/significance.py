@@ -54,23 +54,26 @@ def holm(chances: Sequence[float], level: float = LEVEL) -> list[bool]:
     With m of them in increasing order, p_(1), ..., p_(m), those before the first with p_(k) > level/(m + 1 - k)
     are. Whatever their dependence, the chance that any is called so wrongly is at most `level`.
     """
-    found, count = [False] * len(chances), len(chances)
-    for place, index in enumerate(np.argsort(chances, kind="stable")):
-        if chances[index] > level / (count - place):
+    significant, count = [False] * len(chances), len(chances)
+    for rank, index in enumerate(np.argsort(chances, kind="stable")):
+        if chances[index] > level / (count - rank):
             break
-        found[index] = True
-    return found
+        significant[index] = True
+    return significant
 
 
-def _influences(one: Evaluation) -> tuple[float, np.ndarray]:
+def _influences(evaluation: Evaluation) -> tuple[float, np.ndarray]:
     """Logarithm of the score, and the influence of each run on it, (B,)."""
-    counted = np.isfinite(one.scale)
-    squares, scale = one.mean_squares[:, counted], one.scale[counted]
-    means = pooled_mean(squares, one.weights)
-    some = means > 0  # a state without any error has no influence
-    root = np.sqrt(means[some]) * scale[some]
+    counted = np.isfinite(evaluation.scale)
+    squares, scale = evaluation.mean_squares[:, counted], evaluation.scale[counted]
+    means = pooled_mean(squares, evaluation.weights)
+    nonzero = means > 0  # a state without any error has no influence
+    root = np.sqrt(means[nonzero]) * scale[nonzero]
     score = (np.sqrt(means) / scale).sum()
     with np.errstate(divide="ignore", invalid="ignore"):
-        parts = ((squares[:, some] - means[some]) / (2.0 * root * score)).sum(axis=1)
+        parts = ((squares[:, nonzero] - means[nonzero]) / (2.0 * root * score)).sum(axis=1)
         logarithm = float(np.log(score))
-    return logarithm, parts if one.weights is None else parts * one.weights / one.weights.mean()
+    return (
+        logarithm,
+        parts if evaluation.weights is None else parts * evaluation.weights / evaluation.weights.mean(),
+    )

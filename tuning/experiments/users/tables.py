@@ -43,7 +43,9 @@ class Verdict(NamedTuple):
 
 def verdict_of(cases: Sequence[Case]) -> Verdict:
     """Which tuned filters are significantly worse than a baseline; the oracle's is no baseline that one has."""
-    pairs = [Loss(case, name, one) for case in cases for name, one in case.baselines.items() if name != ORACLE]
+    pairs = [
+        Loss(case, name, paired) for case in cases for name, paired in case.baselines.items() if name != ORACLE
+    ]
     other = [pair for pair in pairs if not pair.paired.ratio.low == pair.paired.ratio.high == 1.0]
     worse = holm([pair.paired.chance for pair in other])
     losses = tuple(pair for pair, is_worse in zip(other, worse, strict=True) if is_worse)
@@ -86,23 +88,23 @@ def markdown(cases: Sequence[Case]) -> str:
 
 def sentences(cases: Sequence[Case]) -> list[str]:
     """What the table says, in words."""
-    found, failed = verdict_of(cases), [case for case in cases if case.error]
-    said = [
-        f"The tuned filter is significantly worse than a baseline in {len(found.losses)} of {found.comparisons} "
-        f"comparisons (Holm's procedure, {100 * LEVEL:g} % for all together, without the oracle), and better in "
-        f"{found.wins}, by the 95 % interval of each.",
-        f"95 % intervals that lie above 1: {found.above}; with equally good filters and baselines one would "
-        f"expect {found.by_chance:.1f} by chance.",
+    verdict, failed = verdict_of(cases), [case for case in cases if case.error]
+    lines = [
+        f"The tuned filter is significantly worse than a baseline in {len(verdict.losses)} of "
+        f"{verdict.comparisons} comparisons (Holm's procedure, {100 * LEVEL:g} % for all together, without the "
+        f"oracle), and better in {verdict.wins}, by the 95 % interval of each.",
+        f"95 % intervals that lie above 1: {verdict.above}; with equally good filters and baselines one would "
+        f"expect {verdict.by_chance:.1f} by chance.",
     ]
-    for loss in found.losses:
+    for loss in verdict.losses:
         ratio = loss.paired.ratio
         small = slightly(ratio)
-        said.append(
+        lines.append(
             f"{loss.case.problem}, {loss.case.filter}: {ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}] "
             f"times the score of {_article(loss.baseline)}"
             + (f", {small}, which is practically none." if small else ".")
         )
-    return said + [f"{case.problem}, {case.filter} failed: {case.error}" for case in failed]
+    return lines + [f"{case.problem}, {case.filter} failed: {case.error}" for case in failed]
 
 
 def csv_text(cases: Sequence[Case]) -> str:
@@ -115,10 +117,10 @@ def csv_text(cases: Sequence[Case]) -> str:
     for case in cases:
         ended = _ended(case)
         of_case = f"{case.score:.6g}", f"{case.nis:.4g}", case.restarts, ended, f"{case.seconds:.1f}"
-        for name, one in case.baselines.items():
+        for name, paired in case.baselines.items():
             worse = (case.problem, case.filter, name) in lost
-            ratio = [f"{value:.6g}" for value in one.ratio]
-            writer.writerow([case.problem, case.filter, name, *ratio, f"{one.chance:.3g}", worse, *of_case])
+            ratio = [f"{value:.6g}" for value in paired.ratio]
+            writer.writerow([case.problem, case.filter, name, *ratio, f"{paired.chance:.3g}", worse, *of_case])
     return text.getvalue()
 
 
@@ -131,10 +133,10 @@ def _article(baseline: str) -> str:
     return "what was given" if baseline == "given" else f"the {baseline}"
 
 
-def _ratio(one: Paired | None, is_worse: bool) -> str:
-    if one is None:
+def _ratio(paired: Paired | None, is_worse: bool) -> str:
+    if paired is None:
         return "none"
-    value, low, high = one.ratio
+    value, low, high = paired.ratio
     if low == high == 1.0:
         return "1, the same"
     return f"{value:.3f} [{low:.3f}, {high:.3f}]" + f" {MARK}" * is_worse

@@ -39,8 +39,8 @@ POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
 def next_attitude(phi, theta, before, after, dt):
     """Roll and pitch [rad] a step later, by Heun's rule; p, q, r [rad/s] were before and are after."""
     rolling, pitching, _ = angle_rates(attitude_of(phi, theta), before[0], before[1], before[2])
-    there = attitude_of(phi + dt * rolling, theta + dt * pitching)
-    rolling_there, pitching_there, _ = angle_rates(there, after[0], after[1], after[2])
+    attitude = attitude_of(phi + dt * rolling, theta + dt * pitching)
+    rolling_there, pitching_there, _ = angle_rates(attitude, after[0], after[1], after[2])
     half = 0.5 * dt
     return phi + half * (rolling + rolling_there), theta + half * (pitching + pitching_there)
 
@@ -113,22 +113,22 @@ KEPT = 5  # roll, pitch and the last p, q, r
 def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels of the extended filter for a model whose last two inputs are roll and pitch."""
     n, m, inner = shape.n, shape.m, page_kernels(ExtendedKalmanFilter.page, functions, shape)
-    places, source, constants = memory_places(n, m), number_places(n, m), constants_reader(shape)
+    layout, source, constants = memory_places(n, m), number_places(n, m), constants_reader(shape)
     start_filter, predict_filter, update_filter = inner.start, inner.predict, inner.update
-    mean, step, kept, substeps = places.mean, places.step, places.extras, source.substeps
+    mean, step, extras, substeps = layout.mean, layout.step, layout.extras, source.substeps
     roll, pitch = shape.inputs - 2, shape.inputs - 1
 
     @inlined
     def start(memory, numbers, size):
         start_filter(memory, numbers, size)
         for i in range(KEPT):
-            memory[0][kept + i] = 0.0
+            memory[0][extras + i] = 0.0
 
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
-        u[roll] = row[kept]
-        u[pitch] = row[kept + 1]
+        u[roll] = row[extras]
+        u[pitch] = row[extras + 1]
         predict_filter(memory, u, numbers, size)
 
     @inlined
@@ -137,10 +137,10 @@ def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
         update_filter(memory, z, numbers, size)
         after = row[mean + 3], row[mean + 4], row[mean + 5]
         if row[step] > 0.0:
-            before = row[kept + 2], row[kept + 3], row[kept + 4]
+            before = row[extras + 2], row[extras + 3], row[extras + 4]
             dt = constants(numbers).substep * numbers[substeps]
-            row[kept], row[kept + 1] = next_attitude(row[kept], row[kept + 1], before, after, dt)
-        row[kept + 2], row[kept + 3], row[kept + 4] = after
+            row[extras], row[extras + 1] = next_attitude(row[extras], row[extras + 1], before, after, dt)
+        row[extras + 2], row[extras + 3], row[extras + 4] = after
 
     return inner._replace(start=start, predict=predict, update=update, extras=KEPT, vectors=())
 
@@ -224,12 +224,12 @@ def measured() -> Estimator:
 def kalman(world: str = "vehicle") -> list[Estimator]:
     """Extended and unscented filter of eight states, extended ones of the papers' six."""
     motion, level = papers_model("motion", world), papers_model("velocities", world, attitude="level")
-    own = papers_model("velocities", world)
+    velocities = papers_model("velocities", world)
     return [
         Estimator("EKF8", ExtendedKalmanFilter(model=motion)),
         Estimator("UKF8", UnscentedKalmanFilter(model=motion)),
         Estimator("EKF6 level", ExtendedKalmanFilter(model=level)),
-        Estimator("EKF6 own attitude", OwnAttitudeKalmanFilter(model=own)),
+        Estimator("EKF6 own attitude", OwnAttitudeKalmanFilter(model=velocities)),
     ]
 
 

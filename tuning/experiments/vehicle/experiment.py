@@ -136,7 +136,7 @@ def joined(parts: Sequence[Scores]) -> Scores:
 
 def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
     """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
-    above, below = (getattr(one, field)[:, :3].sum(axis=1) for one in (a, b))
+    above, below = (getattr(scores, field)[:, :3].sum(axis=1) for scores in (a, b))
     ratios = np.sqrt(resampled_means(above) / resampled_means(below))
     return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
 
@@ -219,14 +219,14 @@ def run_tasks(
     total, done, results = sum(len(task.estimators) for task in tasks) * len(parts), 0, []
     for task in tasks:
         inputs, keys = find_path(task.path).inputs(steps), keys_of(task.path, runs, seed)
-        found: dict[str, list[Scores]] = {one.label: [] for one in task.estimators}
+        by_estimator: dict[str, list[Scores]] = {estimator.label: [] for estimator in task.estimators}
         for part in parts:
             truth = true_runs(task.world, keys[part], inputs)
-            for one in task.estimators:
-                on_part(done, total, f"path {task.path}, {one.label}")
-                found[one.label].append(scores_of(one, truth, keys[part], inputs))
+            for estimator in task.estimators:
+                on_part(done, total, f"path {task.path}, {estimator.label}")
+                by_estimator[estimator.label].append(scores_of(estimator, truth, keys[part], inputs))
                 done += 1
-        scores = {label: joined(several) for label, several in found.items()}
+        scores = {label: joined(several) for label, several in by_estimator.items()}
         results.append(PathResult(task.path, task.world, len(inputs), *along_path(task.world, inputs), scores))
     on_part(done, total, "done")
     return results
@@ -248,36 +248,36 @@ def for_filter(filter_: Filter, inputs: np.ndarray, runs: int) -> np.ndarray:
     return for_all(np.concatenate([inputs, level], axis=1), runs)
 
 
-def estimate(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray):
+def estimate(estimator: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray):
     """Estimates of a filter on some runs, and its seconds of one core without compilation."""
-    if one.filter is None:
-        raise ValueError(f"an estimate must be by a filter, but {one.label} has none")
-    given = for_filter(one.filter, inputs, len(keys))
-    run(one.filter, keys[:1], given[:1, :1], truth.measurements[:1, :2])
+    if estimator.filter is None:
+        raise ValueError(f"an estimate must be by a filter, but {estimator.label} has none")
+    filter_inputs = for_filter(estimator.filter, inputs, len(keys))
+    run(estimator.filter, keys[:1], filter_inputs[:1, :1], truth.measurements[:1, :2])
     began = time.process_time()
-    estimates = run(one.filter, keys, given, truth.measurements)
+    estimates = run(estimator.filter, keys, filter_inputs, truth.measurements)
     return estimates, time.process_time() - began
 
 
-def scores_of(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray) -> Scores:
+def scores_of(estimator: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray) -> Scores:
     """The scores of an estimator on some runs."""
     count, steps, true_pose = len(keys), settled(len(inputs)), truth.states[..., [9, 10, 11, 8]]
     nothing = np.full((count, 4), np.nan)
-    if one.filter is None:
+    if estimator.filter is None:
         velocities = measured_velocities(truth)
         errors = (velocities - truth.states[..., :6])[:, steps]
         errors[..., 3:5] = np.nan
         attitude, nees, divergences, seconds = nothing[:, :2], nothing[:, 0], np.zeros(count), 0.0
         full = None
     else:
-        estimates, seconds = estimate(one, truth, keys, inputs)
-        n = one.filter.model.n
+        estimates, seconds = estimate(estimator, truth, keys, inputs)
+        n = estimator.filter.model.n
         all_errors = (estimates.means - truth.states[..., :n])[:, steps]
         nees = normalized_squares(all_errors, estimates.covs[:, steps]).mean(axis=1)
         divergences = estimates.divergences
         velocities, errors = estimates.means[..., :6], all_errors[..., :6]
-        attitude = np.square(all_errors[..., 6:]).mean(axis=1) if one.has_attitude else nothing[:, :2]
-        reckoned = full_pose(velocities, estimates.means[..., 6:] if one.has_attitude else None, DT)
+        attitude = np.square(all_errors[..., 6:]).mean(axis=1) if estimator.has_attitude else nothing[:, :2]
+        reckoned = full_pose(velocities, estimates.means[..., 6:] if estimator.has_attitude else None, DT)
         full = pose_errors(reckoned, true_pose)
     by_yaw = planar_pose(velocities, DT)
     planar = pose_errors(by_yaw, true_pose)
@@ -343,10 +343,10 @@ def tasks_of(paper: str) -> list[Task]:
     """The tasks of "ngatini2017" or "ngatini2019"; ValueError for another name."""
     if one_of("paper", paper, tuple(PAPERS)) == ngatini2019.PAPER.name:
         return [Task("IV", "vehicle", [measured(), *kalman(), *ensembles(8)])]
-    (printed, *others), ekf8, enkf = fuzzy(), kalman()[0], ensembles(8, members=(ngatini2017.MEMBERS,))[0]
+    (printed, *wide), ekf8, enkf = fuzzy(), kalman()[0], ensembles(8, members=(ngatini2017.MEMBERS,))[0]
     few = [measured(), ekf8, enkf, printed]
     paths = [Task(name, "vehicle", few) for name in ("I", "II", "III")]
-    paths += [Task(name, "vehicle", [*few, *others]) for name in ("IV", "dynamic")]
+    paths += [Task(name, "vehicle", [*few, *wide]) for name in ("IV", "dynamic")]
     ekf8, _, ekf6, _ = kalman(OTHER_WORLD)
-    there = [measured(), ekf8, ekf6, *ensembles(6, OTHER_WORLD), *fuzzy(OTHER_WORLD)]
-    return [*paths, Task("dynamic", OTHER_WORLD, there)]
+    closed = [measured(), ekf8, ekf6, *ensembles(6, OTHER_WORLD), *fuzzy(OTHER_WORLD)]
+    return [*paths, Task("dynamic", OTHER_WORLD, closed)]

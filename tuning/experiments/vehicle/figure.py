@@ -44,12 +44,12 @@ def path_run(path: str, estimators: Sequence[Estimator], *, seed: int = 0, steps
     inputs, keys = PATHS[path].inputs(steps), keys_of(path, 1, at_least("seed", seed, 0))
     truth = true_runs("vehicle", keys, inputs)
     positions = {TRUTH: truth.states[0, :, 9:]}
-    for one in estimators:
-        means = estimate(one, truth, keys, inputs)[0].means
-        pose = full_pose(means[..., :6], means[..., 6:] if one.has_attitude else None, DT)
-        positions[one.label] = pose[0, :, :3]
-        if one is estimators[0]:
-            positions[f"{one.label} by yaw alone"] = planar_pose(means[..., :6], DT)[0, :, :3]
+    for estimator in estimators:
+        means = estimate(estimator, truth, keys, inputs)[0].means
+        pose = full_pose(means[..., :6], means[..., 6:] if estimator.has_attitude else None, DT)
+        positions[estimator.label] = pose[0, :, :3]
+        if estimator is estimators[0]:
+            positions[f"{estimator.label} by yaw alone"] = planar_pose(means[..., :6], DT)[0, :, :3]
     thinned = {label: line[::EVERY] for label, line in positions.items()}
     return PathRun(path, DT * np.arange(len(inputs) + 1)[::EVERY], thinned)
 
@@ -71,13 +71,13 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
     figure.get_layout_engine().set(
         rect=(0.0, 0.0, 1.0 - 0.5 / figure.get_figwidth(), 1.0)
     )  # labels of depth stick out
-    for place, one in enumerate(runs, start=1):
-        axis = figure.add_subplot(rows, columns, place, projection="3d")
-        for label, line in one.positions.items():
+    for panel, run in enumerate(runs, start=1):
+        axis = figure.add_subplot(rows, columns, panel, projection="3d")
+        for label, line in run.positions.items():
             axis.plot(*line.T, label=label, **STYLES[label])
-        _arrange(axis, np.concatenate(list(one.positions.values())))
-        meaning = PATHS[one.path].meaning
-        axis.set_title(one.path if one.path == meaning else f"{one.path}: {meaning}", fontsize=11, y=0.94)
+        _arrange(axis, np.concatenate(list(run.positions.values())))
+        meaning = PATHS[run.path].meaning
+        axis.set_title(run.path if run.path == meaning else f"{run.path}: {meaning}", fontsize=11, y=0.94)
     handles, labels = axis.get_legend_handles_labels()
     if rows * columns > len(runs):
         corner = figure.add_subplot(rows, columns, rows * columns)

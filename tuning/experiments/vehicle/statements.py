@@ -43,14 +43,14 @@ class Finding(NamedTuple):
 
 def findings(paper: str, results: list[PathResult]) -> list[Finding]:
     """All filters on the papers' paths, in the order that they ran in; not those of another world."""
-    found = []
+    rows = []
     for result in results:
         if result.world == "vehicle":
             for label, scores in result.scores.items():
                 printed = printed_row(paper, result.path, label)
                 why = "" if printed is None else why_different(printed, scores, result)
-                found.append(Finding(result.path, label, printed, scores, why))
-    return found
+                rows.append(Finding(result.path, label, printed, scores, why))
+    return rows
 
 
 def printed_row(paper: str, path: str, label: str) -> PrintedRow | None:
@@ -63,19 +63,19 @@ def printed_row(paper: str, path: str, label: str) -> PrintedRow | None:
 
 def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> str:
     """Which of our errors the printed ones resemble, and which are smaller than these measurements allow."""
-    said = []
+    reasons = []
     for field, words in FIELDS.items():
-        ratios = [value / one for value, one in _pairs(printed, scores.rmse(field))]
+        ratios = [value / error for value, error in _pairs(printed, scores.rmse(field))]
         if all(1 / FACTOR < ratio < FACTOR for ratio in ratios):
-            said = [words]
+            reasons = [words]
             break
-    if not said:
-        said = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
-        said += ["no one transformation gives the row"] * (len(said) > 1)
+    if not reasons:
+        reasons = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
+        reasons += ["no one transformation gives the row"] * (len(reasons) > 1)
     below = [name for name, value in printed.rmse.items() if value < result.bound.pose[POSE.index(name)] / FACTOR]
     if below:
-        said.append(f"{', '.join(below)} below the limit set by measured u, v, w, r on a true path")
-    return "; ".join(said)
+        reasons.append(f"{', '.join(below)} below the limit set by measured u, v, w, r on a true path")
+    return "; ".join(reasons)
 
 
 def _pairs(printed: PrintedRow, rmse: np.ndarray) -> list[tuple[float, float]]:
@@ -84,15 +84,15 @@ def _pairs(printed: PrintedRow, rmse: np.ndarray) -> list[tuple[float, float]]:
 
 def _by_component(printed: PrintedRow, scores: Scores) -> dict[str, str]:
     """For each reason the components that it would explain, by the names of these."""
-    found: dict[str, list[str]] = {}
+    components: dict[str, list[str]] = {}
     for name, value in printed.rmse.items():
         for field, words in FIELDS.items():
             if 1 / FACTOR < value / scores.rmse(field)[POSE.index(name)] < FACTOR:
-                found.setdefault(words, []).append(name)
+                components.setdefault(words, []).append(name)
                 break
         else:
-            found.setdefault("unlike any of ours", []).append(name)
-    return {", ".join(names): words for words, names in found.items()}
+            components.setdefault("unlike any of ours", []).append(name)
+    return {", ".join(names): words for words, names in components.items()}
 
 
 # Formats of numbers in tables and statements.
@@ -106,9 +106,10 @@ def digits(value: float) -> str:
     return f"{rounded:,.0f}".replace(",", " ") if 1000 <= abs(rounded) < 1e15 else f"{rounded:g}"
 
 
-def with_interval(one: Interval) -> str:
+def with_interval(estimate: Interval) -> str:
     """A value with its interval; nothing for NaN."""
-    return "" if math.isnan(one.value) else f"{digits(one.value)} [{digits(one.low)}, {digits(one.high)}]"
+    value, low, high = map(digits, estimate)
+    return f"{value} [{low}, {high}]" if value else ""
 
 
 GOLDEN = math.sqrt(
@@ -147,7 +148,7 @@ def statements(paper: str, results: list[PathResult]) -> list[str]:
 def _of_transformation(iv: PathResult) -> list[str]:
     printed = np.array([list(row.rmse.values()) for row in ngatini2019.TABLE_III.values()])
     flat = 100 * (printed.max(axis=0) / printed.min(axis=0) - 1.0).max()
-    by_yaw = np.array([one.rmse("planar") for one in iv.scores.values()])
+    by_yaw = np.array([scores.rmse("planar") for scores in iv.scores.values()])
     ours = 100 * (by_yaw.max(axis=0) / by_yaw.min(axis=0) - 1.0).max()
     gap, full = iv.planar_gap, iv.scores["EKF8"].rmse("full")
     return [
@@ -165,8 +166,8 @@ def _of_members(iv: PathResult) -> list[str]:
     ours = [scores[f"EnKF8 N={count}"] for count in printed]
     kalman = ("EKF8", "UKF8", "EKF6 level", "EKF6 own attitude")
     measured = 1e3 * np.array([scores[label].rmse("velocities")[list(MEASURED_PLACES)] for label in kalman])
-    nees = ", ".join(f"{digits(one.nees_interval.value)}" for one in ours)
-    (mean_only,) = [one for label, one in scores.items() if "eq. (24)" in label]
+    nees = ", ".join(f"{digits(of_members.nees_interval.value)}" for of_members in ours)
+    (mean_only,) = [of_mean for label, of_mean in scores.items() if "eq. (24)" in label]
     theirs = ", ".join(f"{row.seconds:g}" for row in printed.values())
     return [
         f"A measured velocity with Q = R is estimated to sqrt(0.618 R) = {1e3 * GOLDEN:.3f} mm/s (or mrad/s), "
@@ -185,13 +186,13 @@ def _of_members(iv: PathResult) -> list[str]:
 
 
 def _of_attitude(iv: PathResult) -> list[str]:
-    level, own, eight = (iv.scores[label] for label in ("EKF6 level", "EKF6 own attitude", "EKF8"))
-    rates = [1e3 * one.rmse("velocities")[3:5] for one in (eight, own, level)]
+    level, reckoned, eight = (iv.scores[label] for label in ("EKF6 level", "EKF6 own attitude", "EKF8"))
+    rates = [1e3 * scores.rmse("velocities")[3:5] for scores in (eight, reckoned, level)]
     return [
         "The papers' six states are not closed: weight and buoyancy depend on roll and pitch. With zero roll "
         f"and pitch the EKF of six states has RMSE of p and q of {rates[2][0]:.0f} and {rates[2][1]:.0f} mrad/s "
         f"and a NEES of {digits(level.nees_interval.value)}; with its own dead-reckoned attitude "
-        f"{rates[1][0]:.1f} and {rates[1][1]:.1f} and {digits(own.nees_interval.value)}; the EKF of eight "
+        f"{rates[1][0]:.1f} and {rates[1][1]:.1f} and {digits(reckoned.nees_interval.value)}; the EKF of eight "
         f"states {rates[0][0]:.1f} and {rates[0][1]:.1f}.",
         NO_POSTERIOR_BOUND,
     ]
@@ -201,9 +202,10 @@ def _of_matrix() -> str:
     printed = np.sort(np.linalg.eigvals(np.linalg.inv(PRINTED_INVERSE)).real)
     ours = np.linalg.eigvalsh(mass_matrix(SEGOROGENI))
     return (
-        f"The inverse of the printed A^-1 has eigenvalues {', '.join(f'{one:.2f}' for one in printed)}: two are "
-        f"negative, so no vehicle has this mass matrix. Ours has {', '.join(f'{one:.3g}' for one in ours)}. "
-        "The coefficients of the paper are therefore unusable; ours are derived from the printed sizes."
+        f"The inverse of the printed A^-1 has eigenvalues {', '.join(f'{value:.2f}' for value in printed)}: two "
+        f"are negative, so no vehicle has this mass matrix. Ours has "
+        f"{', '.join(f'{value:.3g}' for value in ours)}. The coefficients of the paper are "
+        "therefore unusable; ours are derived from the printed sizes."
     )
 
 
@@ -254,19 +256,19 @@ def _of_other_world(other: PathResult) -> list[str]:
         "fuzzy 0..1 own": "the same with a separate estimate for each rule",
         "fuzzy narrow offsets": "a range around the manoeuvre, with offsets",
     }
-    said = []
+    comparisons = []
     for label, what in words.items():
         p, q = scores[label].rmse("velocities")[3:5] / base.rmse("velocities")[3:5]
         ratio = position_ratio(scores[label], base, "full")
-        said.append(f"{what}: p {p:.2g}, q {q:.2g}, position {with_interval(ratio)}")
+        comparisons.append(f"{what}: p {p:.2g}, q {q:.2g}, position {with_interval(ratio)}")
     ensembles = ", ".join(
-        f"{digits(one.nees_interval.value)}"
-        for label, one in scores.items()
+        f"{digits(of_filter.nees_interval.value)}"
+        for label, of_filter in scores.items()
         if label.startswith("EnKF6") and "(24)" not in label
     )
     return [
         "On equal terms, in a world without restoring moments where six states are exact, the fuzzy filter's "
-        f"RMSE over that of the EKF of six states: {'; '.join(said)}. The NEES of that EKF is "
+        f"RMSE over that of the EKF of six states: {'; '.join(comparisons)}. The NEES of that EKF is "
         f"{digits(base.nees_interval.value)}, of the EnKF {ensembles} for N = 50, 100, 200, 300. Positions are "
         "worse for all: without restoring moments roll and pitch drift unseen.",
     ]

@@ -75,13 +75,13 @@ class Result(NamedTuple):
     error: str = ""
 
 
-def data_set(case: Case, place: int) -> Data:
+def data_set(case: Case, set_index: int) -> Data:
     """The runs of a data set, to learn from."""
     problem = case.make()
     if case.make is lidar:
-        data = problem.data(range(32 * place, 32 * place + case.runs))
+        data = problem.data(range(32 * set_index, 32 * set_index + case.runs))
     else:
-        data = problem.data(problem.training_seeds(place, max(case.runs, 2))).slice(0, case.runs)
+        data = problem.data(problem.training_seeds(set_index, max(case.runs, 2))).slice(0, case.runs)
     return data if case.truth else data._replace(states=None, outputs=None)
 
 
@@ -99,48 +99,52 @@ def scored(choice: Choice, case: Case, count: int) -> Scored:
     problem, data = case.make(), _held_out(case.make, count)
     filter_ = choice.filter(problem)
     runs = metrics_of_all(filter_, data, True, False, problem.scale)
-    found = compute_metrics(filter_, runs, data, problem.scale, False, False)
-    ratios = found.nees.value / len(found.rmse), found.nis.value / found.expected_nis
-    return Scored(found.score.value, *ratios, found.log_likelihood, found.log_score.value)
+    evaluation = compute_metrics(filter_, runs, data, problem.scale, False, False)
+    ratios = evaluation.nees.value / len(evaluation.rmse), evaluation.nis.value / evaluation.expected_nis
+    return Scored(evaluation.score.value, *ratios, evaluation.log_likelihood, evaluation.log_score.value)
 
 
-def start_of(case: Case, place: int) -> Choice:
+def start_of(case: Case, set_index: int) -> Choice:
     """Where a data set's ways begin."""
-    problem, (on_q, on_r) = case.make(), STARTS[place % len(STARTS)]
-    found = untuned_choice(case.filter, problem)
+    problem, (on_q, on_r) = case.make(), STARTS[set_index % len(STARTS)]
+    choice = untuned_choice(case.filter, problem)
     if case.members is not None:
-        found = found.with_size(case.members)
-    for one in model_parameters(problem, hold_r=case.options.get("hold_r", False)):
-        factor = {ProcessVariance: on_q, MeasurementVariance: on_r}.get(type(one.place), 1.0)
-        found = one.set(found, min(max(factor * (one.get(found) or 1.0), one.low), one.high))
-    return found
+        choice = choice.with_size(case.members)
+    for parameter in model_parameters(problem, hold_r=case.options.get("hold_r", False)):
+        factor = {ProcessVariance: on_q, MeasurementVariance: on_r}.get(type(parameter.place), 1.0)
+        choice = parameter.set(
+            choice, min(max(factor * (parameter.get(choice) or 1.0), parameter.low), parameter.high)
+        )
+    return choice
 
 
-def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
+def run_way(case: Case, way: str, set_index: int, protocol: Protocol) -> Result:
     """A way on a data set."""
-    data, error, label = data_set(case, place), "", way
+    data, error, label = data_set(case, set_index), "", way
     informed = way.endswith(FROM_NOISE)
     if informed or way.endswith(WITH_FULL):
         if case.options == FULL and not informed:
-            return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here")
+            return Result(
+                case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here"
+            )
         way = way.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
         case = case._replace(options=FULL)
     try:
-        _check(case, way, _task(case, data, place, Budget()))
+        _check(case, way, _task(case, data, set_index, Budget()))
     except ValueError as lacking:
-        return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, str(lacking))
+        return Result(case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, str(lacking))
     if way in WAYS:  # so that nothing is left to compile
         with suppress(ValueError):
-            find_way(way).run(way, _task(case, data.slice(0, 4), place, Budget(60, 5.0)))
-    task = _task(case, data, place, Budget(protocol.runs, protocol.seconds))
+            find_way(way).run(way, _task(case, data.slice(0, 4), set_index, Budget(60, 5.0)))
+    task = _task(case, data, set_index, Budget(protocol.runs, protocol.seconds))
     try:
         if informed:
             find_way("noise-estimation").run("noise-estimation", task)
             task.start = task.best
-        _follow(case, way, place, task)
+        _follow(case, way, set_index, task)
     except ValueError as problem:
         error = str(problem) or type(problem).__name__
-    taken = task.runs, task.seconds  # without that of scoring
+    cost = task.runs, task.seconds  # without that of scoring
     known: dict[int, Scored] = {}
 
     def at(choice: Choice) -> Scored:
@@ -150,19 +154,21 @@ def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
 
     last = task.start if error else task.best
     by_runs = {
-        f"{one:g}": at(last if error else task.best_within(runs=one)) for one in RUNS if one <= protocol.runs
+        f"{limit:g}": at(last if error else task.best_within(runs=limit))
+        for limit in RUNS
+        if limit <= protocol.runs
     }
     by_seconds = {
-        f"{one:g}": at(last if error else task.best_within(seconds=one))
-        for one in SECONDS
-        if one <= protocol.seconds
+        f"{limit:g}": at(last if error else task.best_within(seconds=limit))
+        for limit in SECONDS
+        if limit <= protocol.seconds
     }
-    return Result(case.name, label, place, by_runs, by_seconds, at(last), *taken, _plain(last), error)
+    return Result(case.name, label, set_index, by_runs, by_seconds, at(last), *cost, _plain(last), error)
 
 
-def _task(case: Case, data: Data, place: int, budget: Budget) -> Task:
-    given: dict[str, Any] = {"options": case.options, "budget": budget, "seed": place}
-    return Task(case.filter, case.make(), data, start=start_of(case, place), **given)
+def _task(case: Case, data: Data, set_index: int, budget: Budget) -> Task:
+    arguments: dict[str, Any] = {"options": case.options, "budget": budget, "seed": set_index}
+    return Task(case.filter, case.make(), data, start=start_of(case, set_index), **arguments)
 
 
 def _check(case: Case, way: str, task: Task) -> None:
@@ -175,31 +181,31 @@ def _check(case: Case, way: str, task: Task) -> None:
         raise ValueError("a study draws its own runs, not these")
 
 
-def _follow(case: Case, way: str, place: int, task: Task) -> None:
+def _follow(case: Case, way: str, set_index: int, task: Task) -> None:
     """Let a task keep what a way finds."""
     problem = task.problems[0]
     if way in WAYS:
         return find_way(way).run(way, task, guarded=False)
-    found: Choice | None = task.start
+    choice: Choice | None = task.start
     if way == SCALED:
-        found = scaled_default(case.filter, problem, place).choice
+        choice = scaled_default(case.filter, problem, set_index).choice
     elif way == ORACLE:
-        found = oracle_choice(case.filter, problem)
+        choice = oracle_choice(case.filter, problem)
     elif way in (STUDY, STUDY_LOG_SCORE):
-        return _study(case, way, place, task)
-    if found is None:
+        return _study(case, way, set_index, task)
+    if choice is None:
         raise ValueError(f"there is no {way}")
-    return task.keep(found if case.members is None else found.with_size(case.members))
+    return task.keep(choice if case.members is None else choice.with_size(case.members))
 
 
-def _study(case: Case, way: str, place: int, task: Task) -> None:
+def _study(case: Case, way: str, set_index: int, task: Task) -> None:
     """What `thruster tune` does, which draws runs of its own to choose among its best trials; in one piece."""
     objective = SCORE if way == STUDY else LOG_SCORE
-    given: dict[str, Any] = dict(case.options)
-    plan = Plan(case.filter, (case.make(),), place, (objective,), **given)
+    options: dict[str, Any] = dict(case.options)
+    plan = Plan(case.filter, (case.make(),), set_index, (objective,), **options)
     with quiet_optuna():
         with task.uncounted():  # so that nothing is left to compile
-            other = plan._replace(seed=place + 1000)
+            other = plan._replace(seed=set_index + 1000)
             run_study(open_study("first", other), other, 2)
         result = run_study(open_study("ways", plan), plan, TRIALS)
     task.runs += TRIALS * task.passes
@@ -221,29 +227,31 @@ def reference(case: Case, protocol: Protocol) -> Result:
         coordinates, rng = goal.coordinates, np.random.default_rng(0)
         first = coordinates.of(goal.untuned)
         for turn in range(protocol.starts):
-            moved = first + rng.uniform(-np.log(100.0), np.log(100.0), len(first)) * coordinates.log * (turn > 0)
-            found = optimum(goal, np.clip(moved, coordinates.low, coordinates.high))
-            best = found if best is None or found.value > best.value else best
+            shifted = first + rng.uniform(-np.log(100.0), np.log(100.0), len(first)) * coordinates.log * (turn > 0)
+            maximum = optimum(goal, np.clip(shifted, coordinates.low, coordinates.high))
+            best = maximum if best is None or maximum.value > best.value else best
         assert best is not None
         choice = goal.choice_at(coordinates.of(best.parameters))
     else:
         least, choice = math.inf, start
-        some = data.slice(0, min(protocol.many, 200))
-        budget = Budget(SIMPLEX * len(some.seeds))
+        fewer = data.slice(0, min(protocol.many, 200))
+        budget = Budget(SIMPLEX * len(fewer.seeds))
         starts = [start_of(case, turn) for turn in range(min(protocol.starts, len(STARTS)))]
         for turn, begun in enumerate(starts):
             if begun in starts[:turn]:
                 continue
-            one = Task(case.filter, problem, some, options=case.options, start=begun, budget=budget)
-            find_way("nelder-mead").run("nelder-mead", one)
-            value = one.value(one.best)
+            simplex = Task(case.filter, problem, fewer, options=case.options, start=begun, budget=budget)
+            find_way("nelder-mead").run("nelder-mead", simplex)
+            value = simplex.value(simplex.best)
             if value < least:
-                least, choice = value, one.best
+                least, choice = value, simplex.best
     found_score, seconds = scored(choice, case, protocol.held_out), time.process_time() - begin
     return Result(case.name, REFERENCE, 0, {}, {}, found_score, 0.0, seconds, _plain(choice))
 
 
 def _plain(choice: Choice) -> dict[str, Any]:
     """A choice as JSON has it."""
-    found: dict[str, Any] = json.loads(json.dumps(choice._asdict(), default=lambda one: np.asarray(one).tolist()))
-    return found
+    content: dict[str, Any] = json.loads(
+        json.dumps(choice._asdict(), default=lambda array: np.asarray(array).tolist())
+    )
+    return content

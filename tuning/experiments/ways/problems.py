@@ -61,12 +61,12 @@ GROUPS = {
 @cache
 def walk() -> Problem:
     """A level that wanders."""
-    one = np.eye(1)
+    unit = np.eye(1)
     noise = {"process_noise_cov": [1.0], "measurement_noise_cov": 4.0}
-    model = affine_model(a=one, b=np.zeros((1, 0)), c=one, prior_mean=[0.0], prior_cov=[4.0], **noise)
-    given = {"process_noise_cov": (0.01,), "measurement_noise_cov": 4.0}
+    model = affine_model(a=unit, b=np.zeros((1, 0)), c=unit, prior_mean=[0.0], prior_cov=[4.0], **noise)
+    untuned = {"process_noise_cov": (0.01,), "measurement_noise_cov": 4.0}
     return ModelProblem(
-        model, steps=300, untuned=given, name="walk", about="a level that wanders, seen with noise"
+        model, steps=300, untuned=untuned, name="walk", about="a level that wanders, seen with noise"
     )
 
 
@@ -82,19 +82,21 @@ def velocity() -> Problem:
         prior_mean=[0.0] * 4,
         prior_cov=[10.0, 10.0, 1.0, 1.0],
     )
-    given = {"process_noise_cov": (1.0,) * 4, "measurement_noise_cov": (1.0, 1.0)}
+    untuned = {"process_noise_cov": (1.0,) * 4, "measurement_noise_cov": (1.0, 1.0)}
     about = "motion in a plane at nearly constant velocity, both positions measured"
-    return ModelProblem(model, steps=300, untuned=given, name="velocity", about=about)
+    return ModelProblem(model, steps=300, untuned=untuned, name="velocity", about=about)
 
 
 @cache
 def swing() -> Problem:
     """Gymnasium's pendulum, drawn from the model that filters assume."""
     true = pendulum(0.3)
-    given = {"process_noise_cov": (1e-3, 1e-1), "measurement_noise_cov": (0.01, 0.01, 0.25)}
+    untuned = {"process_noise_cov": (1e-3, 1e-1), "measurement_noise_cov": (0.01, 0.01, 0.25)}
     push = Steps(amplitude=2.0, hold=20)
     name = "pendulum"
-    return ModelProblem(true, true, push, steps=300, dt=0.05, untuned=given, name=name, about="a pendulum, right")
+    return ModelProblem(
+        true, true, push, steps=300, dt=0.05, untuned=untuned, name=name, about="a pendulum, right"
+    )
 
 
 @cache
@@ -106,21 +108,21 @@ def chain() -> Problem:
     eye, zero = np.eye(MASSES), np.zeros((MASSES, MASSES))
     a = np.block([[zero, eye], [-k, -DAMPING * eye]])
     b = np.vstack([zero, eye])[:, :1]
-    whole = expm(DT * np.block([[a, b], [np.zeros((1, 2 * MASSES + 1))]]))
+    discrete = expm(DT * np.block([[a, b], [np.zeros((1, 2 * MASSES + 1))]]))
     n = 2 * MASSES
     model = affine_model(
-        a=whole[:n, :n],
-        b=whole[:n, n:],
+        a=discrete[:n, :n],
+        b=discrete[:n, n:],
         c=np.eye(n)[[0, 2, 4]],
         process_noise_cov=[1e-6] * MASSES + [1e-4, 4e-4, 1e-4, 1e-3, 1e-4],
         measurement_noise_cov=[2.5e-5, 1e-4, 2.5e-5],
         prior_mean=np.zeros(n),
         prior_cov=[1e-4] * MASSES + [1e-2] * MASSES,
     )
-    given = {"process_noise_cov": (1e-5,) * MASSES + (1e-3,) * MASSES, "measurement_noise_cov": (1e-4,) * 3}
+    untuned = {"process_noise_cov": (1e-5,) * MASSES + (1e-3,) * MASSES, "measurement_noise_cov": (1e-4,) * 3}
     push = Steps(amplitude=20.0, hold=40)
     about = "five masses and springs, ten states, three displacements measured: thirteen numbers"
-    return ModelProblem(model, model, push, steps=300, dt=DT, untuned=given, name="chain", about=about)
+    return ModelProblem(model, model, push, steps=300, dt=DT, untuned=untuned, name="chain", about=about)
 
 
 @cache
@@ -134,7 +136,7 @@ def targets() -> Problem:
     times = np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
     intensities = np.array([[0.10, 0.06], [0.06, 0.05]]), np.array([[0.02, -0.01], [-0.01, 0.04]])
     q = np.zeros((8, 8))
-    q[:4, :4], q[4:, 4:] = (np.kron(times, one) for one in intensities)
+    q[:4, :4], q[4:, 4:] = (np.kron(times, intensity) for intensity in intensities)
     model = affine_model(
         a=np.kron(np.eye(2), motion),
         b=np.zeros((8, 0)),
@@ -144,17 +146,17 @@ def targets() -> Problem:
         prior_mean=np.zeros(8),
         prior_cov=[10.0, 10.0, 1.0, 1.0] * 2,
     )
-    given = {"process_noise_cov": (0.1,) * 8, "measurement_noise_cov": (1.0,) * 4}
+    untuned = {"process_noise_cov": (0.1,) * 8, "measurement_noise_cov": (1.0,) * 4}
     about = "a target and another one seen from it, eight states; Q has two full blocks: forty numbers"
-    return ModelProblem(model, steps=300, untuned=given, name="targets", about=about)
+    return ModelProblem(model, steps=300, untuned=untuned, name="targets", about=about)
 
 
 @cache
 def ring(steps: int = 300) -> Problem:
     """Lorenz-96, where twenty members need some inflation; in the first half of a run it reaches its attractor."""
-    given: dict[str, Any] = {"scale": np.ones(lorenz96.STATES), "dt": lorenz96.SUBSTEP}
+    arguments: dict[str, Any] = {"scale": np.ones(lorenz96.STATES), "dt": lorenz96.SUBSTEP}
     return noise_free_problem(
-        lorenz96.model(), steps=steps, first_scored_step=steps // 2, about="Lorenz-96", **given
+        lorenz96.model(), steps=steps, first_scored_step=steps // 2, about="Lorenz-96", **arguments
     )
 
 
@@ -164,7 +166,7 @@ def lidar() -> Problem:
     return lidar_problem(drawn(LIDAR_SETS * 32 + LIDAR_RUNS), LIDAR_RUNS)
 
 
-def found(name: str) -> Callable[[], Problem]:
+def problem_named(name: str) -> Callable[[], Problem]:
     """A problem by its name."""
     return partial(find_problem, name)  # which another process can be sent
 
@@ -172,22 +174,22 @@ def found(name: str) -> Callable[[], Problem]:
 CASES = (
     Case("walk", "A", walk, "kf"),
     Case("velocity", "A", velocity, "kf"),
-    Case("published_tunnel", "A", found("published_tunnel"), "kf"),
-    Case("nominal", "B", found("nominal"), "ekf"),
+    Case("published_tunnel", "A", problem_named("published_tunnel"), "kf"),
+    Case("nominal", "B", problem_named("nominal"), "ekf"),
     Case("pendulum", "B", swing, "ekf"),
-    Case("mismatch", "C", found("mismatch"), "ekf"),
-    Case("ambient", "C", found("ambient"), "ekf"),
+    Case("mismatch", "C", problem_named("mismatch"), "ekf"),
+    Case("ambient", "C", problem_named("ambient"), "ekf"),
     Case("lidar", "C", lidar, "kf", FULL),
-    Case("outliers", "D", found("outliers"), "ekf"),
-    Case("deadband", "D", found("deadband"), "ekf"),
-    Case("nominal, N = 10", "E", found("nominal"), "enkf", members=10),
+    Case("outliers", "D", problem_named("outliers"), "ekf"),
+    Case("deadband", "D", problem_named("deadband"), "ekf"),
+    Case("nominal, N = 10", "E", problem_named("nominal"), "enkf", members=10),
     Case("lorenz96, N = 20", "E", ring, "etkf", HELD_R, 16, 20),
     Case("chain", "F", chain, "kf"),
     Case("targets", "F", targets, "kf", FULL_Q),
-    Case("auv:motion", "F", found("auv:motion"), "ekf"),
-    Case("nominal, blind", "G", found("nominal"), "ekf", truth=False),
-    Case("mismatch, blind", "G", found("mismatch"), "ekf", truth=False),
-    *(Case(f"nominal, {runs} runs", "H", found("nominal"), "ekf", runs=runs) for runs in (1, 3, 10)),
+    Case("auv:motion", "F", problem_named("auv:motion"), "ekf"),
+    Case("nominal, blind", "G", problem_named("nominal"), "ekf", truth=False),
+    Case("mismatch, blind", "G", problem_named("mismatch"), "ekf", truth=False),
+    *(Case(f"nominal, {runs} runs", "H", problem_named("nominal"), "ekf", runs=runs) for runs in (1, 3, 10)),
     *(Case(f"velocity, {runs} runs", "H", velocity, "kf", runs=runs) for runs in (1, 3, 10)),
 )
 QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "kf", runs=4, truth=False))

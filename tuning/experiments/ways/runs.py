@@ -26,8 +26,8 @@ def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:
     """All that there is to do, one data set after the other, so that an early end leaves whole ones."""
     models = {case.model: case for case in reversed(protocol.cases)}
     yield from ((case, REFERENCE, 0) for case in protocol.cases if models[case.model] is case)
-    for place in range(protocol.sets):
-        yield from ((case, way, place) for case in protocol.cases for way in protocol.ways)
+    for set_index in range(protocol.sets):
+        yield from ((case, way, set_index) for case in protocol.cases for way in protocol.ways)
 
 
 def run_protocol(
@@ -47,18 +47,18 @@ def run_protocol(
         KeyboardInterrupt: on Ctrl-C; finished results are kept.
     """
     wanted = list(jobs_of(protocol))
-    missing = [one for one in wanted if not file_of(folder, *one, protocol).is_file()]
+    missing = [job for job in wanted if not file_of(folder, *job, protocol).is_file()]
     done = len(wanted) - len(missing)
     on_result("", done, len(wanted))
     if jobs == 1:
-        for one in missing:
+        for job in missing:
             done += 1
-            if not file_of(folder, *one, protocol).is_file():
-                _one(*one, protocol, folder)
-            on_result(f"{one[0].name}, {one[1]}", done, len(wanted))
+            if not file_of(folder, *job, protocol).is_file():
+                _one(*job, protocol, folder)
+            on_result(f"{job[0].name}, {job[1]}", done, len(wanted))
     elif missing:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            waiting = {pool.submit(_one, *one, protocol, folder): one for one in missing}
+            waiting = {pool.submit(_one, *job, protocol, folder): job for job in missing}
             try:
                 for future in as_completed(waiting):
                     future.result()
@@ -73,28 +73,28 @@ def run_protocol(
 
 def read(folder: Path, protocol: Protocol) -> list[Result]:
     """The results that are there."""
-    files = (file_of(folder, *one, protocol) for one in jobs_of(protocol))
+    files = (file_of(folder, *job, protocol) for job in jobs_of(protocol))
     return [_result(json.loads(file.read_text(encoding="utf-8"))) for file in files if file.is_file()]
 
 
-def file_of(folder: Path, case: Case, way: str, place: int, protocol: Protocol) -> Path:
+def file_of(folder: Path, case: Case, way: str, set_index: int, protocol: Protocol) -> Path:
     """The file of a result, whose name says what it depends on."""
 
     def plain(text: str) -> str:
-        return "".join(one if one.isalnum() else "-" for one in text)
+        return "".join(letter if letter.isalnum() else "-" for letter in text)
 
     if way == REFERENCE:
         return folder / plain(case.model) / f"{way}-{protocol.many}-{protocol.starts}-{protocol.held_out}.json"
     budget = f"{protocol.runs:g}-{protocol.seconds:g}-{protocol.held_out}"
-    return folder / plain(case.name) / f"{plain(way)}-{place}-{budget}.json"
+    return folder / plain(case.name) / f"{plain(way)}-{set_index}-{budget}.json"
 
 
-def _one(case: Case, way: str, place: int, protocol: Protocol, folder: Path) -> None:
+def _one(case: Case, way: str, set_index: int, protocol: Protocol, folder: Path) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    file = file_of(folder, case, way, place, protocol)
+    file = file_of(folder, case, way, set_index, protocol)
     if file.is_file():  # of another host, meanwhile
         return
-    result = reference(case, protocol) if way == REFERENCE else run_way(case, way, place, protocol)
+    result = reference(case, protocol) if way == REFERENCE else run_way(case, way, set_index, protocol)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(_as_data(result), indent=1))
 
@@ -102,13 +102,13 @@ def _one(case: Case, way: str, place: int, protocol: Protocol, folder: Path) -> 
 def _as_data(result: Result) -> dict[str, Any]:
     content = result._asdict()
     for name in ("by_runs", "by_seconds"):
-        content[name] = {key: list(one) for key, one in content[name].items()}
+        content[name] = {key: list(scored) for key, scored in content[name].items()}
     return content
 
 
 def _result(content: dict[str, Any]) -> Result:
     for name in ("by_runs", "by_seconds"):
-        content[name] = {key: Scored(*map(_float, one)) for key, one in content[name].items()}
+        content[name] = {key: Scored(*map(_float, scored)) for key, scored in content[name].items()}
     last: Sequence[float] | None = content.pop("last")
     return Result(**content, last=None if last is None else Scored(*map(_float, last)))
 
@@ -126,7 +126,7 @@ EQUAL = 0.01  # of log ratios: "equal" is within 1 %
 
 def within(kind: str, key: str) -> Callable[[Result], Scored | None]:
     """What of a result counts: what the way gave for a budget of "by_runs" or "by_seconds"."""
-    return lambda one: getattr(one, kind).get(key)
+    return lambda result: getattr(result, kind).get(key)
 
 
 class Regret(NamedTuple):
@@ -154,7 +154,7 @@ class Regret(NamedTuple):
 
 
 def regrets(
-    results: Sequence[Result], case: Case, at: Callable[[Result], Scored | None] = lambda one: one.last
+    results: Sequence[Result], case: Case, at: Callable[[Result], Scored | None] = lambda result: result.last
 ) -> list[Regret]:
     """The ways that a case allows, the best first; those with fewer data sets than the others, too.
 
@@ -167,49 +167,51 @@ def regrets(
     if reference is None:
         return []
     logs: dict[str, dict[int, float]] = {}
-    found, by_way = [], _by_way(results, case)
-    for way, some in by_way.items():
-        scores = {one.set: at(one) for one in some}
+    regrets_, by_way = [], _by_way(results, case)
+    for way, of_way in by_way.items():
+        scores = {result.set: at(result) for result in of_way}
         logs[way] = {
-            place: math.log(one.score / reference.score) for place, one in scores.items() if one is not None
+            set_index: math.log(scored.score / reference.score)
+            for set_index, scored in scores.items()
+            if scored is not None
         }
         values = np.array(list(logs[way].values()))
         if not len(values):
             continue
-        there = [one for one in scores.values() if one is not None]
-        found.append(
+        valid = [scored for scored in scores.values() if scored is not None]
+        regrets_.append(
             Regret(
                 way,
                 _exp(student(values)),
                 math.exp(float(np.median(values))),
                 math.exp(float(values.max())),
-                float(np.median([one.nees for one in there])),
-                float(np.median([one.nis for one in there])),
-                reference.log_score - float(np.mean([one.log_score for one in there])),
-                sum(bool(one.error) for one in some),
+                float(np.median([scored.nees for scored in valid])),
+                float(np.median([scored.nis for scored in valid])),
+                reference.log_score - float(np.mean([scored.log_score for scored in valid])),
+                sum(bool(result.error) for result in of_way),
                 len(values),
-                float(np.median([one.taken_runs for one in some])),
-                float(np.median([one.taken_seconds for one in some])),
+                float(np.median([result.taken_runs for result in of_way])),
+                float(np.median([result.taken_seconds for result in of_way])),
             )
         )
-    found.sort(key=lambda one: one.ratio.value)
-    worse = holm([chance(logs[one.way], logs[found[0].way]) for one in found], LEVEL)
-    return [one._replace(worse=is_worse) for one, is_worse in zip(found, worse, strict=True)]
+    regrets_.sort(key=lambda regret: regret.ratio.value)
+    worse = holm([chance(logs[regret.way], logs[regrets_[0].way]) for regret in regrets_], LEVEL)
+    return [regret._replace(worse=is_worse) for regret, is_worse in zip(regrets_, worse, strict=True)]
 
 
 def reference_of(results: Sequence[Result], case: Case) -> Scored | None:
     """What the best constant numbers of a case have, which cases that differ in their data share."""
-    names = {one.case for one in results if one.way == REFERENCE}
-    name = next((one for one in (case.name, case.name.split(",")[0]) if one in names), None)
-    return next((one.last for one in results if one.way == REFERENCE and one.case == name), None)
+    names = {result.case for result in results if result.way == REFERENCE}
+    name = next((candidate for candidate in (case.name, case.name.split(",")[0]) if candidate in names), None)
+    return next((result.last for result in results if result.way == REFERENCE and result.case == name), None)
 
 
 def _by_way(results: Iterable[Result], case: Case) -> dict[str, list[Result]]:
-    found: dict[str, list[Result]] = {}
-    for one in results:
-        if one.case == case.name and one.way != REFERENCE and one.last is not None:
-            found.setdefault(one.way, []).append(one)
-    return found
+    by_way: dict[str, list[Result]] = {}
+    for result in results:
+        if result.case == case.name and result.way != REFERENCE and result.last is not None:
+            by_way.setdefault(result.way, []).append(result)
+    return by_way
 
 
 def student(values: np.ndarray) -> Interval:
@@ -223,12 +225,12 @@ def student(values: np.ndarray) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
-def chance(one: dict[int, float], best: dict[int, float]) -> float:
+def chance(logs: dict[int, float], best: dict[int, float]) -> float:
     """One-sided p-value of "no worse than the best", by Student's test of differences paired by data set."""
     from scipy.special import stdtr
 
-    shared = [place for place in one if place in best]
-    differences = np.array([one[place] - best[place] for place in shared])
+    shared = [set_index for set_index in logs if set_index in best]
+    differences = np.array([logs[set_index] - best[set_index] for set_index in shared])
     if len(differences) < 2 or not differences.any():
         return 1.0
     error = differences.std(ddof=1) / math.sqrt(len(differences))
@@ -237,5 +239,5 @@ def chance(one: dict[int, float], best: dict[int, float]) -> float:
     return float(stdtr(len(differences) - 1, -differences.mean() / error))
 
 
-def _exp(one: Interval) -> Interval:
-    return Interval(*(math.exp(min(end, 700.0)) for end in one))
+def _exp(interval: Interval) -> Interval:
+    return Interval(*(math.exp(min(end, 700.0)) for end in interval))

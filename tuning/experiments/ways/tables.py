@@ -86,61 +86,61 @@ def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
     rows = []
     for situation in SITUATIONS:
         cases = [case for case in protocol.cases if situation.has(case)]
-        found = [regrets(results, case) for case in cases]
-        some = [
-            [one for one in each if _may(one.way, case, situation)]
-            for each, case in zip(found, cases, strict=True)
+        by_case = [regrets(results, case) for case in cases]
+        allowed = [
+            [regret for regret in each if _may(regret.way, case, situation)]
+            for each, case in zip(by_case, cases, strict=True)
         ]
-        some = [one for one in some if one]
-        if not some:
+        allowed = [of_case for of_case in allowed if of_case]
+        if not allowed:
             continue
-        everywhere = set.intersection(*({one.way for one in each} for each in some)) - {SCALED}
+        everywhere = set.intersection(*({regret.way for regret in each} for each in allowed)) - {SCALED}
         if not everywhere:
             continue
-        error = _cheapest(some, everywhere, lambda one: math.log(one.ratio.value), ENOUGH)
-        proper = _cheapest(some, everywhere, lambda one: _finite(one.log_score), ENOUGH_NATS)
-        cells = [[f"`{way}`", _both(some, way), _nees(some, way)] for way in (error, proper)]
+        error = _cheapest(allowed, everywhere, lambda regret: math.log(regret.ratio.value), ENOUGH)
+        proper = _cheapest(allowed, everywhere, lambda regret: _finite(regret.log_score), ENOUGH_NATS)
+        cells = [[f"`{way}`", _both(allowed, way), _nees(allowed, way)] for way in (error, proper)]
         rows.append([situation.text, *cells[0], *cells[1]])
     return markdown_table(heads, rows)
 
 
 def _cheapest(
-    some: Sequence[Sequence[Regret]], ways: set[str], of: Callable[[Regret], float], enough: float
+    by_case: Sequence[Sequence[Regret]], ways: set[str], of: Callable[[Regret], float], enough: float
 ) -> str:
     """The way of the least time among those whose mean is within what is enough of the least mean."""
-    means = {way: _mean(some, way, of) for way in ways}
+    means = {way: _mean(by_case, way, of) for way in ways}
     near = [way for way in ways if means[way] <= min(means.values()) + enough]
-    return min(near, key=lambda way: _mean(some, way, lambda one: one.seconds))
+    return min(near, key=lambda way: _mean(by_case, way, lambda regret: regret.seconds))
 
 
 def _may(way: str, case: Case, situation: Situation) -> bool:
     return way not in NO_WAYS and (situation.truth or is_blind(way, case))
 
 
-def _of(some: Sequence[Sequence[Regret]], way: str) -> list[Regret]:
-    return [one for each in some for one in each if one.way == way]
+def _of(by_case: Sequence[Sequence[Regret]], way: str) -> list[Regret]:
+    return [regret for each in by_case for regret in each if regret.way == way]
 
 
-def _mean(some: Sequence[Sequence[Regret]], way: str, of: Callable[[Regret], float]) -> float:
-    return float(np.mean([of(one) for one in _of(some, way)]))
+def _mean(by_case: Sequence[Sequence[Regret]], way: str, of: Callable[[Regret], float]) -> float:
+    return float(np.mean([of(regret) for regret in _of(by_case, way)]))
 
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else 1e6
 
 
-def _both(some: Sequence[Sequence[Regret]], way: str) -> str:
-    values = [one.ratio.value for one in _of(some, way)]
+def _both(by_case: Sequence[Sequence[Regret]], way: str) -> str:
+    values = [regret.ratio.value for regret in _of(by_case, way)]
     return f"{percent(math.exp(np.mean(np.log(values))))}, {percent(max(values))}"
 
 
-def _nees(some: Sequence[Sequence[Regret]], way: str) -> str:
-    return spread([one.nees for one in _of(some, way)])
+def _nees(by_case: Sequence[Sequence[Regret]], way: str) -> str:
+    return spread([regret.nees for regret in _of(by_case, way)])
 
 
 def spread(values: Sequence[float]) -> str:
     """The smallest and the largest of some values; nothing of those that are none."""
-    known = [one for one in values if math.isfinite(one)]
+    known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""
     return f"{known[0]:.3g}" if len(known) == 1 else f"{min(known):.3g} to {max(known):.3g}"
@@ -154,7 +154,7 @@ def percent(ratio: float) -> str:
 def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> str:
     """Regrets of all ways in the cases of a group, in percent; significantly worse than the best: in italics."""
     cases = [case for case in protocol.cases if case.group == group]
-    columns = [{one.way: one for one in regrets(results, case)} for case in cases]
+    columns = [{regret.way: regret for regret in regrets(results, case)} for case in cases]
     ways = dict.fromkeys(way for column in columns for way in column)
     order = sorted(ways, key=lambda way: _rank(columns, way))
     heads = ["way", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
@@ -162,44 +162,53 @@ def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> st
 
 
 def _rank(columns: Sequence[Mapping[str, Regret]], way: str) -> float:
-    return float(np.mean([math.log(one[way].ratio.value) if way in one else 9.0 for one in columns]))
+    return float(np.mean([math.log(column[way].ratio.value) if way in column else 9.0 for column in columns]))
 
 
 def _row(way: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
-    there = [one[way] for one in columns if way in one]
-    cells = [_cell(one.get(way)) for one in columns]
+    regrets_ = [column[way] for column in columns if way in column]
+    cells = [_cell(column.get(way)) for column in columns]
     name = f"**{way}**" if way in (STUDY, STUDY_LOG_SCORE) else way
-    taken = f"{np.median([one.runs for one in there]):.0f}", f"{np.median([one.seconds for one in there]):.2g}"
-    return [name, *cells, spread([one.nees for one in there]), *taken]
+    cost = (
+        f"{np.median([regret.runs for regret in regrets_]):.0f}",
+        f"{np.median([regret.seconds for regret in regrets_]):.2g}",
+    )
+    return [name, *cells, spread([regret.nees for regret in regrets_]), *cost]
 
 
-def _cell(one: Regret | None) -> str:
-    if one is None:
+def _cell(regret: Regret | None) -> str:
+    if regret is None:
         return "-"
-    half = 50.0 * (one.ratio.high - one.ratio.low)
-    said = percent(one.ratio.value)
-    if one.ratio.value < 2.0 and one.sets > 1:
-        said = f"{said[:-2]} ± {half:.1f} %" if half < 100.0 else f"{said[:-2]} ± 100 % or more"
-    failed = f", {one.failures} of {one.sets} failed" if one.failures else ""
-    said = f"*{said}*" if one.worse else said
-    return f"**{said}**{failed}" if one.equal else f"{said}{failed}"
+    half = 50.0 * (regret.ratio.high - regret.ratio.low)
+    text = percent(regret.ratio.value)
+    if regret.ratio.value < 2.0 and regret.sets > 1:
+        text = f"{text[:-2]} ± {half:.1f} %" if half < 100.0 else f"{text[:-2]} ± 100 % or more"
+    failed = f", {regret.failures} of {regret.sets} failed" if regret.failures else ""
+    text = f"*{text}*" if regret.worse else text
+    return f"**{text}**{failed}" if regret.equal else f"{text}{failed}"
 
 
 def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
     """Mean regret over the cases of groups A to D and F, at each budget of passes and of seconds."""
     cases = [case for case in protocol.cases if case.group in "ABCDF"]
-    by_runs = [f"{one:g}" for one in RUNS if one <= protocol.runs]
-    by_seconds = [f"{one:g}" for one in SECONDS if one <= protocol.seconds]
+    by_runs = [f"{limit:g}" for limit in RUNS if limit <= protocol.runs]
+    by_seconds = [f"{limit:g}" for limit in SECONDS if limit <= protocol.seconds]
     looks = [(f"{key} passes", within("by_runs", key)) for key in by_runs]
     looks += [(f"{key} s", within("by_seconds", key)) for key in by_seconds]
-    found = {name: [{one.way: one for one in regrets(results, case, at)} for case in cases] for name, at in looks}
+    by_budget = {
+        name: [{regret.way: regret for regret in regrets(results, case, at)} for case in cases]
+        for name, at in looks
+    }
     rows = []
     for way in (*WAYS, *FULL_WAYS, STUDY, STUDY_LOG_SCORE):
-        logs = [[math.log(one[way].ratio.value) for one in columns if way in one] for columns in found.values()]
+        logs = [
+            [math.log(column[way].ratio.value) for column in columns if way in column]
+            for columns in by_budget.values()
+        ]
         if logs and all(logs):
-            means = [float(np.mean(some)) for some in logs]
-            rows.append((means[-1], [way, str(len(logs[-1])), *(percent(math.exp(one)) for one in means)]))
-    return markdown_table(["way", "cases", *found], [row for _, row in sorted(rows, key=lambda one: one[0])])
+            means = [float(np.mean(of_budget)) for of_budget in logs]
+            rows.append((means[-1], [way, str(len(logs[-1])), *(percent(math.exp(mean)) for mean in means)]))
+    return markdown_table(["way", "cases", *by_budget], [row for _, row in sorted(rows, key=lambda pair: pair[0])])
 
 
 def ways_table() -> str:
@@ -248,14 +257,16 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
         axis.set_visible(False)
     for axis, group in zip(axes.flat, groups, strict=False):
         cases = [case for case in protocol.cases if case.group == group]
-        budgets = [one for one in RUNS if one <= protocol.runs]
+        budgets = [limit for limit in RUNS if limit <= protocol.runs]
         points: dict[float, dict[str, float]] = {}
         for budget in budgets:
-            found = [regrets(results, case, within("by_runs", f"{budget:g}")) for case in cases]
-            ways = dict.fromkeys(one.way for each in found for one in each)
+            by_case = [regrets(results, case, within("by_runs", f"{budget:g}")) for case in cases]
+            ways = dict.fromkeys(regret.way for each in by_case for regret in each)
             points[budget] = {
                 way: float(
-                    np.mean([math.log(one.ratio.value) for each in found for one in each if one.way == way])
+                    np.mean(
+                        [math.log(regret.ratio.value) for each in by_case for regret in each if regret.way == way]
+                    )
                 )
                 for way in ways
             }

@@ -27,31 +27,29 @@ def template() -> Template:
 
 
 @cache
-def own(name: str) -> Markup:
+def asset(name: str) -> Markup:
     """A style or script of the page."""
     return Markup((HERE / name).read_text(encoding="utf-8"))
 
 
 def signals(bench: Bench) -> list[tuple[str, str, str]]:
     """Name, title and description of each picture over time."""
-    found = []
-    for place, one in enumerate(bench.states):
-        named = _named(one)
-        found.append((f"state{place}", named, f"{named} over time, with the 95 % band of its estimate"))
-    for place, one in enumerate(bench.measurements):
-        named = f"Innovation of {_named(one)}"
-        found.append((f"innovation{place}", named, f"{named} over time, with its 95 % band"))
-    found.append(
-        ("nis", "NIS", "Normalised innovation squared over time, with the interval of its mean over runs")
-    )
+    rows = []
+    for i, quantity in enumerate(bench.states):
+        named = _named(quantity)
+        rows.append((f"state{i}", named, f"{named} over time, with the 95 % band of its estimate"))
+    for i, quantity in enumerate(bench.measurements):
+        named = f"Innovation of {_named(quantity)}"
+        rows.append((f"innovation{i}", named, f"{named} over time, with its 95 % band"))
+    rows.append(("nis", "NIS", "Normalised innovation squared over time, with the interval of its mean over runs"))
     if bench.has_truth:
-        found.append(("nees", "NEES", "Normalised estimation error squared over time, with its interval"))
-    found.append(("autocorrelation", "Autocorrelation of innovations", "Autocorrelation over lags, with its band"))
-    return found
+        rows.append(("nees", "NEES", "Normalised estimation error squared over time, with its interval"))
+    rows.append(("autocorrelation", "Autocorrelation of innovations", "Autocorrelation over lags, with its band"))
+    return rows
 
 
-def _named(one: Quantity) -> str:
-    return f"{one.name} [{one.unit}]" if one.unit else one.name
+def _named(quantity: Quantity) -> str:
+    return f"{quantity.name} [{quantity.unit}]" if quantity.unit else quantity.name
 
 
 def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
@@ -64,11 +62,11 @@ def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
         document.template = template()
         document.template_variables.update(
             heading=here.title,
-            css=own("page.css"),
-            js=own("page.js"),
+            css=asset("page.css"),
+            js=asset("page.js"),
             kinds=list(KINDS.items()),
             signals=signals(here),
-            scenes=[(one.name, one.title) for one in SCENES.values()],
+            scenes=[(scene_.name, scene_.title) for scene_ in SCENES.values()],
             scene=scene,
             has_truth=here.has_truth,
         )
@@ -80,5 +78,5 @@ def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
 def _asked(document: Document) -> str:
     """The scene that the address asks for; empty if none."""
     context = document.session_context
-    given = getattr(context.request, "arguments", {}) if context is not None else {}
-    return b"".join(given.get("scene", [])[:1]).decode(errors="replace")
+    arguments = getattr(context.request, "arguments", {}) if context is not None else {}
+    return b"".join(arguments.get("scene", [])[:1]).decode(errors="replace")

@@ -24,16 +24,16 @@ TICKS += " : String(+size.toPrecision(3))"
 class MapPicture:
     """Score or NIS over two knobs; a click takes their values."""
 
-    def __init__(self, knobs: Sequence[Knob], taken: Callable[[dict[str, float]], None], sent: Sent):
+    def __init__(self, knobs: Sequence[Knob], on_click: Callable[[dict[str, float]], None], sent: Sent):
         """Make it empty.
 
         Args:
             knobs: all that may be an axis.
-            taken: called with the two values of a click.
+            on_click: called with the two values of a click.
             sent: takes where one is.
         """
         self.set_knobs(knobs)
-        self._taken, self._sent = taken, sent
+        self._taken, self._sent = on_click, sent
         self.map: Map | None = None
         self.figure = new_figure("map", HEIGHT, tools="tap")
         self.image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
@@ -69,10 +69,10 @@ class MapPicture:
         paint(self.figure, colours)
         self.bar.major_label_text_color = colours.axis
 
-    def show(self, found: Map, what: str) -> None:
+    def show(self, map_: Map, what: str) -> None:
         """Draw a map: its "score", or its "nis"."""
-        self.map = found
-        values = np.array(found.nis if what == "nis" else found.score, dtype=float)
+        self.map = map_
+        values = np.array(map_.nis if what == "nis" else map_.score, dtype=float)
         values[~np.isfinite(values) | (values <= 0.0)] = np.nan
         if what == "nis":
             self.mapper.update(palette=RdBu11, low=0.1, high=10.0)
@@ -80,10 +80,10 @@ class MapPicture:
             least = float(np.nanmin(values)) if np.isfinite(values).any() else 1.0
             self.mapper.update(palette=Cividis256[::-1], low=least, high=BAD * least)
         (left, width), (bottom, height) = (
-            self._extent(name, along) for name, along in ((found.x, found.xs), (found.y, found.ys))
+            self._extent(name, along) for name, along in ((map_.x, map_.xs), (map_.y, map_.ys))
         )
         self.image.data = {"image": [as_sent(values)], "x": [left], "y": [bottom], "dw": [width], "dh": [height]}
-        for axis, name in ((self.figure.xaxis[0], found.x), (self.figure.yaxis[0], found.y)):
+        for axis, name in ((self.figure.xaxis[0], map_.x), (self.figure.yaxis[0], map_.y)):
             knob = self._knobs[name]
             axis.axis_label = f"{knob.label} [{knob.unit}]" if knob.unit else knob.label
             axis.formatter.args = {"log": knob.log}
@@ -104,13 +104,13 @@ class MapPicture:
         if self.map is None:
             return
         least, path = np.inf, []
-        for one in trials:
-            if one.score < least and not one.pruned:
-                least = one.score
-                path.append(one)
-        for source, some in ((self.trials, trials), (self.path, path)):
+        for trial in trials:
+            if trial.score < least and not trial.pruned:
+                least = trial.score
+                path.append(trial)
+        for source, points in ((self.trials, trials), (self.path, path)):
             source.data = {
-                axis: np.array([self._place(name, one.values) for one in some], dtype=float)
+                axis: np.array([self._place(name, trial.values) for trial in points], dtype=float)
                 for axis, name in (("x", self.map.x), ("y", self.map.y))
             }
 

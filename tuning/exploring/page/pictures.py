@@ -17,7 +17,7 @@ from tuning.exploring.view import View
 # Fewer points than steps: what a screen of so many pixels can show of a long run.
 
 
-def places(steps: int, width: int) -> np.ndarray:
+def drawn_steps(steps: int, width: int) -> np.ndarray:
     """Which steps are drawn on so many pixels: all, or evenly spaced ones from the first to the last."""
     if steps <= width:
         return np.arange(steps)
@@ -29,20 +29,20 @@ def extremes(values: np.ndarray, at: np.ndarray) -> np.ndarray:
 
     Args:
         values: (steps,).
-        at: places of `places`, (points,).
+        at: places of `drawn_steps`, (points,).
 
     Returns:
         (points,); NaN where a stretch has no number.
     """
     if len(at) == len(values):
         return values
-    there = np.isfinite(values)
-    centre = values[there].mean() if there.any() else 0.0
-    away = np.where(there, np.abs(values - centre), -1.0)
+    finite = np.isfinite(values)
+    centre = values[finite].mean() if finite.any() else 0.0
+    away = np.where(finite, np.abs(values - centre), -1.0)
     largest = np.maximum.reduceat(away, at)
-    stretch = np.searchsorted(at, np.arange(len(values)), side="right") - 1
-    peaks = np.flatnonzero(away == largest[stretch])
-    first = peaks[np.unique(stretch[peaks], return_index=True)[1]]
+    interval = np.searchsorted(at, np.arange(len(values)), side="right") - 1
+    peaks = np.flatnonzero(away == largest[interval])
+    first = peaks[np.unique(interval[peaks], return_index=True)[1]]
     return values[first]
 
 
@@ -112,7 +112,7 @@ def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
     Its axes stand where they are until the server moves them: pictures are to be compared while one drags, and a
     browser then need not lay them out.
     """
-    made = figure(
+    empty = figure(
         name=name,
         height=height,
         sizing_mode="stretch_width",
@@ -127,12 +127,12 @@ def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
         outline_line_color=None,
         **options,
     )
-    made.axis.axis_label_text_font_style = "normal"
-    made.axis.axis_label_text_font_size = made.axis.major_label_text_font_size = "12px"
-    made.axis.minor_tick_line_color = None
-    made.xgrid.visible = False
-    made.yaxis.ticker.desired_num_ticks = 4
-    return made
+    empty.axis.axis_label_text_font_style = "normal"
+    empty.axis.axis_label_text_font_size = empty.axis.major_label_text_font_size = "12px"
+    empty.axis.minor_tick_line_color = None
+    empty.xgrid.visible = False
+    empty.yaxis.ticker.desired_num_ticks = 4
+    return empty
 
 
 class Signal:
@@ -159,8 +159,8 @@ class Signal:
         draw.varea("time", "low", "high", source=between, fill_alpha=0.2, name="band")
         self._fan = draw.multi_line("xs", "ys", source=self._runs, line_alpha=0.35, name="estimate", visible=False)
         self._others = [
-            draw.line("time", "line", source=held, line_color=colour, visible=False)
-            for held, colour in zip(self.held, HELD, strict=True)
+            draw.line("time", "line", source=source, line_color=colour, visible=False)
+            for source, colour in zip(self.held, HELD, strict=True)
         ]
         self._truth = draw.line("time", "truth", source=lines, name="truth", visible=False)
         draw.line("time", "line", source=lines, name="estimate")
@@ -178,8 +178,10 @@ class Signal:
         self.columns = {"time": time, "low": low, "high": high, "line": line}
         self.columns["truth"] = line if truth is None else truth
         parts = ("band", ("low", "high"), corners(low, high)), ("lines", ("line", "truth"), ~np.isnan(line))
-        for what, names, some in parts:
-            self.sent.columns(f"{self.name} {what}", {one: self.columns[one][some] for one in ("time", *names)})
+        for what, names, mask in parts:
+            self.sent.columns(
+                f"{self.name} {what}", {column: self.columns[column][mask] for column in ("time", *names)}
+            )
         self.runs = list(runs)
         _set_visible(self._truth, truth is not None)
         _set_visible(self._fan, len(runs) > 0)
@@ -200,8 +202,8 @@ class Signal:
     def _frame(self, time: np.ndarray, lines: list[np.ndarray], band: tuple[np.ndarray, np.ndarray]) -> None:
         """Move the axes where what is drawn leaves them, or has become small in them."""
         ends = [*lines, *_most_of(band)]
-        ends = [one[np.isfinite(one) & (one > 0.0 if self.level else True)] for one in ends]
-        values = np.concatenate([one for one in ends if len(one)] or [np.ones(1)])
+        ends = [end[np.isfinite(end) & (end > 0.0 if self.level else True)] for end in ends]
+        values = np.concatenate([end for end in ends if len(end)] or [np.ones(1)])
         low, high = float(values.min()), float(values.max())
         if self.level:
             low, high = max(np.log10(low), np.log10(high) - 4.0), np.log10(high)
@@ -219,9 +221,9 @@ class Signal:
 
 def _most_of(band: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
     """Where most of a band ends, below and above."""
-    low, high = (np.sort(one[np.isfinite(one)]) for one in band)
-    within = [int(share * (len(one) - 1)) for one, share in ((low, 1.0 - OF_BAND), (high, OF_BAND))]
-    return [one[[at]] for one, at in zip((low, high), within, strict=True) if len(one)]
+    low, high = (np.sort(edge[np.isfinite(edge)]) for edge in band)
+    within = [int(share * (len(edge) - 1)) for edge, share in ((low, 1.0 - OF_BAND), (high, OF_BAND))]
+    return [edge[[at]] for edge, at in zip((low, high), within, strict=True) if len(edge)]
 
 
 def _set_visible(renderer: Any, visible: bool) -> None:
@@ -239,8 +241,8 @@ class Pictures:
     def __init__(self, bench: Bench, sent: Sent):
         """Make them empty; `sent` takes what is to be drawn."""
         self.sent = sent
-        self.states = [Signal(f"state{place}", sent) for place in range(len(bench.states))]
-        self.innovations = [Signal(f"innovation{place}", sent) for place in range(len(bench.measurements))]
+        self.states = [Signal(f"state{i}", sent) for i in range(len(bench.states))]
+        self.innovations = [Signal(f"innovation{i}", sent) for i in range(len(bench.measurements))]
         self.nis = Signal("nis", sent, level=True)
         self.nees = [Signal("nees", sent, level=True)] if bench.has_truth else []
         self.lags = ColumnDataSource({"lag": [], "value": []}, name="lags")
@@ -260,42 +262,42 @@ class Pictures:
     @property
     def figures(self) -> list[figure]:
         """All figures, in the order of the page."""
-        return [*(one.figure for one in self.signals), self.autocorrelation]
+        return [*(signal.figure for signal in self.signals), self.autocorrelation]
 
     def choose(self, states: Sequence[int]) -> None:
         """Which states are drawn."""
-        self.chosen = tuple(place for place in states if 0 <= place < len(self.states))
-        for place, one in enumerate(self.states):
-            one.figure.visible = place in self.chosen
+        self.chosen = tuple(i for i in states if 0 <= i < len(self.states))
+        for i, signal in enumerate(self.states):
+            signal.figure.visible = i in self.chosen
 
     def paint(self, colours: Colours) -> None:
         """Colour all of them."""
-        for one in self.figures:
-            paint(one, colours)
+        for picture in self.figures:
+            paint(picture, colours)
         self.white.fill_color = colours.band
 
     def show(self, view: View, look: Look) -> None:
         """Draw a view: one run's states, or the errors of all runs; what all runs say of consistency."""
         width, run, errors = look
-        at = places(view.time.shape[1], width)
+        at = drawn_steps(view.time.shape[1], width)
         run = min(run, len(view.estimate) - 1)
         time = view.time[run, at]
-        for place in self.chosen:
-            band = band_of(view, place, run, at, errors)
-            line, truth, runs = lines_of(view, place, run, at, errors)
-            self.states[place].show(time, line, band, truth, runs)
-        for place, one in enumerate(self.innovations):
-            half = WITHIN_95 * view.innovation_deviation[run, at, place]
-            one.show(time, extremes(view.innovation[run, :, place], at), (-half, half))
-        for one, values, (low, high) in self._levels(view):
-            one.show(time, extremes(mean_of_runs(values), at), (low[at], high[at]))
+        for i in self.chosen:
+            band = band_of(view, i, run, at, errors)
+            line, truth, runs = lines_of(view, i, run, at, errors)
+            self.states[i].show(time, line, band, truth, runs)
+        for i, signal in enumerate(self.innovations):
+            half = WITHIN_95 * view.innovation_deviation[run, at, i]
+            signal.show(time, extremes(view.innovation[run, :, i], at), (-half, half))
+        for signal, values, (low, high) in self._levels(view):
+            signal.show(time, extremes(mean_of_runs(values), at), (low[at], high[at]))
         self._show_lags(view)
 
     def _levels(self, view: View) -> list[tuple[Signal, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
-        found = [(self.nis, view.nis, view.nis_band)]
+        levels = [(self.nis, view.nis, view.nis_band)]
         if self.nees and view.nees is not None and view.nees_band is not None:
-            found.append((self.nees[0], view.nees, view.nees_band))
-        return found
+            levels.append((self.nees[0], view.nees, view.nees_band))
+        return levels
 
     def _show_lags(self, view: View) -> None:
         values = np.asarray(view.autocorrelation)
@@ -310,35 +312,35 @@ class Pictures:
     def hold(self, slot: int, view: View, look: Look) -> None:
         """Draw a held configuration in its colour."""
         width, run, errors = look
-        at = places(view.time.shape[1], width)
+        at = drawn_steps(view.time.shape[1], width)
         run = min(run, len(view.estimate) - 1)
         time = view.time[run, at]
-        for place, one in enumerate(self.states):
-            one.hold(slot, time, lines_of(view, place, run, at, errors)[0])
-        for place, one in enumerate(self.innovations):
-            one.hold(slot, time, extremes(view.innovation[run, :, place], at))
-        for one, values, _ in self._levels(view):
-            one.hold(slot, time, extremes(mean_of_runs(values), at))
+        for i, signal in enumerate(self.states):
+            signal.hold(slot, time, lines_of(view, i, run, at, errors)[0])
+        for i, signal in enumerate(self.innovations):
+            signal.hold(slot, time, extremes(view.innovation[run, :, i], at))
+        for signal, values, _ in self._levels(view):
+            signal.hold(slot, time, extremes(mean_of_runs(values), at))
 
     def drop(self, slot: int) -> None:
         """Draw a held configuration no longer."""
-        for one in self.signals:
-            one.drop(slot)
+        for signal in self.signals:
+            signal.drop(slot)
 
 
-def band_of(view: View, place: int, run: int, at: np.ndarray, errors: bool) -> tuple[np.ndarray, np.ndarray]:
+def band_of(view: View, i: int, run: int, at: np.ndarray, errors: bool) -> tuple[np.ndarray, np.ndarray]:
     """Where 95 % of a run's states lie, or of its errors."""
-    half = WITHIN_95 * view.deviation[run, at, place]
-    middle = 0.0 if errors and view.truth is not None else view.estimate[run, at, place]
+    half = WITHIN_95 * view.deviation[run, at, i]
+    middle = 0.0 if errors and view.truth is not None else view.estimate[run, at, i]
     return middle - half, middle + half
 
 
-def lines_of(view: View, place: int, run: int, at: np.ndarray, errors: bool) -> tuple:
+def lines_of(view: View, i: int, run: int, at: np.ndarray, errors: bool) -> tuple:
     """A run's estimate of a state, and the truth; or if `errors` x_hat - x of this run, and of the others."""
-    mean = view.estimate[run, at, place]
+    mean = view.estimate[run, at, i]
     if view.truth is None:
         return mean, None, ()
     if not errors:
-        return mean, view.truth[run, at, place], ()
-    fan = view.estimate[:, at, place] - view.truth[:, at, place]
-    return fan[run], None, [one for number, one in enumerate(fan) if number != run]
+        return mean, view.truth[run, at, i], ()
+    fan = view.estimate[:, at, i] - view.truth[:, at, i]
+    return fan[run], None, [errors_of_run for number, errors_of_run in enumerate(fan) if number != run]

@@ -39,7 +39,7 @@ class Sent:
         def part(column: Column) -> list:
             nonlocal size
             if not isinstance(column, np.ndarray):
-                return [part(one) for one in column]
+                return [part(line) for line in column]
             numbers.append(as_sent(column))
             size += column.size
             return [size - column.size, size]
@@ -51,7 +51,7 @@ class Sent:
         axes, self._columns, self._axes = self._axes, {}, {}
         if not (parts or axes):
             return {}
-        sent = b"".join(one.tobytes() for one in numbers)
+        sent = b"".join(array.tobytes() for array in numbers)
         return {"numbers": base64.b64encode(sent).decode(), "columns": parts, "axes": axes}
 
 

@@ -89,9 +89,9 @@ class Guarded(BokehTornado):
 
     def resources(self, absolute_url: str | bool | None = None) -> Resources:
         """Bokeh's scripts, from this server, without their warnings that a picture is still empty."""
-        found = super().resources(absolute_url)
-        found.log_level = "error"
-        return found
+        resources = super().resources(absolute_url)
+        resources.log_level = "error"
+        return resources
 
     def log_request(self, handler: Any) -> None:
         """Log nothing: addresses hold the token."""
@@ -159,14 +159,14 @@ class Server:
 
     def _watch(self, app: BokehTornado) -> Callable[[], None]:
         """What looks whether the last page was left a while ago."""
-        seen = {"page": False, "since": 0.0}
+        last_visit = {"page": False, "since": 0.0}
 
         def look() -> None:
             assert self._loop is not None
             now = self._loop.time()
             if any(session.connection_count for session in app.get_sessions("/")):
-                seen.update(page=True, since=now)
-            elif seen["page"] and now - seen["since"] > LEFT_FOR:
+                last_visit.update(page=True, since=now)
+            elif last_visit["page"] and now - last_visit["since"] > LEFT_FOR:
                 self._loop.stop()
 
         return look

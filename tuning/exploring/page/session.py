@@ -56,8 +56,8 @@ class Session:
         self.map.figure.tags = [self.wire]
         self.wire.on_change("asked", self._asked)
         document.on_session_destroyed(self._left)
-        for one in (*self.pictures.figures, self.map.figure):
-            document.add_root(one)
+        for figure in (*self.pictures.figures, self.map.figure):
+            document.add_root(figure)
         self._paint()
 
     def _asked(self, _: str, __: str, text: str) -> None:
@@ -110,25 +110,27 @@ class Session:
     def do_step(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """A setting of the scene."""
         steps = () if self.scene is None else self.scene.steps
-        place = int(question["step"])
-        if not 0 <= place < len(steps):
-            raise ValueError(f"step must be one of {len(steps)}, but got {place}")
-        return self._changed(steps[place].filter, steps[place].values)
+        index = int(question["step"])
+        if not 0 <= index < len(steps):
+            raise ValueError(f"step must be one of {len(steps)}, but got {index}")
+        return self._changed(steps[index].filter, steps[index].values)
 
     def _changed(self, name: str, values: Mapping[str, float]) -> dict[str, Any]:
         """Go on with another filter, or the same one, at what it knows of some values."""
         self._stopped.set()
         bench = self.bench if name == self.bench.filter else self.bench.with_filter(name)
         known = {knob.name: knob for knob in bench.knobs}
-        kept = {one: min(max(at, known[one].low), known[one].high) for one, at in values.items() if one in known}
-        self.bench, self.values, self.trials = bench, bench.checked(kept), []
+        clipped = {
+            key: min(max(at, known[key].low), known[key].high) for key, at in values.items() if key in known
+        }
+        self.bench, self.values, self.trials = bench, bench.checked(clipped), []
         self.map.set_knobs(bench.knobs)
         self._look()
         return {"spec": self._spec(), **self._numbers()}
 
     def do_plotted(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """Which states are drawn, of which run, and whether as errors."""
-        self.pictures.choose([int(place) for place in question["states"]])
+        self.pictures.choose([int(index) for index in question["states"]])
         self.run, self.errors = max(0, int(question["run"])), bool(question["errors"])
         self._look()
         for slot in self.held:
@@ -175,8 +177,9 @@ class Session:
         self.held[free[0]] = (self.bench, dict(self.values))
         self._draw_held(free[0])
         assert self.view is not None
-        held = {"slot": free[0], "colour": HELD[free[0]], "filter": self.bench.filter, "values": self.values}
-        return {"held": {**held, "figures": {name: one.value for name, one in self.view.figures.items()}}}
+        figures = {name: figure.value for name, figure in self.view.figures.items()}
+        source = {"filter": self.bench.filter, "values": self.values, "figures": figures}
+        return {"held": {"slot": free[0], "colour": HELD[free[0]], **source}}
 
     def do_drop(self, question: Mapping[str, Any]) -> None:
         """Forget a held configuration."""
@@ -186,8 +189,8 @@ class Session:
     def do_export(self, question: Mapping[str, Any]) -> None:
         """What is seen, as a file or text; a tuned file is evaluated first, which takes seconds."""
         assert self.view is not None
-        seen = self.bench, dict(self.values), self.view, self.run, str(question["kind"])
-        self._in_background(lambda: exported(*seen), lambda file: self.tell({"file": file._asdict()}))
+        arguments = self.bench, dict(self.values), self.view, self.run, str(question["kind"])
+        self._in_background(lambda: exported(*arguments), lambda file: self.tell({"file": file._asdict()}))
 
     def _seen(self, question: Mapping[str, Any]) -> None:
         width, least, most = float(question.get("width", self.width)), *WIDTHS
@@ -207,9 +210,11 @@ class Session:
 
     def _numbers(self) -> dict[str, Any]:
         assert self.view is not None and self.before is not None
-        start = {name: one.value for name, one in self.before.figures.items()}
-        shown = {name: {**one._asdict(), "start": start.get(name)} for name, one in self.view.figures.items()}
-        return {"figures": shown, "values": self.values}
+        start = {name: figure.value for name, figure in self.before.figures.items()}
+        figures = {
+            name: {**figure._asdict(), "start": start.get(name)} for name, figure in self.view.figures.items()
+        }
+        return {"figures": figures, "values": self.values}
 
     def _spec(self) -> dict[str, Any]:
         bench = self.bench
@@ -219,9 +224,9 @@ class Session:
             "start": dict(bench.start),
             "filter": bench.filter,
             "filters": list(bench.filters),
-            "states": [one.name for one in bench.states],
+            "states": [state.name for state in bench.states],
             "shown": list(self.pictures.chosen),
-            "steps": [one.label for one in self.scene.steps] if self.scene else [],
+            "steps": [step.label for step in self.scene.steps] if self.scene else [],
             "axes": list(self.scene.knobs[:2]) if self.scene else [],
             "truth": bench.has_truth,
             "seeds": 0 if self.view is None else len(self.view.estimate),
@@ -241,8 +246,8 @@ class Session:
         self._look()
         self.tell(self._numbers())
 
-    def _mapped(self, found: Any) -> None:
-        self.map.show(found, self.what)
+    def _mapped(self, computed: Any) -> None:
+        self.map.show(computed, self.what)
         self.map.mark(self.values)
         self.map.points(self.trials)
         self.tell({"map": True})
@@ -252,7 +257,7 @@ class Session:
             return
         self.trials.append(trial)
         self.map.points(self.trials)
-        best = min(self.trials, key=lambda one: one.score if math.isfinite(one.score) else math.inf)
+        best = min(self.trials, key=lambda trial: trial.score if math.isfinite(trial.score) else math.inf)
         self.tell({"study": {"done": False, "trial": len(self.trials), "trials": trials, "best": best._asdict()}})
 
     def _in_background(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
@@ -260,12 +265,12 @@ class Session:
 
         def run() -> None:
             try:
-                found = work()
+                result = work()
             except Exception as error:
                 text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
                 self._later(lambda: self.tell({"error": text, "study": {"done": True}}))
                 return
-            self._later(lambda: then(found))
+            self._later(lambda: then(result))
 
         threading.Thread(target=run, daemon=True).start()
 
@@ -282,9 +287,9 @@ class Session:
 def _plain(value: Any) -> Any:
     """What JSON holds: None for NaN and infinities."""
     if isinstance(value, Mapping):
-        return {str(name): _plain(one) for name, one in value.items()}
+        return {str(name): _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(entry) for entry in value]
     if value is None or isinstance(value, str | bool):
         return value
     number = float(value)

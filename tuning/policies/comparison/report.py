@@ -55,8 +55,8 @@ def _noise_table(results: Sequence[Result], noise: str, rough: bool) -> str:
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
-    said = f"{comparison.seeds} training seeds; {comparison.episodes} held-out episodes."
-    parts = [f"# Policies on raw, filtered and true state\n\n{said} Thrust errors are in N."]
+    counts = f"{comparison.seeds} training seeds; {comparison.episodes} held-out episodes."
+    parts = [f"# Policies on raw, filtered and true state\n\n{counts} Thrust errors are in N."]
     parts += [f"<!-- table {name} -->\n<!-- end -->" for name in names]
     parts += [f"![Learning curves]({CURVES})", f"![Cost against the error of what is observed]({ERRORS})"]
     return "\n\n".join(parts) + "\n"

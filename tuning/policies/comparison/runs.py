@@ -90,8 +90,8 @@ def run_comparison(
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    found = (results[run.name] for run in runs)
-    return [result for result in found if result is not None]  # all are there now
+    in_order = (results[run.name] for run in runs)
+    return [result for result in in_order if result is not None]  # all are there now
 
 
 def _prepare(counter) -> None:
@@ -102,10 +102,10 @@ def _prepare(counter) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
-        place, counter.value = counter.value, counter.value + 1
+        core, counter.value = counter.value, counter.value + 1
     if hasattr(os, "sched_setaffinity"):
         available = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {available[place % len(available)]})
+        os.sched_setaffinity(0, {available[core % len(available)]})
 
 
 def _end_with_parent() -> None:

@@ -87,8 +87,8 @@ def rows_of(results: Sequence[Result], noise: str) -> list[list[str]]:
         value = as_interval(figure := typical_return(group))
         part = "" if gap is None else percent(closed(figure, *gap).value)
         errors = [typical_error(group, part).value for part in ("transient", "steady", "reversal", "observed")]
-        said = f"{value.value:.3f} ± {(value.high - value.low) / 2:.3f}"
-        rows.append([name_of(kind, label), said, part, *[f"{error:.2f}" for error in errors]])
+        return_text = f"{value.value:.3f} ± {(value.high - value.low) / 2:.3f}"
+        rows.append([name_of(kind, label), return_text, part, *[f"{error:.2f}" for error in errors]])
     return rows
 
 
@@ -100,7 +100,7 @@ def summary_rows(results: Sequence[Result]) -> list[list[str]]:
     def row(title: str, cell: Callable[[str], str]) -> list[str]:
         return [title, *(cell(noise) for noise in noises)]
 
-    rows = [row(f"gap closed by {name_of(*one)}", partial(_gap_cell, groups, one=one)) for one in GAPS]
+    rows = [row(f"gap closed by {name_of(*policy)}", partial(_gap_cell, groups, policy=policy)) for policy in GAPS]
     for above, below in RATIOS:
         title = f"cost of {name_of(*above)} / of {name_of(*below)}"
         rows.append(row(title, partial(_ratio_cell, groups, above=above, below=below)))
@@ -138,8 +138,8 @@ def percent(value: Interval | float) -> str:
     return f"{100 * value:.0f} %"
 
 
-def _gap_cell(groups: Groups, noise: str, one: tuple[str, str]) -> str:
-    figure, gap = figure_of(groups, noise, *one), ends_of_gap(groups, noise)
+def _gap_cell(groups: Groups, noise: str, policy: tuple[str, str]) -> str:
+    figure, gap = figure_of(groups, noise, *policy), ends_of_gap(groups, noise)
     return "" if figure is None or gap is None else percent(as_interval(closed(figure, *gap)))
 
 
@@ -165,20 +165,20 @@ def answers(results: Sequence[Result]) -> list[str]:
 
 def _goal(groups: Groups) -> Iterator[str]:
     gap = ends_of_gap(groups, VARIANT_NOISE)
-    found = [figure_of(groups, VARIANT_NOISE, "ppo", observed) for observed in FILTERED]
-    parts = [as_interval(closed(figure, *gap)) for figure in found if gap is not None and figure is not None]
+    figures = [figure_of(groups, VARIANT_NOISE, "ppo", observed) for observed in FILTERED]
+    parts = [as_interval(closed(figure, *gap)) for figure in figures if gap is not None and figure is not None]
     if parts:
         least = min(parts, key=lambda value: value.low)
-        said = "reached" if least.low >= GOAL else "not reached by all, intervals counted"
+        outcome = "reached" if least.low >= GOAL else "not reached by all, intervals counted"
         yield (
             f"At medium noise PPO on filtered state closes at least {percent(least)} of the gap between PPO on "
-            f"raw measurements and {name_of(BEST, 'true')}; the aim of {100 * GOAL:.0f} % is {said}."
+            f"raw measurements and {name_of(BEST, 'true')}; the aim of {100 * GOAL:.0f} % is {outcome}."
         )
 
 
 def _estimates(groups: Groups) -> Iterator[str]:
     """The effect of a better estimate on the same controller, without training."""
-    for one, other, said in (
+    for better, other, advantage in (
         ("true", "ekf", "knowing the true state"),
         ("ekf, tuned", "ekf, untuned", "tuning the EKF's Q and R, against the rule of thumb,"),
         (
@@ -188,10 +188,11 @@ def _estimates(groups: Groups) -> Iterator[str]:
         ),
         ("ekf", "ekf, wrong model", "a right model"),
     ):
-        known, usual = (figure_of(groups, VARIANT_NOISE, BEST, label) for label in (one, other))
+        known, usual = (figure_of(groups, VARIANT_NOISE, BEST, label) for label in (better, other))
         if known is not None and usual is not None:
             value = as_interval(known - usual)
-            yield f"With the same controller (MPC), {said} is worth {as_text(value, '+.4f')}: {_verdict(value)}."
+            gain = as_text(value, "+.4f")
+            yield f"With the same controller (MPC), {advantage} is worth {gain}: {_verdict(value)}."
 
 
 def _learnt(groups: Groups) -> Iterator[str]:
@@ -212,16 +213,16 @@ def _wrong(groups: Groups) -> Iterator[str]:
             figure = figure_of(groups, VARIANT_NOISE, kind, f"ekf, {variant}")
             if best is not None and figure is not None:
                 value = as_interval(figure - best)
-                said = f"{name_of(kind, f'ekf, {variant}')} returns {as_text(value, '+.3f')} more than MPC"
-                yield f"{said}: {_verdict(value)}."
+                sentence = f"{name_of(kind, f'ekf, {variant}')} returns {as_text(value, '+.3f')} more than MPC"
+                yield f"{sentence}: {_verdict(value)}."
 
 
 def _tuned(groups: Groups) -> Iterator[str]:
-    for about, one, other, called in (
+    for about, tuned_label, other, called in (
         ("the exact model", "ekf, tuned", "ekf, untuned", "the untuned one"),
         ("a wrong model", "ekf, wrong model tuned", "ekf, wrong model", "the one with the plant's Q and R"),
     ):
-        tuned, reference = (figure_of(groups, VARIANT_NOISE, "ppo", label) for label in (one, other))
+        tuned, reference = (figure_of(groups, VARIANT_NOISE, "ppo", label) for label in (tuned_label, other))
         if tuned is not None and reference is not None:
             value = as_interval(tuned - reference)
             yield (

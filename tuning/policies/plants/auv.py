@@ -37,7 +37,7 @@ class Vehicle(TrainingPlant):
         "depth": Task("steps of 2 m up and down on a straight course", "SegorogeniAUVDepth-v0", {}),
     }
     scenario = "auv:navigation"
-    scenarios = tuple(name for name, one in SCENARIOS.items() if _may_learn(one))
+    scenarios = tuple(name for name, scenario_ in SCENARIOS.items() if _may_learn(scenario_))
     env_arguments = tuple(
         dict.fromkeys(
             name
@@ -89,11 +89,11 @@ class Vehicle(TrainingPlant):
         """The same for an env with a filter, or `ObserveState`, as its outermost wrapper, if it has one."""
         from tuning.policies.controllers import ClassicalPolicy
 
-        seen = "navigation" if isinstance(env, ObserveState) else "measurement"
+        source = "navigation" if isinstance(env, ObserveState) else "measurement"
         if (filter_ := getattr(env, "filter", None)) is not None:
-            seen = "navigation" if filter_.model.n == len(STATES) else "motion"
+            source = "navigation" if filter_.model.n == len(STATES) else "motion"
         low, high = env.unwrapped.plant.input_limits
-        return ClassicalPolicy(DepthAndCourse.for_env(env, seen), 0, (high - low) / 2, (high + low) / 2)
+        return ClassicalPolicy(DepthAndCourse.for_env(env, source), 0, (high - low) / 2, (high + low) / 2)
 
     def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """True errors beside the path and below it [m], and the speed u [m/s]."""

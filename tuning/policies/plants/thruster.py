@@ -86,7 +86,7 @@ class Thruster(TrainingPlant):
 
         "observed" is the error of the thrust that the policy observes.
         """
-        thrusts, references, shown = recorded
+        thrusts, references, observed = recorded
         transient, reversal = _windows(
             references, STEP_OF_REFERENCE * thrust_scale(plant), round(TRANSIENT / plant.dt)
         )
@@ -96,7 +96,7 @@ class Thruster(TrainingPlant):
             "transient": part_of(errors, alive & transient),
             "steady": part_of(errors, alive & ~transient),
             "reversal": part_of(errors, alive & reversal),
-            "observed": part_of(shown - thrusts, alive & late),
+            "observed": part_of(observed - thrusts, alive & late),
         }
 
 

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from tuning.exploring.page.pictures import corners, extremes, places
+from tuning.exploring.page.pictures import corners, drawn_steps, extremes
 
 
 def test_a_short_run_is_drawn_whole():
-    assert places(5, 5).tolist() == [0, 1, 2, 3, 4]
+    assert drawn_steps(5, 5).tolist() == [0, 1, 2, 3, 4]
     values = np.array([1.0, np.nan, 3.0])
-    assert extremes(values, places(3, 10)) is values
+    assert extremes(values, drawn_steps(3, 10)) is values
 
 
 def test_places_go_from_the_first_step_to_the_last():
-    at = places(1001, 101)
+    at = drawn_steps(1001, 101)
     assert at[0] == 0 and at[-1] == 1000 and set(np.diff(at)) == {10}
 
 
