@@ -259,7 +259,7 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     as measured, with noise, and a position by dead reckoning from measured velocities and attitude, from the known
     start. So they drift as the vehicle's own navigation does, by decimetres in half a minute with the default
     sensors, and more with others. `info["path_errors"]` and the reward have the true ones. Where a filter's
-    estimate is in the observation, `control.depth_and_course` compares that with the path in their place, and with
+    estimate is in the observation, `auv.control` compares that with the path in their place, and with
     the depth.
 
     ## Reward

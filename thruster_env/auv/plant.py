@@ -129,7 +129,7 @@ def make_plant(
             `channels.CHANNELS`, or a mapping from channels to lists of effects. Suites and lists come at the rates
             of their instruments, satellites near the surface; in a mapping, effects "sample-every" and
             "near-surface" say so.
-        current: three velocities (north, east, down) [m/s], or signals by direction; see `effects.current`.
+        current: three velocities (north, east, down) [m/s], or signals by direction; see `auv.effects`.
         propeller_lag: time constant with which the thrust follows the command [s]; 0 for at once. (A small
             propeller's is some 1 s.)
         plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters model neither lag.
