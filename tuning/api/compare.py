@@ -91,10 +91,10 @@ class FilterComparison:
 
     def sentences(self) -> list[str]:
         """The filters that are significantly better or worse than the first one on each problem, and restarts."""
-        found = []
+        statements = []
         for board in self.boards:
-            found += [winners(board), *restart_sentences({row.label: row.evaluation for row in board.rows})]
-        return found
+            statements += [winners(board), *restart_sentences({row.label: row.evaluation for row in board.rows})]
+        return statements
 
     def to_frame(self) -> pandas.DataFrame:
         """A row for each filter and problem: errors, score and its ratio to the first filter's, consistency, cost.
@@ -115,8 +115,8 @@ class FilterComparison:
             cells[-1] |= {
                 "verdict": "" if row is board.rows[0] else row.verdict
             }  # the first is compared with itself
-        for name in dict.fromkeys(name for one in cells for name in one):
-            columns[name] = [one.get(name, np.nan) for one in cells]
+        for name in dict.fromkeys(name for values in cells for name in values):
+            columns[name] = [values.get(name, np.nan) for values in cells]
         return frame(columns)
 
     def plot_scores(self) -> Figure:
@@ -131,12 +131,12 @@ class FilterComparison:
         return drawn(figure)
 
     def __repr__(self) -> str:
-        said = []
+        parts = []
         for board in self.boards:
-            found = [f"{row.label} {_figure(row)}" for row in sorted(board.rows, key=_rank)]
-            said.append(f"{board.scenario.name}: {', '.join(found)}")
+            ranking = [f"{row.label} {_figure(row)}" for row in sorted(board.rows, key=_rank)]
+            parts.append(f"{board.scenario.name}: {', '.join(ranking)}")
         ended = ", interrupted" if self.interrupted else ""
-        return f"FilterComparison({'; '.join(said)}{ended})"
+        return f"FilterComparison({'; '.join(parts)}{ended})"
 
     def __str__(self) -> str:
         """The tables that `thruster compare` prints."""
@@ -150,14 +150,18 @@ class FilterComparison:
             heads = ["filter", "score", "over the first"] if truth else ["filter", "log L", "less the first's"]
             rows = []
             for row in board.rows:
-                one = row.evaluation
-                found = [about(one.score), about(row.score_ratio)]
+                evaluation = row.evaluation
+                cells = [about(evaluation.score), about(row.score_ratio)]
                 if not truth:
-                    found = [number(one.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
-                last = [number(one.nees.value, ".3g"), number(one.nis.value, ".3g"), f"{row.microseconds:.3g}"]
+                    cells = [number(evaluation.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
+                last = [
+                    number(evaluation.nees.value, ".3g"),
+                    number(evaluation.nis.value, ".3g"),
+                    f"{row.microseconds:.3g}",
+                ]
                 first = row is board.rows[0]  # which is compared with itself
                 rows.append(
-                    [row.label, found[0], "" if first else found[1], *last, "" if first else _verdict(row)]
+                    [row.label, cells[0], "" if first else cells[1], *last, "" if first else _verdict(row)]
                 )
             heads += ["NEES", "NIS", "us/step", "verdict"]
             title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
@@ -176,8 +180,8 @@ def _rank(row: Row) -> float:
 
 
 def _figure(row: Row) -> str:
-    one = row.evaluation
-    return number(one.score.value if one.has_truth else one.log_likelihood)
+    evaluation = row.evaluation
+    return number(evaluation.score.value if evaluation.has_truth else evaluation.log_likelihood)
 
 
 def _verdict(row: Row) -> str:
@@ -187,15 +191,15 @@ def _verdict(row: Row) -> str:
 
 def _draw(axis: Any, board: Leaderboard) -> None:
     truth = board.rows[0].evaluation.has_truth
-    for place, row in enumerate(board.rows):
+    for i, row in enumerate(board.rows):
         value: Interval = row.evaluation.score if truth else row.likelihood_gain
         if np.isnan(value.value):
             continue
         colour = colour_of(row.filter_name)
-        face = "white" if row.verdict == "tie" and place else colour
-        axis.plot([value.low, value.high], [-place, -place], "|-", color=colour, linewidth=1.4)
-        axis.plot(value.value, -place, "o", color=colour, markerfacecolor=face, markersize=6)
-    axis.set_yticks([-place for place in range(len(board.rows))], [verbatim(row.label) for row in board.rows])
+        face = "white" if row.verdict == "tie" and i else colour
+        axis.plot([value.low, value.high], [-i, -i], "|-", color=colour, linewidth=1.4)
+        axis.plot(value.value, -i, "o", color=colour, markerfacecolor=face, markersize=6)
+    axis.set_yticks([-i for i in range(len(board.rows))], [verbatim(row.label) for row in board.rows])
     axis.set_ylim(0.6 - len(board.rows), 0.6)
     axis.grid(axis="y", visible=False)
     gained = f"log L of a run less that of {verbatim(board.rows[0].label)}"
@@ -258,11 +262,13 @@ def compare(
         KeyboardInterrupt: after Ctrl-C before any row is done.
     """
     labels = list(filters) if isinstance(filters, Mapping) else []
-    some = list(filters.values()) if labels else list(filters) if isinstance(filters, list | tuple) else [filters]
-    problems = problems_of(_default(some) if problem is None else problem, preset)
+    requested = (
+        list(filters.values()) if labels else list(filters) if isinstance(filters, list | tuple) else [filters]
+    )
+    problems = problems_of(_default(requested) if problem is None else problem, preset)
     each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
     sizes = {name: size for name, size in each.items() if size is not None}
-    named = None if filters is DEFAULT_FILTERS else some
+    named = None if filters is DEFAULT_FILTERS else requested
     options: dict[str, Any] = {"knows": knows, "trials": trials, "unknown": unknowns_of(augment or {})}
     return run_comparison(
         named, problems, seed, seeds, console_for(progress), sizes=sizes, labels=labels, **options
@@ -306,15 +312,21 @@ def run_comparison(
         filters, left_out = default_filters(problems)
     asked = filters
     filters, unfit = without_unfit(asked, problems)
-    labels = [label for label, one in zip(labels, asked, strict=False) if not _is_named(one) or one in filters]
-    given = knows, unknown, sizes, seed, trials or STUDY_TRIALS
-    contenders = contenders_of(filters, *given)
+    labels = [
+        label
+        for label, filter_ in zip(labels, asked, strict=False)
+        if not _is_named(filter_) or filter_ in filters
+    ]
+    arguments = knows, unknown, sizes, seed, trials or STUDY_TRIALS
+    contenders = contenders_of(filters, *arguments)
     if labels:
-        of_each = [(label, contenders_of([one], *given)) for label, one in zip(labels, filters, strict=True)]
+        of_each = [
+            (label, contenders_of([filter_], *arguments)) for label, filter_ in zip(labels, filters, strict=True)
+        ]
         contenders = [
-            one._replace(label=one.label.replace(made[0].label, str(label), 1))
-            for label, made in of_each
-            for one in made
+            contender._replace(label=contender.label.replace(group[0].label, str(label), 1))
+            for label, group in of_each
+            for contender in group
         ]
 
     def held_out(problem: Problem) -> range:
@@ -329,11 +341,11 @@ def run_comparison(
 
 def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
     """The filters without named ones that do not accept a problem's model, and the reasons by label."""
-    named = [one for one in filters if _is_named(one)]
-    kept, left_out = fitting(named, problems)
-    if not kept and len(named) == len(filters):  # not even a tuned one
+    named = [filter_ for filter_ in filters if _is_named(filter_)]
+    accepted, left_out = fitting(named, problems)
+    if not accepted and len(named) == len(filters):  # not even a tuned one
         raise ValueError(next(iter(left_out.values()), "a comparison must have at least one filter, but got none"))
-    return [one for one in filters if not _is_named(one) or one in kept], left_out
+    return [filter_ for filter_ in filters if not _is_named(filter_) or filter_ in accepted], left_out
 
 
 def contenders_of(
@@ -363,39 +375,42 @@ def contenders_of(
         return sizes[name] if name in sizes else sizes.get(None)
 
     out: list[Contender] = []
-    for one in filters:
-        if isinstance(one, Study):
-            choice = sized(one.choice, size_of(one.choice.name))
-            label, suit = f"{label_of(choice.name)} tuned", partial(suited, constants=constants_in(one.problem))
+    for filter_ in filters:
+        if isinstance(filter_, Study):
+            choice = sized(filter_.choice, size_of(filter_.choice.name))
+            label, suit = (
+                f"{label_of(choice.name)} tuned",
+                partial(suited, constants=constants_in(filter_.problem)),
+            )
             out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
-        elif is_own(one):
-            label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"
-            source = "" if isinstance(one, Filter) and not one.has_covariance else OF_FILTER
-            out.append(Contender(_new(label, out), partial(user_choice, one), knows=source))
-        elif not is_filter(one):
-            size = size_of(read_tuned_file(one)["filter"]["name"])
-            chosen, suit = partial(_from_file, Path(one), size), partial(suited_to, Path(one))
-            out.append(Contender(_new(Path(one).stem, out), chosen, knows=OF_FILE, suit=suit))
+        elif is_own(filter_):
+            label = f"{filter_.name if isinstance(filter_, Filter) else DEFAULT_FILTER} {OWN}"
+            source = "" if isinstance(filter_, Filter) and not filter_.has_covariance else OF_FILTER
+            out.append(Contender(_new(label, out), partial(user_choice, filter_), knows=source))
+        elif not is_filter(filter_):
+            size = size_of(read_tuned_file(filter_)["filter"]["name"])
+            chosen, suit = partial(_from_file, Path(filter_), size), partial(suited_to, Path(filter_))
+            out.append(Contender(_new(Path(filter_).stem, out), chosen, knows=OF_FILE, suit=suit))
         else:
-            kind = filter_type(one)
-            size = size_of(one) if kind.has_ensemble and not kind.is_foreign else None
-            out.append(contender(one, knows, None, seed, trials, ensemble_size=size))
+            kind = filter_type(filter_)
+            size = size_of(filter_) if kind.has_ensemble and not kind.is_foreign else None
+            out.append(contender(filter_, knows, None, seed, trials, ensemble_size=size))
             if unknown and kind.has_covariance:
-                out.append(contender(one, knows, unknown, seed, trials, ensemble_size=size))
+                out.append(contender(filter_, knows, unknown, seed, trials, ensemble_size=size))
     return out
 
 
-def _is_named(given: Any) -> bool:
-    return not isinstance(given, Study) and not is_own(given) and is_filter(given)
+def _is_named(filter_: Any) -> bool:
+    return not isinstance(filter_, Study) and not is_own(filter_) and is_filter(filter_)
 
 
 def _default(filters: Sequence[Any]) -> Any:
     """The problem where none is named: that of the first tuned file or study, or nominal."""
-    for one in filters:
-        if isinstance(one, Study):
-            return list(one.problems)
-        if not is_own(one) and not is_filter(one):
-            return read_tuned(one, given_for(one))[1]
+    for filter_ in filters:
+        if isinstance(filter_, Study):
+            return list(filter_.problems)
+        if not is_own(filter_) and not is_filter(filter_):
+            return read_tuned(filter_, given_for(filter_))[1]
     return NOMINAL
 
 
@@ -409,7 +424,9 @@ def _same(choice: Choice, problem: Problem) -> Choice:
 
 def _new(label: str, before: Sequence[Contender]) -> str:
     """A label that none has before."""
-    labels = [one.label for one in before]
+    labels = [contender.label for contender in before]
     if label not in labels:
         return label
-    return next(text for text in (f"{label} {place}" for place in range(2, len(labels) + 3)) if text not in labels)
+    return next(
+        text for text in (f"{label} {number}" for number in range(2, len(labels) + 3)) if text not in labels
+    )

@@ -128,18 +128,22 @@ class LogEstimates:
 
     def __repr__(self) -> str:
         what = f"{self.filter.name}{', smoothed,' if self.found.smoothed else ''} on {self.log.name}"
-        rows, told = self.log.steps + 1, self.findings
-        if isnan(told.mean_nis):
+        rows, findings = self.log.steps + 1, self.findings
+        if isnan(findings.mean_nis):
             return f"LogEstimates({what}: {rows} rows)"
-        low, high = told.nis_band
-        nis = f"mean NIS over channels {told.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
-        return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(told.log_likelihood)})"
+        low, high = findings.nis_band
+        nis = f"mean NIS over channels {findings.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
+        return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(findings.log_likelihood)})"
 
     def _repr_html_(self) -> str:
-        told, rows = self.findings, []
-        for what, some in (("prediction less measurement", told.predictions), ("less reference", told.references)):
-            for one in some:
-                rows.append([what, one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", one.rows])
+        findings, rows = self.findings, []
+        for what, residuals in (
+            ("prediction less measurement", findings.predictions),
+            ("less reference", findings.references),
+        ):
+            for residual in residuals:
+                errors = f"{residual.rmse:.4g}", f"{residual.bias:+.4g}"
+                rows.append([what, residual.quantity.short_label, *errors, residual.rows])
         return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows, " ".join(self.sentences()))
 
 
@@ -210,8 +214,8 @@ def estimate(
     with _as_file(tuned) as file:
         named = as_tuned(named, file)
         read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
-        found = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
-    return LogEstimates(found, findings(found, skip))
+        estimates = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
+    return LogEstimates(estimates, findings(estimates, skip))
 
 
 @contextmanager

@@ -64,35 +64,39 @@ class EstimatorTraining:
     @property
     def best_other(self) -> Standing:
         """The filter with the lowest held-out score, without the oracle, which knows the plant's Q and R."""
-        others = (one for one in self.standings[:-1] if not one.label.endswith(f" {ORACLE}"))
-        return min(others, key=lambda one: one.evaluations[HELD_OUT].score.value)
+        candidates = (standing for standing in self.standings[:-1] if not standing.label.endswith(f" {ORACLE}"))
+        return min(candidates, key=lambda standing: standing.evaluations[HELD_OUT].score.value)
 
     def sentences(self) -> list[str]:
         """Whether training paid."""
         ratio, other = self.ratio, self.best_other.label
-        said = f"{self.kind} has {about(ratio)} of the score of {other}"
+        sentence = f"{self.kind} has {about(ratio)} of the score of {other}"
         if ratio.low > 1.0:
-            verdict = f"{said}: it is significantly worse. Take {other}."
+            verdict = f"{sentence}: it is significantly worse. Take {other}."
         elif ratio.high < 1.0:
-            verdict = f"{said}: it is significantly better."
+            verdict = f"{sentence}: it is significantly better."
         else:
-            verdict = f"{said}: no significant difference. {other} is cheaper."
+            verdict = f"{sentence}: no significant difference. {other} is cheaper."
         stopped = ["Interrupted: these are the best weights so far."] if self.interrupted else []
         return [verdict, *stopped]
 
     def rows(self) -> list[list[str]]:
         """Cells of the table, by `COLUMNS`."""
         first, rows = self.standings[0], []
-        for one in self.standings:
-            ratios = (one.ratio(first, name) for name in (HELD_OUT, LONGER, NOISIER))
-            cells = ["" if one is first else "-" if np.isnan(ratio.value) else about(ratio) for ratio in ratios]
-            found = one.evaluations[HELD_OUT]
-            rows.append([one.label, number(found.score.value), *cells, number(found.nees.value, ".3g")])
+        for standing in self.standings:
+            ratios = (standing.ratio(first, name) for name in (HELD_OUT, LONGER, NOISIER))
+            cells = [
+                "" if standing is first else "-" if np.isnan(ratio.value) else about(ratio) for ratio in ratios
+            ]
+            evaluation = standing.evaluations[HELD_OUT]
+            rows.append(
+                [standing.label, number(evaluation.score.value), *cells, number(evaluation.nees.value, ".3g")]
+            )
         return rows
 
     def columns(self) -> list[str]:
         """Heads of the table."""
-        return [one.format(first=self.standings[0].label) for one in COLUMNS]
+        return [column.format(first=self.standings[0].label) for column in COLUMNS]
 
     @property
     def title(self) -> str:
@@ -109,16 +113,16 @@ class EstimatorTraining:
         """The same as plain data, for JSON."""
         first = self.standings[0]
         rows = []
-        for one in self.standings:
-            row: dict[str, Any] = {"filter": one.label, "nees": one.evaluations[HELD_OUT].nees.value}
-            for name, found in one.evaluations.items():
-                row[name] = {"score": found.score.value, "ratio": one.ratio(first, name)._asdict()}
+        for standing in self.standings:
+            row: dict[str, Any] = {"filter": standing.label, "nees": standing.evaluations[HELD_OUT].nees.value}
+            for name, evaluation in standing.evaluations.items():
+                row[name] = {"score": evaluation.score.value, "ratio": standing.ratio(first, name)._asdict()}
             rows.append(row)
         return {
             "kind": self.kind,
             "problem": self.problem.name,
             "file": str(self.file),
-            "checks": [one._asdict() for one in self.checks],
+            "checks": [check._asdict() for check in self.checks],
             "standings": rows,
             "seconds": self.seconds,
             "interrupted": self.interrupted,
@@ -127,19 +131,21 @@ class EstimatorTraining:
     def to_frame(self) -> pandas.DataFrame:
         """A row for each filter: scores on held-out, longer and noisier runs, with their ratios to the first."""
         rows = []
-        for one in self.as_data()["standings"]:
-            row = {"filter": one["filter"], "NEES": one["nees"]}
+        for standing in self.as_data()["standings"]:
+            row = {"filter": standing["filter"], "NEES": standing["nees"]}
             for name in (HELD_OUT, LONGER, NOISIER):
-                found = one.get(name, {"score": np.nan, "ratio": {"value": np.nan, "low": np.nan, "high": np.nan}})
-                row[name] = found["score"]
-                row |= {f"{name}, ratio {key}": value for key, value in found["ratio"].items()}
+                result = standing.get(
+                    name, {"score": np.nan, "ratio": {"value": np.nan, "low": np.nan, "high": np.nan}}
+                )
+                row[name] = result["score"]
+                row |= {f"{name}, ratio {key}": value for key, value in result["ratio"].items()}
             rows.append(row)
         return frame({name: [row[name] for row in rows] for name in rows[0]})
 
     def plot_training(self) -> Figure:
         """Validation score over updates, beside the held-out score of the first filter."""
         figure, (axis,) = panels(1, 1, (6.0, 3.6))
-        steps, scores = [one.step for one in self.checks], [one.score for one in self.checks]
+        steps, scores = [check.step for check in self.checks], [check.score for check in self.checks]
         axis.plot(steps, scores, "o-", color=colour_of(self.kind), label=f"{self.kind}, validation")
         first = self.standings[0]
         level = first.evaluations[HELD_OUT].score.value
@@ -156,10 +162,10 @@ class EstimatorTraining:
             raise ValueError(f"a page must be a file that ends in .html, but got {page}")
         labels = self.standings[0].label, self.standings[-1].label
         pair = {name: self.filters[name] for name in labels}
-        found = PageTable(self.title, self.columns(), self.rows())
+        page_table = PageTable(self.title, self.columns(), self.rows())
         title, seed = f"{self.kind} trained on {self.problem.name}", self.problem.held_out_seeds(self.seed, 2)[0]
         course, advice = self.plot_training(), self.sentences()
-        return write_training_report(page, title, advice, found, course, pair, self.problem, seed)
+        return write_training_report(page, title, advice, page_table, course, pair, self.problem, seed)
 
     def __str__(self) -> str:
         """The table that `thruster train-estimator` prints."""

@@ -57,9 +57,9 @@ def evaluate(
     Raises:
         ValueError: states the rule and the value.
     """
-    choice, found, is_tuned = subject_of(tuned, problem, preset, model)
+    choice, chosen, is_tuned = subject_of(tuned, problem, preset, model)
     name = OWN if is_own(tuned) else TUNED
-    return on_held_out(choice, found, seed, seeds, is_tuned=is_tuned, console=console_for(progress), name=name)
+    return on_held_out(choice, chosen, seed, seeds, is_tuned=is_tuned, console=console_for(progress), name=name)
 
 
 def subject_of(
@@ -70,18 +70,18 @@ def subject_of(
 ) -> tuple[Choice, Problem, bool]:
     """The choice, the problem, and whether it was tuned; the arguments are those of `evaluate`."""
     if isinstance(tuned, Study):
-        found = problem_of(tuned.problem if problem is None else problem, preset)
-        return tuned.choice, suited(found, constants_in(tuned.problem)), True
+        chosen = problem_of(tuned.problem if problem is None else problem, preset)
+        return tuned.choice, suited(chosen, constants_in(tuned.problem)), True
     if is_own(tuned):
         if problem is None:
             raise ValueError(f"a filter or model must come with a problem, but got {type(tuned).__name__} alone")
-        found = problem_of(problem, preset)
-        return user_choice(tuned, found), found, True
+        chosen = problem_of(problem, preset)
+        return user_choice(tuned, chosen), chosen, True
     if is_filter(tuned):
-        found = problem_of(NOMINAL if problem is None else problem, preset)
-        return rule_of_thumb(tuned, found), found, False
+        chosen = problem_of(NOMINAL if problem is None else problem, preset)
+        return rule_of_thumb(tuned, chosen), chosen, False
     if problem is None:
-        choice, found, _ = read_tuned(tuned, given_for(tuned, model=model, preset=preset))
-        return choice, found, True
-    found = suited_to(tuned, problem_of(problem, preset))
-    return read_choice(tuned, found), found, True
+        choice, chosen, _ = read_tuned(tuned, given_for(tuned, model=model, preset=preset))
+        return choice, chosen, True
+    chosen = suited_to(tuned, problem_of(problem, preset))
+    return read_choice(tuned, chosen), chosen, True

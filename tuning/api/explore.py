@@ -50,11 +50,11 @@ def explore(
         ValueError: states the rule and the value.
         ModuleNotFoundError: without the extra `explore`.
     """
-    found = problem_of(problem, preset, **of_logs)
+    chosen = problem_of(problem, preset, **of_logs)
     if tuned is None and not is_own(filter):
-        return Explorer(Bench(found, filter, seed=seed), seeds)
-    choice, found, _ = subject_of(filter if tuned is None else tuned, found)
-    return Explorer(Bench(found, choice.name, choice, seed), seeds)
+        return Explorer(Bench(chosen, filter, seed=seed), seeds)
+    choice, chosen, _ = subject_of(filter if tuned is None else tuned, chosen)
+    return Explorer(Bench(chosen, choice.name, choice, seed), seeds)
 
 
 class Explorer:

@@ -64,8 +64,12 @@ class HeldOut:
     @property
     def evaluations(self) -> dict[str, Evaluation]:
         """The evaluation of each filter: "rule of thumb", "scaled default", "tuned", "oracle", if there is one."""
-        found = self.comparison.evaluations
-        return {self._called(name): one for name, one in found.items() if self.is_tuned or name != TUNED}
+        evaluations = self.comparison.evaluations
+        return {
+            self._called(name): evaluation
+            for name, evaluation in evaluations.items()
+            if self.is_tuned or name != TUNED
+        }
 
     def _called(self, name: str) -> str:
         return self.name if name == TUNED else name
@@ -80,13 +84,13 @@ class HeldOut:
         """The parameters of each filter."""
         choice, default = self.choice, self.comparison.default
         known = baselines(choice.name, self.problem, self.seed, default, baseline_size(choice))
-        found = {self.name: choice, **known}
-        return {name: found[name] for name in self.evaluations}
+        choices = {self.name: choice, **known}
+        return {name: choices[name] for name in self.evaluations}
 
     @property
     def filters(self) -> dict[str, Filter]:
         """Each filter, ready to use: `EstimateState(env, filter=study.held_out.filters["scaled default"])`."""
-        return {name: one.filter(self.problem) for name, one in self.choices.items()}
+        return {name: choice.filter(self.problem) for name, choice in self.choices.items()}
 
     @property
     def bound(self) -> np.ndarray:
@@ -115,11 +119,11 @@ class HeldOut:
 
     def to_dict(self) -> dict[str, Any]:
         """All results as plain numbers, as in `thruster evaluate --json`."""
-        said = metrics(self.comparison)
+        data = metrics(self.comparison)
         if not self.is_tuned:
-            del said["tuned"]
+            del data["tuned"]
         warned = warnings_of(self.evaluation, self.problem, self.forget)
-        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said, "warnings": warned}
+        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **data, "warnings": warned}
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
@@ -128,8 +132,8 @@ class HeldOut:
             ValueError: if pandas is not installed.
         """
         columns: dict[str, list] = {"filter": list(self.evaluations)}
-        for one in self.evaluations.values():
-            for name, value in cells_of(one).items():
+        for evaluation in self.evaluations.values():
+            for name, value in cells_of(evaluation).items():
                 columns.setdefault(name, []).append(value)
         return frame(columns, "filter")
 
@@ -159,10 +163,10 @@ class HeldOut:
         place = at_least("place", place, 0, len(self.seeds) - 1)
         pair = {RULE: self.choice}
         if self.is_tuned:
-            others = {name: one for name, one in self.choices.items() if name != self.name}
+            choices = {name: choice for name, choice in self.choices.items() if name != self.name}
             first = self.comparison.baselines[0]
-            pair = {first: others[first], self.name: self.choice}
-        filters = {name: one.filter(self.problem) for name, one in pair.items()}
+            pair = {first: choices[first], self.name: self.choice}
+        filters = {name: choice.filter(self.problem) for name, choice in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
         return drawn(draw_estimates(filters, data, place, self.problem.dt, scored))
 
@@ -184,7 +188,7 @@ class HeldOut:
         what = f"{label_of(self.choice.name)} on {self.problem.name}, {seeds}"
         if not self.evaluation.has_truth:
             return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
-        ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
+        ratios = [f"{about(ratio)} x {name}" for name, ratio in self.ratios.items()][: int(self.is_tuned)]
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
 
     def __str__(self) -> str:
@@ -204,19 +208,23 @@ class HeldOut:
             restarts += warnings_of(self.evaluation, self.problem, self.forget)
         restarts.append(memory_sentence(self.evaluation, self.problem))
         if self.is_tuned:
-            said = gains(self.comparison, self.problem.seed_word, self.name)
-            return [*said, *model_doubts(self.problem, self.comparison, self.seed), *restarts]
+            sentences = gains(self.comparison, self.problem.seed_word, self.name)
+            return [*sentences, *model_doubts(self.problem, self.comparison, self.seed), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.comparison), *restarts]
 
     def _repr_html_(self) -> str:
         truth, rows = self.evaluation.has_truth, []
         heads = [*(state.short_label for state in self.evaluation.states), "score", "NEES"] if truth else ["log L"]
-        for name, one in self.evaluations.items():
-            found = [number(one.log_likelihood, ".2f")]
+        for name, evaluation in self.evaluations.items():
+            cells = [number(evaluation.log_likelihood, ".2f")]
             if truth:
-                found = [*(about(rmse) for rmse in one.rmse), about(one.score), number(one.nees.value, ".3g")]
-            rows.append([name, *found, number(one.nis.value, ".3g")])
+                cells = [
+                    *(about(rmse) for rmse in evaluation.rmse),
+                    about(evaluation.score),
+                    number(evaluation.nees.value, ".3g"),
+                ]
+            rows.append([name, *cells, number(evaluation.nis.value, ".3g")])
         what = "RMSE" if truth else "Log-likelihood of the innovations of a run, and their mean NIS,"
         title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
         note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""
@@ -238,13 +246,18 @@ def on_held_out(
         return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed, name)
 
 
-def cells_of(one: Evaluation) -> dict[str, float]:
+def cells_of(evaluation: Evaluation) -> dict[str, float]:
     """The results of an evaluation by column names."""
     cells: dict[str, float] = {}
-    errors = [(state.short_label, rmse) for state, rmse in zip(one.states, one.rmse, strict=True)]
-    errors += [(one.outputs[symbol].short_label, rmse) for symbol, rmse in one.output_rmse.items()]
+    errors = [(state.short_label, rmse) for state, rmse in zip(evaluation.states, evaluation.rmse, strict=True)]
+    errors += [(evaluation.outputs[symbol].short_label, rmse) for symbol, rmse in evaluation.output_rmse.items()]
     for label, rmse in errors:
         cells |= {f"RMSE {label}": rmse.value, f"RMSE {label} low": rmse.low, f"RMSE {label} high": rmse.high}
-    for name, value in (("score", one.score), ("log score", one.log_score), ("NEES", one.nees), ("NIS", one.nis)):
+    for name, value in (
+        ("score", evaluation.score),
+        ("log score", evaluation.log_score),
+        ("NEES", evaluation.nees),
+        ("NIS", evaluation.nis),
+    ):
         cells |= {name: value.value, f"{name} low": value.low, f"{name} high": value.high}
-    return cells | {"log-likelihood": one.log_likelihood, "restarts": one.divergences}
+    return cells | {"log-likelihood": evaluation.log_likelihood, "restarts": evaluation.divergences}

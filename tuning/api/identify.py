@@ -103,7 +103,7 @@ class Identified:
         names, tests = self.found.names, self.found.null_tests
         columns: dict[str, Sequence[Any]] = {
             "parameter": list(names),
-            "unit": [one.unit for one in self.found.objective.coordinates.free],
+            "unit": [parameter.unit for parameter in self.found.objective.coordinates.free],
             "start": [self.found.start[name] for name in names],
             "value": [self.values[name] for name in names],
             "standard error": [self.standard_errors[name] for name in names],
@@ -139,12 +139,12 @@ class Identified:
         values = ", ".join(f"{name} {value:.4g}" for name, value in list(self.values.items())[:6])
         more = ", ..." if len(self.values) > 6 else ""
         loose = sum(not known for known in self.determined.values())
-        said = f"{loose} of {len(self.values)} not determined" if loose else "all determined"
-        return f"Identified({values}{more}; {said}, {len(self.runs)} runs)"
+        verdict = f"{loose} of {len(self.values)} not determined" if loose else "all determined"
+        return f"Identified({values}{more}; {verdict}, {len(self.runs)} runs)"
 
     def _repr_html_(self) -> str:
         tests = self.found.null_tests
-        units = {one.name: one.unit for one in self.found.objective.coordinates.free}
+        units = {parameter.name: parameter.unit for parameter in self.found.objective.coordinates.free}
         rows = [
             [name, units[name], f"{self.found.start[name]:.5g}", f"{value:.5g}"]
             + [f"{self.standard_errors[name]:.2g}", "yes" if self.determined[name] else "no"]
@@ -292,6 +292,6 @@ def identified(
             status.update(f"start {number + 1} of {starts}: log-likelihood {value:.2f}")
 
         options: dict[str, Any] = {"filter": filter, "predicted": predicted, "starts": starts, **search}
-        found = identify_runs(family.data, family.model, parameters, **options, progress=tell)
-    checked = validate(found, family.shifted(proving)) if proving else validate(found)
-    return Identified(found, checked, family, tuple(runs), tuple(proving))
+        identification = identify_runs(family.data, family.model, parameters, **options, progress=tell)
+    checked = validate(identification, family.shifted(proving)) if proving else validate(identification)
+    return Identified(identification, checked, family, tuple(runs), tuple(proving))

@@ -22,11 +22,11 @@ RULE = (
 )
 
 
-def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> Problem:
+def problem_of(argument: Any, preset: str | Path | None = None, **of_logs: Any) -> Problem:
     """The problem for a user's argument.
 
     Args:
-        given: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a
+        argument: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a
             `Problem`; or a pair (model, data) for `log_problem`, where the model is a `StateSpaceModel`, an object
             that makes or offers one, "module:object", or a thruster's preset, and data are recorded runs.
         preset: the problem of another thruster, by name or file.
@@ -35,31 +35,33 @@ def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> 
     Raises:
         ValueError: states the rule and the value.
     """
-    told = {name: value for name, value in of_logs.items() if value is not None}
-    if isinstance(given, tuple) and len(given) == 2:
-        return _of_logs(*given, preset, told)
-    if told:
-        raise ValueError(f"{next(iter(told))} must come with a pair (model, data), but got {short_repr(given)}")
-    if isinstance(given, str | Path):
-        found = find_problem(str(given))
-    elif isinstance(given, Problem):
-        found = checked_problem(_told_apart(given))
+    options = {name: value for name, value in of_logs.items() if value is not None}
+    if isinstance(argument, tuple) and len(argument) == 2:
+        return _of_logs(*argument, preset, options)
+    if options:
+        raise ValueError(
+            f"{next(iter(options))} must come with a pair (model, data), but got {short_repr(argument)}"
+        )
+    if isinstance(argument, str | Path):
+        problem = find_problem(str(argument))
+    elif isinstance(argument, Problem):
+        problem = checked_problem(_told_apart(argument))
     else:
-        raise ValueError(f"{RULE}, but got {short_repr(given)}")
-    return logs_package().of_preset(found, preset)
+        raise ValueError(f"{RULE}, but got {short_repr(argument)}")
+    return logs_package().of_preset(problem, preset)
 
 
-def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
+def problems_of(argument: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
     """One problem, or several in a list; arguments as in `problem_of`. A second "a" is named "a (2)"."""
-    some = given if isinstance(given, list) else [given]
-    if not some:
+    arguments = argument if isinstance(argument, list) else [argument]
+    if not arguments:
         raise ValueError(f"{RULE}, or a list of them, but got an empty list")
-    found = [problem_of(one, preset, **of_logs) for one in some]
-    names = [one.name for one in found]
-    for place, name in enumerate(names):
-        if name in names[:place]:  # tables and files know problems by their names
-            found[place] = named(found[place], f"{name} ({names[: place + 1].count(name)})")
-    return tuple(found)
+    problems = [problem_of(each, preset, **of_logs) for each in arguments]
+    names = [problem.name for problem in problems]
+    for i, name in enumerate(names):
+        if name in names[:i]:  # tables and files know problems by their names
+            problems[i] = named(problems[i], f"{name} ({names[: i + 1].count(name)})")
+    return tuple(problems)
 
 
 def given_for(
@@ -72,14 +74,14 @@ def given_for(
 
     Names in a file are never imported: a problem or a model that is code has to be given.
     """
-    given = [] if problem is None else list(problems_of(problem))
-    kept = read_tuned_file(file)["problems"]
-    if any(one.name in kept for one in given):
-        return given
-    return [*given, *problems_in(Path(file), model, preset)]
+    problems = [] if problem is None else list(problems_of(problem))
+    stored = read_tuned_file(file)["problems"]
+    if any(candidate.name in stored for candidate in problems):
+        return problems
+    return [*problems, *problems_in(Path(file), model, preset)]
 
 
-def is_filter(given: Any) -> bool:
+def is_filter(argument: Any) -> bool:
     """Whether something is a filter or an estimator, not a tuned file (a `Path`, or a text that ends in .json).
 
     The file of a trained estimator is an estimator.
@@ -87,15 +89,17 @@ def is_filter(given: Any) -> bool:
     Raises:
         ValueError: for an unknown name, or any other object.
     """
-    if is_trained(given):
+    if is_trained(argument):
         return True
-    if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
+    if isinstance(argument, Path) or (
+        isinstance(argument, str) and argument not in FILTERS and _is_tuned_file(argument)
+    ):
         return False
-    if isinstance(given, str) or is_foreign(given):
-        filter_type(given)  # a clear error for an unknown name
+    if isinstance(argument, str) or is_foreign(argument):
+        filter_type(argument)  # a clear error for an unknown name
         return True
     raise ValueError(
-        f"a filter must be a name, a tuned file, a Study or an estimator, but got {short_repr(given)}"
+        f"a filter must be a name, a tuned file, a Study or an estimator, but got {short_repr(argument)}"
     )
 
 

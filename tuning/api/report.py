@@ -68,21 +68,21 @@ def report(
         folder = Path(scratch) / "page" if page is not None else None if out is None else Path(out)
         if folder is None and several and isinstance(several[0], Study):
             folder = Path("out")  # beside its scratch file the page would be lost
-        found = [
-            _of_value(one, Path(scratch) / str(place))
-            if isinstance(one, Study)
-            else Source(one, storage_text(storage), _given(one, problem, model, preset))
-            for place, one in enumerate(several)
+        sources = [
+            _of_value(subject, Path(scratch) / str(i))
+            if isinstance(subject, Study)
+            else Source(subject, storage_text(storage), _given(subject, problem, model, preset))
+            for i, subject in enumerate(several)
         ]
-        if len(found) == 1:
-            one = found[0]
-            made = write_report(one.name, one.storage, folder, one.problems, one.file)
+        if len(sources) == 1:
+            single = sources[0]
+            written = write_report(single.name, single.storage, folder, single.problems, single.file)
         else:
-            made = write_two_studies(found, folder)
+            written = write_two_studies(sources, folder)
         if page is None:
-            return made.page
-        write_whole(page, made.page.read_bytes())
-        write_whole(page.with_suffix(".md"), made.tables.read_bytes())
+            return written.page
+        write_whole(page, written.page.read_bytes())
+        write_whole(page.with_suffix(".md"), written.tables.read_bytes())
         return page
 
 
@@ -103,11 +103,11 @@ def _of_value(study: Study, folder: Path) -> Source:
     journal, tuning = str(folder / "study.journal"), study.tuning
     plan, sizes = tuning.plan, tuning.result.sizes
     directions = [StudyDirection.MINIMIZE] * len(plan.objectives)
-    kept = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
-    kept.set_user_attr("identity", plan.identity)
+    copied = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
+    copied.set_user_attr("identity", plan.identity)
     if sizes:
-        kept.set_user_attr(SIZES, sizes_as_data(sizes, tuning.result.sized or study.choice, plan))
-    kept.add_trials(study.trials)
+        copied.set_user_attr(SIZES, sizes_as_data(sizes, tuning.result.sized or study.choice, plan))
+    copied.add_trials(study.trials)
     file = folder / f"{study.name}.json"
     tuning.write(file)
     return Source(file, journal, study.problems, str(tuning.file) if tuning.file else "")

@@ -112,16 +112,16 @@ def follow(
         return False
     options = plan.options if filter_type(plan.filter).has_covariance else {}
     with stop_on_interrupt() as interrupted:
-        given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
-        passes = sum(len(one.seeds) for one in data)
-        given["budget"] = Budget(trials * passes) if find_way(name).by_trials else Budget()
-        task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), given=_given(plan), **given)
+        arguments: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
+        passes = sum(len(runs.seeds) for runs in data)
+        arguments["budget"] = Budget(trials * passes) if find_way(name).by_trials else Budget()
+        task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), given=_given(plan), **arguments)
         task.seed, task.stop = plan.seed, interrupted
         find_way(name).run(name, task)
         stopped = interrupted()
     space = plan.space()
     path = task.kept[1:] if task.refused is None else task.kept[1:-1]
-    for choice in _some([one.choice for one in path], trials - 1):
+    for choice in _some([step.choice for step in path], trials - 1):
         study.enqueue_trial(within_ranges(trial_parameters(choice, space), space))
     waiting = len(study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.WAITING,)))
 
@@ -141,30 +141,32 @@ def _start(plan: Plan, name: str) -> Choice | None:
     """
     if name not in OF_STATES or not plan.full_q:
         return None
-    found = noise_estimated(plan.filter, plan.scenarios[0], plan.seed)
-    if found is None or not plan.hold_r and (plan.full_r or np.ndim(found.model[R]) < 2):
-        return found
+    estimated = noise_estimated(plan.filter, plan.scenarios[0], plan.seed)
+    if estimated is None or not plan.hold_r and (plan.full_r or np.ndim(estimated.model[R]) < 2):
+        return estimated
     rule = untuned_choice(plan.filter, plan.scenarios[0]).model[R]
-    r = rule if plan.hold_r else tuple(np.diag(np.asarray(found.model[R])).tolist())
-    return found._replace(model={**found.model, R: r})
+    r = rule if plan.hold_r else tuple(np.diag(np.asarray(estimated.model[R])).tolist())
+    return estimated._replace(model={**estimated.model, R: r})
 
 
 def _given(plan: Plan) -> Choice | None:
     """The model's own numbers; None if there are none, or if they are the plant's, which no study knows."""
     problem = plan.scenarios[0]
-    own, true = given_choice(plan.filter, problem), oracle_choice(plan.filter, problem)
-    if own is None or (true is not None and same_filter(own, true)):
+    model_choice, true = given_choice(plan.filter, problem), oracle_choice(plan.filter, problem)
+    if model_choice is None or (true is not None and same_filter(model_choice, true)):
         return None
-    if plan.hold_r and R in own.model:
-        own = own._replace(model={**own.model, R: untuned_choice(plan.filter, problem).model[R]})
-    return own
+    if plan.hold_r and R in model_choice.model:
+        model_choice = model_choice._replace(
+            model={**model_choice.model, R: untuned_choice(plan.filter, problem).model[R]}
+        )
+    return model_choice
 
 
 def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
     """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
     answer = study.user_attrs[ANSWER]
-    found, refused = answer["choice"], answer.get("refused")
-    choice = plan.forgetting(Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"])))
+    stored, refused = answer["choice"], answer.get("refused")
+    choice = plan.forgetting(Choice(stored["name"], _tuples(stored["model"]), _tuples(stored["numbers"])))
     choice = plan.forgetting(choice, exact=True)
     value = measured(choice, plan, plan.training_data()).value
     nothing: dict[str, Any] = {
@@ -181,26 +183,26 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     )
 
 
-def way_sentence(found: Followed, word: str, objective: str) -> str:
+def way_sentence(followed: Followed, word: str, objective: str) -> str:
     """How the parameters were found, and the cost."""
-    way = WAYS[found.name]
-    took = f"It took {found.seconds:.2g} s, as long as {found.runs:.0f} runs of the filter over one of the"
+    way = WAYS[followed.name]
+    took = f"It took {followed.seconds:.2g} s, as long as {followed.runs:.0f} runs of the filter over one of the"
     worse = ""
-    if found.refused is not None:
-        given, answer = (reported(objective, value) for value in found.refused)
+    if followed.refused is not None:
+        given_value, answer = (reported(objective, value) for value in followed.refused)
         worse = (
             f" On these its answer has a {reported_name(objective)} of {answer:.4g} and the given filter "
-            f"{given:.4g}, so that one is returned."
+            f"{given_value:.4g}, so that one is returned."
         )
-    return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
+    return f"Way {followed.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
 
 
 def _some(choices: Sequence[Choice], count: int) -> list[Choice]:
     """At most so many of some choices, the last one among them, without two that are the same."""
     if len(choices) <= count or count < 1:
         return list(choices) if count >= 1 else []
-    places = sorted({round((i + 1) * len(choices) / count) - 1 for i in range(count)})
-    return [choices[place] for place in places]
+    indices = sorted({round((i + 1) * len(choices) / count) - 1 for i in range(count)})
+    return [choices[i] for i in indices]
 
 
 def _tuples(content: Any) -> Any:
@@ -254,8 +256,8 @@ class Tuning(NamedTuple):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to beware of in the tuned filter: a covariance that is far off, and where the search ended."""
-        found = all_warnings(self.comparisons, self.plan.scenarios, self.plan.forget)
-        return (*found, *range_warning(self.result.choice, self.plan))
+        messages = all_warnings(self.comparisons, self.plan.scenarios, self.plan.forget)
+        return (*messages, *range_warning(self.result.choice, self.plan))
 
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
@@ -432,7 +434,7 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
     parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
     parts += ["full-r"] * plan.full_r
-    parts += [re.sub(r"[^\w.+-]+", "", one.replace("=", "-")) for one in plan.where]
+    parts += [re.sub(r"[^\w.+-]+", "", setting.replace("=", "-")) for setting in plan.where]
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += [] if plan.forget is None else [f"forget{plan.forget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")

@@ -31,8 +31,8 @@ def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFr
         import pandas
     except ImportError:
         raise ValueError(f"to_frame must have pandas, which is not installed: {to_install('frames')}") from None
-    found = pandas.DataFrame(dict(columns))
-    return found if index is None else found.set_index(index)
+    data_frame = pandas.DataFrame(dict(columns))
+    return data_frame if index is None else data_frame.set_index(index)
 
 
 def html(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note: str = "") -> str:

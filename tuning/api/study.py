@@ -84,8 +84,8 @@ class Study:
         pairs = zip(self.problems, self.tuning.comparisons, strict=True)
         plan, chosen = self.tuning.plan, self.tuning.chosen
         return tuple(
-            HeldOut(self.choice, one, comparison, seed=plan.seed, chosen=chosen, forget=plan.forget)
-            for one, comparison in pairs
+            HeldOut(self.choice, problem, comparison, seed=plan.seed, chosen=chosen, forget=plan.forget)
+            for problem, comparison in pairs
         )
 
     @property
@@ -145,8 +145,8 @@ class Study:
         names = list(dict.fromkeys(name for trial in self.trials for name in trial.params))
         columns: dict[str, list] = {"trial": [trial.number + 1 for trial in self.trials]}
         columns["state"] = [trial.state.name.lower() for trial in self.trials]
-        for place, objective in enumerate(objectives):
-            values = [_value(trial, place) for trial in self.trials]
+        for i, objective in enumerate(objectives):
+            values = [_value(trial, i) for trial in self.trials]
             columns[reported_name(objective)] = [v if v is None else reported(objective, v) for v in values]
         columns["consistent"] = [is_consistent(trial) for trial in self.trials]
         columns["seconds"] = [_seconds(trial) for trial in self.trials]
@@ -200,40 +200,40 @@ class Study:
         return report(self, out)
 
     def __repr__(self) -> str:
-        result, names = self.tuning.result, ", ".join(one.name for one in self.problems)
-        said = f"Study({label_of(self.choice.name)} on {names}, {result.finished} trials"
+        result, names = self.tuning.result, ", ".join(problem.name for problem in self.problems)
+        summary = f"Study({label_of(self.choice.name)} on {names}, {result.finished} trials"
         ended = ", interrupted" if self.interrupted else ""
+        effect = tuning_effect(self.tuning.comparison)
         if not self.tuning.comparison.tuned.has_truth:
-            return f"{said}{ended}: tuning {tuning_effect(self.tuning.comparison)})"
-        return (
-            f"{said}{ended}: score {about(self.held_out.score)}; tuning {tuning_effect(self.tuning.comparison)})"
-        )
+            return f"{summary}{ended}: tuning {effect})"
+        return f"{summary}{ended}: score {about(self.held_out.score)}; tuning {effect})"
 
     def __str__(self) -> str:
         """The choice and its reason, a summary line, and the tables of its held-out evaluations."""
-        first, tables = plain_text(self.tuning.chosen), [plain_text(one.tables()) for one in self.evaluations]
+        first = plain_text(self.tuning.chosen)
+        tables = [plain_text(evaluation.tables()) for evaluation in self.evaluations]
         return "\n\n".join([*([first] if first else []), repr(self), *tables])
 
     def _repr_html_(self) -> str:
         from tuning.reporting.units import number_rows
 
-        found = self.held_out
-        rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
-        numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *found.choices], rows)
-        said = " ".join([*self.tuning.chosen, f"Tuning {tuning_effect(self.tuning.comparison)}."])
-        return numbers + found._repr_html_() + f"<p>{escape(said)}</p>"
+        held_out = self.held_out
+        rows = number_rows(list(held_out.choices.values()), self.choice.name, self.problem, _text)
+        numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *held_out.choices], rows)
+        text = " ".join([*self.tuning.chosen, f"Tuning {tuning_effect(self.tuning.comparison)}."])
+        return numbers + held_out._repr_html_() + f"<p>{escape(text)}</p>"
 
 
 def _text(value: Any) -> str:
     return "default" if value is None else number(value) if isinstance(value, float) else str(value)
 
 
-def _value(trial: FrozenTrial, place: int) -> float | None:
+def _value(trial: FrozenTrial, index: int) -> float | None:
     """An objective of a complete trial; of a pruned one the mean of the seeds that it came to."""
     if trial.state == TrialState.COMPLETE:
-        return trial.values[place]
-    seen = list(trial.intermediate_values.values())
-    return sum(seen) / len(seen) if seen and place == 0 else None
+        return trial.values[index]
+    values = list(trial.intermediate_values.values())
+    return sum(values) / len(values) if values and index == 0 else None
 
 
 def _seconds(trial: FrozenTrial) -> float | None:
@@ -358,7 +358,7 @@ def tune(
     of_logs |= {"grid": None if grid else False, "stamps": stamps}
     of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
     unknown = unknowns_of(augment)
-    problems = tuple(augmented(one, unknown) for one in problems_of(problem, preset, **of_logs))
+    problems = tuple(augmented(base, unknown) for base in problems_of(problem, preset, **of_logs))
     if objective is None:
         objective = "score" if problems[0].scale is not None else "likelihood"
     plan = Plan(
@@ -378,9 +378,9 @@ def tune(
         forget=forget,
     )
     plan = with_budget(plan)
-    place = None if storage is None else storage_text(storage)
+    journal = None if storage is None else storage_text(storage)
     console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, place, name, by_gradient=aim, way=way, workers=workers))
+    return Study(run_tuning(plan, trials, console, journal, name, by_gradient=aim, way=way, workers=workers))
 
 
 # A user's own parameters as a choice: those of a filter, or of a model with its own Q and R.
@@ -389,12 +389,12 @@ def tune(
 DEFAULT_FILTER = "ekf"  # of a model alone
 
 
-def is_own(given: Any) -> bool:
+def is_own(argument: Any) -> bool:
     """Whether something is a filter object or a model, with its own parameters."""
-    return isinstance(given, Filter | StateSpaceModel)
+    return isinstance(argument, Filter | StateSpaceModel)
 
 
-def user_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
+def user_choice(filter_or_model: Filter | StateSpaceModel, problem: Problem) -> Choice:
     """The Q, R and other parameters of a filter or model, with its prior, for a problem of the same equations.
 
     A model means an extended Kalman filter on it.
@@ -402,8 +402,8 @@ def user_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
     Raises:
         ValueError: if the model's functions, states or constants are not those of the problem's.
     """
-    model = given.model if isinstance(given, Filter) else given
-    name = given.name if isinstance(given, Filter) else DEFAULT_FILTER
+    model = filter_or_model.model if isinstance(filter_or_model, Filter) else filter_or_model
+    name = filter_or_model.name if isinstance(filter_or_model, Filter) else DEFAULT_FILTER
     expected = problem.model(**problem.untuned)
     if model.digest != expected.digest:
         raise ValueError(
@@ -415,8 +415,12 @@ def user_choice(given: Filter | StateSpaceModel, problem: Problem) -> Choice:
         "measurement_noise_cov": as_argument(model.measurement_noise_cov),
     }
     numbers = untuned_choice(name, problem).numbers
-    if isinstance(given, Filter):
+    if isinstance(filter_or_model, Filter):
         numbers = {
-            key: getattr(given, key) for key in filter_type(name).numbers if key in numbers or hasattr(given, key)
+            key: getattr(filter_or_model, key)
+            for key in filter_type(name).numbers
+            if key in numbers or hasattr(filter_or_model, key)
         }
-    return Choice(name, {**{one.name: one.start for one in problem.parameters or ()}, **noise}, numbers)
+    return Choice(
+        name, {**{parameter.name: parameter.start for parameter in problem.parameters or ()}, **noise}, numbers
+    )

@@ -97,39 +97,39 @@ def train_estimator(
     from tuning.learning.starting import new_estimator, starting_filter
 
     one_of("an estimator", kind, tuple(LEARNED))
-    found = problem_of(problem, preset)
-    if found.scale is None:
-        raise ValueError(f"training needs true states, but {found.name} has none")
+    chosen = problem_of(problem, preset)
+    if chosen.scale is None:
+        raise ValueError(f"training needs true states, but {chosen.name} has none")
     settings = Settings(
         at_least("steps", steps, 1, MOST),
         at_least("batch", batch, 1, MOST),
         at_least("window", window, 1, MOST),
         positive("rate", rate),
     )
-    target = FOLDER / f"{kind}-{file_name(found.name)}{TRAINED}" if file is None else Path(file)
+    target = FOLDER / f"{kind}-{file_name(chosen.name)}{TRAINED}" if file is None else Path(file)
     if target.suffix != TRAINED:
         raise ValueError(f"file must end in {TRAINED}, but got {target}")
     check_target(target)
-    others = {Path(one).stem: read_choice(Path(one), found).filter(found) for one in against}
-    found.held_out_seeds(seed, seeds)  # a clear error before the training
+    competitors = {Path(path).stem: read_choice(Path(path), chosen).filter(chosen) for path in against}
+    chosen.held_out_seeds(seed, seeds)  # a clear error before the training
     console = console_for(progress)
-    training_seeds = found.training_seeds(seed, at_least("runs", runs, 1))
-    data = data_of(found, training_seeds)
-    first, filter_ = starting_filter(found, data, seed)
+    training_seeds = chosen.training_seeds(seed, at_least("runs", runs, 1))
+    data = data_of(chosen, training_seeds)
+    first, filter_ = starting_filter(chosen, data, seed)
     estimator = new_estimator(kind, filter_, data, seed, start, **(options or {}))
     began = time.perf_counter()
     with stop_on_interrupt() as stopped:
-        checks = _trained(estimator, found, data, settings, seed, target, stopped, console)
+        checks = _trained(estimator, chosen, data, settings, seed, target, stopped, console)
         interrupted = stopped()
     seconds = time.perf_counter() - began
-    known = oracle(filter_.name, found)
-    filters: dict[str, Filter] = {first: filter_, **others}
+    known = oracle(filter_.name, chosen)
+    filters: dict[str, Filter] = {first: filter_, **competitors}
     if known is not None:
-        filters[f"{filter_.name} {ORACLE}"] = known.filter(found)
+        filters[f"{filter_.name} {ORACLE}"] = known.filter(chosen)
     filters[kind] = ForeignFilter(model=estimator.model, estimator=estimator)
     with console.status("held-out runs ..."):
-        rows = standings(filters, found, found.held_out_seeds(seed, seeds))
-    return EstimatorTraining(kind, found, target, tuple(checks), tuple(rows), seconds, filters, seed, interrupted)
+        rows = standings(filters, chosen, chosen.held_out_seeds(seed, seeds))
+    return EstimatorTraining(kind, chosen, target, tuple(checks), tuple(rows), seconds, filters, seed, interrupted)
 
 
 def _trained(
@@ -147,15 +147,15 @@ def _trained(
     from tuning.learning.training import train
 
     validation = data_of(problem, problem.validation_seeds(seed, VALIDATION_SEEDS))
-    told = {"problem": problem.name, "digest": problem.digest, "seed": seed, "runs": len(data.seeds)}
-    told["plant"] = problem.plant_data
+    origin = {"problem": problem.name, "digest": problem.digest, "seed": seed, "runs": len(data.seeds)}
+    origin["plant"] = problem.plant_data
     target.parent.mkdir(parents=True, exist_ok=True)
     with _bar(f"{estimator.kind} on {problem.name}", settings.steps, console) as (on_step, show):
 
         def on_check(check: Check) -> None:
             show(check.score)
             if check.best:
-                write_estimator(target, estimator, {**told, **settings._asdict(), "step": check.step})
+                write_estimator(target, estimator, {**origin, **settings._asdict(), "step": check.step})
 
         return train(estimator, data, validation, problem.scale, settings, seed, on_step, on_check, stopped)
 

@@ -61,8 +61,8 @@ class Commands(Group):
         return {name: listed(name) for name in COMMANDS}
 
     @commands.setter
-    def commands(self, given: MutableMapping[str, Any]) -> None:
-        self._made = given
+    def commands(self, commands: MutableMapping[str, Any]) -> None:
+        self._made = commands
 
     def format_help(self, ctx, formatter) -> None:
         """List the commands without importing them, which takes a second."""

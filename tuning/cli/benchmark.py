@@ -19,10 +19,10 @@ def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[Renderabl
     benchmark = find_benchmark(name)
     with progress_console.status("...") as status:
         rows = benchmark.reproduce(runs, seed, lambda row: status.update(f"done: {row.label}"))
-    shown: list[RenderableType] = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
+    output: list[RenderableType] = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
     if benchmark.remarks:
-        shown.append(list_of(benchmark.remarks))
-    return shown, {
+        output.append(list_of(benchmark.remarks))
+    return output, {
         "settings": {"runs": runs, "seed": seed},
         "source": benchmark.source,
         "score": benchmark.score,
@@ -51,15 +51,15 @@ LEAST = 12  # width of a column of words
 def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
     """The table with a blank line between rows of two lines, and numbers that do not wrap where there is room."""
     out.leading = 1
-    fixed = [place for place, column in enumerate(out.columns) if str(column.header) != flexible]
-    widths = [max(len(line) for row in rows for line in row[place].split("\n")) for place in fixed]
+    fixed = [i for i, column in enumerate(out.columns) if str(column.header) != flexible]
+    widths = [max(len(line) for row in rows for line in row[i].split("\n")) for i in fixed]
     if sum(widths) + 2 * len(out.columns) + (LEAST if flexible else 0) > console.width:
         return out
-    for place, column in enumerate(out.columns):
+    for i, column in enumerate(out.columns):
         if str(column.header) == flexible:
             column.justify = "left"
         else:
-            lines = [line for row in rows for line in row[place].split("\n")]
+            lines = [line for row in rows for line in row[i].split("\n")]
             column.width = max(len(text) for text in lines + str(column.header).split())
     return out
 

@@ -86,22 +86,22 @@ def command(
     for file in files or []:
         _check_is_file(file)
     chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
-    chosen = [of_preset(one, preset) for one in chosen]
+    chosen = [of_preset(problem, preset) for problem in chosen]
     for file, problem in product(files or [], chosen):
         if not is_trained(file):
             read_choice(file, problem)  # a clear error for a file that is for another plant
-    some = [*sorted(files or [], key=is_trained), *(filters or [])]
+    contenders = [*sorted(files or [], key=is_trained), *(filters or [])]
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(unknown_in, augment or []))
     announce_compilation()
     options: dict[str, Any] = {"knows": knows, "trials": trials, "unknown": unknown, "sizes": sizes}
-    found = run_comparison(some or None, chosen, seed, seeds, progress_console, **options)
-    boards, interrupted = list(found.boards), found.interrupted
-    shown = [part for board in boards for part in report(board)]
-    shown += left_out_lines(found.left_out)
+    comparison = run_comparison(contenders or None, chosen, seed, seeds, progress_console, **options)
+    boards, interrupted = list(comparison.boards), comparison.interrupted
+    output = [part for board in boards for part in report(board)]
+    output += left_out_lines(comparison.left_out)
     if interrupted:
-        shown.append(INTERRUPTED)
-    told = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": found.left_out}
-    emit(shown, {**told, **as_json(boards)}, json)
+        output.append(INTERRUPTED)
+    data = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": comparison.left_out}
+    emit(output, {**data, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)
 

@@ -70,8 +70,8 @@ def command(
         "report": str(report.page),
         "seconds": seconds,
     }
-    told = [*result(tuning, best, report, seconds), *files(file, best, pictures, report), *next_steps()]
-    emit(told, data, json)
+    output = [*result(tuning, best, report, seconds), *files(file, best, pictures, report), *next_steps()]
+    emit(output, data, json)
     if best is None or best.result.interrupted:
         sys.exit(130)
 
@@ -86,10 +86,10 @@ def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
 
 def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) -> list[str | Table]:
     """What was tuned on what, the errors before and after, and one sentence on the gain."""
-    found, seeds = tuning.result, len(tuning.comparison.seeds)
-    stopped = ", interrupted," if found.interrupted else ""
+    outcome, seeds = tuning.result, len(tuning.comparison.seeds)
+    stopped = ", interrupted," if outcome.interrupted else ""
     return [
-        f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {found.finished} trials{stopped} on "
+        f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {outcome.finished} trials{stopped} on "
         f"{TRAINING_SEEDS} runs, evaluated on {seeds} others, in {seconds:.0f} s.",
         report.advice,
         "",
@@ -116,17 +116,17 @@ def error_table(tuning: Tuning, best: Tuning | None) -> Table:
     comparison, scenario = tuning.comparison, tuning.scenario
     choices = {TUNED: tuning.result.choice, **baselines(FILTER, scenario, tuning.plan.seed)}
     rows = []
-    evaluations, others = dict(comparison.evaluations), {*comparison.evaluations} - {TUNED}
+    evaluations, reference = dict(comparison.evaluations), {*comparison.evaluations} - {TUNED}
     if best is not None:
         name = f"auto: {best.result.choice.name}"
         evaluations[name], choices[name] = best.comparison.tuned, best.result.choice
-    for name, found in evaluations.items():
-        if name in others and same_filter(choices[name], choices[TUNED]):
+    for name, evaluation in evaluations.items():
+        if name in reference and same_filter(choices[name], choices[TUNED]):
             continue  # its numbers stand in the row "tuned"
-        pairs = zip(found.rmse, above_bound(found, comparison.bound), strict=True)
+        pairs = zip(evaluation.rmse, above_bound(evaluation, comparison.bound), strict=True)
         errors = [cell for rmse, above in pairs for cell in (f"{rmse.value:#.3g}", f"{above:+.0f} %")]
         ((variance,),) = choices[name].filter(scenario).model.measurement_noise_cov
-        rows.append([name, f"{variance:.3g}", *errors, *consistency_cells(found)])
+        rows.append([name, f"{variance:.3g}", *errors, *consistency_cells(evaluation)])
     speed, flow = (f"{limit:#.3g}" for limit in comparison.bound)
     rows.append(["bound", "", speed, "", flow, "", str(len(comparison.bound)), "1"])
     heads = [
@@ -134,9 +134,9 @@ def error_table(tuning: Tuning, best: Tuning | None) -> Table:
         for state in scenario.model().states
         for head in ("\n".join([*state.name.split(), f"[{state.unit}]"]), "above\nbound")
     ]
-    shown = table(None, ["filter", "R\n[N^2]", *heads, "mean\nNEES", "mean\nNIS"], rows)
-    shown.show_edge = False
-    return shown
+    output = table(None, ["filter", "R\n[N^2]", *heads, "mean\nNEES", "mean\nNIS"], rows)
+    output.show_edge = False
+    return output
 
 
 def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
@@ -167,9 +167,10 @@ def before_and_after(tuning: Tuning) -> dict[str, Filter]:
 
 def best_baseline(tuning: Tuning) -> str:
     """The baseline with the lowest score among those that need no truth."""
-    found = tuning.comparison.evaluations
+    evaluations = tuning.comparison.evaluations
     return min(
-        (name for name in found if name not in (TUNED, NOISE, ORACLE)), key=lambda name: found[name].score.value
+        (name for name in evaluations if name not in (TUNED, NOISE, ORACLE)),
+        key=lambda name: evaluations[name].score.value,
     )
 
 

@@ -125,85 +125,94 @@ def command(
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
     options: dict[str, Any] = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}
-    found = estimate(recorded, filter_name, offer, **options)
-    told = findings(found, skip)
-    alarms = None if watch is None else alarms_of(found, watch, told.first, isolate=isolate)
+    estimates = estimate(recorded, filter_name, offer, **options)
+    assessment = findings(estimates, skip)
+    alarms = None if watch is None else alarms_of(estimates, watch, assessment.first, isolate=isolate)
     if out is not None:
-        write_columns(out, columns_of(found, alarms), again=True)
+        write_columns(out, columns_of(estimates, alarms), again=True)
     if plot is not None:
         from filters.logs.figure import log_figure
 
-        log_figure(plot, found, f"{_title(found)} on {log.name}", alarms)
+        log_figure(plot, estimates, f"{_title(estimates)} on {log.name}", alarms)
     files = [str(path) for path in (out, plot) if path is not None]
-    shown = [*_report(found, told), *_alarms(found, alarms), *[f"wrote {path}" for path in files]]
-    emit(shown, {**_as_json(found, told), **_alarms_as_json(found, alarms), "files": files}, json)
+    output = [*_report(estimates, assessment), *_alarms(estimates, alarms), *[f"wrote {path}" for path in files]]
+    emit(output, {**_as_json(estimates, assessment), **_alarms_as_json(estimates, alarms), "files": files}, json)
 
 
-def _title(found: LogEstimate) -> str:
-    return f"{found.filter.name}, smoothed," if found.smoothed else found.filter.name
+def _title(estimates: LogEstimate) -> str:
+    return f"{estimates.filter.name}, smoothed," if estimates.smoothed else estimates.filter.name
 
 
-def _report(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
-    log = found.log
+def _report(estimates: LogEstimate, assessment: LogFindings) -> list[RenderableType]:
+    log = estimates.log
     how = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
     about = f"{log.steps + 1} rows, dt {log.dt:g} s{how}"
-    title = f"{_title(found)} on {log.name} ({about}); scored: rows {told.first} to {log.steps}"
+    title = f"{_title(estimates)} on {log.name} ({about}); scored: rows {assessment.first} to {log.steps}"
     rows = [
-        ["mean NIS over channels", f"{told.mean_nis:.3g}", f"{told.nis_band[0]:.3g} to {told.nis_band[1]:.3g}"],
-        ["log-likelihood", f"{told.log_likelihood:.6g}", ""],
-        ["restarts", str(found.divergences), "0"],
+        [
+            "mean NIS over channels",
+            f"{assessment.mean_nis:.3g}",
+            f"{assessment.nis_band[0]:.3g} to {assessment.nis_band[1]:.3g}",
+        ],
+        ["log-likelihood", f"{assessment.log_likelihood:.6g}", ""],
+        ["restarts", str(estimates.divergences), "0"],
     ]
-    if isnan(told.mean_nis):
+    if isnan(assessment.mean_nis):
         rows = rows[2:]
-    elif told.whiteness is not None:
-        white = told.whiteness
+    elif assessment.whiteness is not None:
+        white = assessment.whiteness
         rows.insert(1, ["whiteness, p-value", f"{white.p_value:.3g}", f"above {ALPHA:g}"])
-    shown: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
+    output: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
     columns = ["", "RMSE", "bias", "rows"]
-    shown.append(table("One-step prediction less measurement", columns, list(map(_row, told.predictions))))
-    if told.references:
-        what = "Smoother" if found.smoothed else "Estimate"
-        shown.append(table(f"{what} less reference, not seen", columns, list(map(_row, told.references))))
-    return shown + verdict(found, told)
+    output.append(table("One-step prediction less measurement", columns, list(map(_row, assessment.predictions))))
+    if assessment.references:
+        what = "Smoother" if estimates.smoothed else "Estimate"
+        output.append(table(f"{what} less reference, not seen", columns, list(map(_row, assessment.references))))
+    return output + verdict(estimates, assessment)
 
 
-def _alarms(found: LogEstimate, told: LogAlarms | None) -> list[RenderableType]:
+def _alarms(estimates: LogEstimate, alarms: LogAlarms | None) -> list[RenderableType]:
     """The first alarms in words, and the channel at fault."""
-    if told is None:
+    if alarms is None:
         return []
-    log, times = found.log, found.log.start + found.log.times
-    rows, expected = log.steps + 1 - told.first, (log.steps + 1 - told.first) / told.monitor.steps_between
+    log, times = estimates.log, estimates.log.start + estimates.log.times
+    rows, expected = log.steps + 1 - alarms.first, (log.steps + 1 - alarms.first) / alarms.monitor.steps_between
     what = f"{rows} rows, {expected:.2g} false alarms expected if the model is right"
-    if not told.alarms:
+    if not alarms.alarms:
         return [f"No alarm in {what}."]
-    some = episodes(told.alarms, told.monitor.memory)
-    shown: list[RenderableType] = [f"Alarms: {len(told.alarms)} in {what}."]
-    shown += [f"- {episode_sentence(one, log.measured[one[0].channel], times)}" for one in some[:MOST_EPISODES]]
-    shown += [f"- and {len(some) - MOST_EPISODES} more stretches"] * (len(some) > MOST_EPISODES)
-    if told.without is not None:
-        counts = ", ".join(f"{one.symbol} {count}" for one, count in zip(log.measured, told.without, strict=True))
-        place = told.at_fault
-        fault = "no single channel is at fault" if place is None else f"{log.measured[place].symbol} is at fault"
-        shown.append(f"Remaining alarms without each channel: {counts}: {fault}.")
-    return shown
+    stretches = episodes(alarms.alarms, alarms.monitor.memory)
+    output: list[RenderableType] = [f"Alarms: {len(alarms.alarms)} in {what}."]
+    output += [
+        f"- {episode_sentence(episode, log.measured[episode[0].channel], times)}"
+        for episode in stretches[:MOST_EPISODES]
+    ]
+    output += [f"- and {len(stretches) - MOST_EPISODES} more stretches"] * (len(stretches) > MOST_EPISODES)
+    if alarms.without is not None:
+        counts = ", ".join(
+            f"{channel.symbol} {count}" for channel, count in zip(log.measured, alarms.without, strict=True)
+        )
+        index = alarms.at_fault
+        fault = "no single channel is at fault" if index is None else f"{log.measured[index].symbol} is at fault"
+        output.append(f"Remaining alarms without each channel: {counts}: {fault}.")
+    return output
 
 
-def _alarms_as_json(found: LogEstimate, told: LogAlarms | None) -> dict[str, Any]:
-    if told is None:
+def _alarms_as_json(estimates: LogEstimate, watched: LogAlarms | None) -> dict[str, Any]:
+    if watched is None:
         return {}
-    measured = found.log.measured
-    alarms = [{**one._asdict(), "channel": measured[one.channel].symbol} for one in told.alarms]
-    left = told.without and {one.symbol: n for one, n in zip(measured, told.without, strict=True)}
-    fault = None if told.at_fault is None else measured[told.at_fault].symbol
-    return {"monitor": told.monitor.as_mapping(), "alarms": alarms, "left_without": left, "at_fault": fault}
+    measured = estimates.log.measured
+    alarms = [{**alarm._asdict(), "channel": measured[alarm.channel].symbol} for alarm in watched.alarms]
+    left = watched.without and {channel.symbol: n for channel, n in zip(measured, watched.without, strict=True)}
+    fault = None if watched.at_fault is None else measured[watched.at_fault].symbol
+    return {"monitor": watched.monitor.as_mapping(), "alarms": alarms, "left_without": left, "at_fault": fault}
 
 
-def _row(one: Residual) -> list[str]:
-    return [one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", str(one.rows)]
+def _row(residual: Residual) -> list[str]:
+    return [residual.quantity.short_label, f"{residual.rmse:.4g}", f"{residual.bias:+.4g}", str(residual.rows)]
 
 
-def _as_json(found: LogEstimate, told: LogFindings) -> dict:
-    log, white = found.log, told.whiteness
+def _as_json(estimates: LogEstimate, assessment: LogFindings) -> dict:
+    log, white = estimates.log, assessment.whiteness
     return {
         "log": log.name,
         "digest": log.digest,
@@ -211,17 +220,17 @@ def _as_json(found: LogEstimate, told: LogFindings) -> dict:
         "rows": log.steps + 1,
         "irregular": log.irregular,
         "grid": log.stamps is None,
-        "filter": found.filter.name,
-        "smoothed": found.smoothed,
-        "first_row": told.first,
-        "mean_nis": told.mean_nis,
-        "nis_band": told.nis_band,
+        "filter": estimates.filter.name,
+        "smoothed": estimates.smoothed,
+        "first_row": assessment.first,
+        "mean_nis": assessment.mean_nis,
+        "nis_band": assessment.nis_band,
         "whiteness_p_value": None if white is None else white.p_value,
-        "log_likelihood": told.log_likelihood,
-        "divergences": found.divergences,
-        "restarts": found.restarts and found.restarts._asdict(),
-        "one_step_ahead": {one.quantity.symbol: one._asdict() for one in told.predictions},
-        "references": {one.quantity.symbol: one._asdict() for one in told.references},
-        "findings": [asdict(one) for one in log.findings],
-        "sentences": verdict(found, told),
+        "log_likelihood": assessment.log_likelihood,
+        "divergences": estimates.divergences,
+        "restarts": estimates.restarts and estimates.restarts._asdict(),
+        "one_step_ahead": {residual.quantity.symbol: residual._asdict() for residual in assessment.predictions},
+        "references": {residual.quantity.symbol: residual._asdict() for residual in assessment.references},
+        "findings": [asdict(finding) for finding in log.findings],
+        "sentences": verdict(estimates, assessment),
     }

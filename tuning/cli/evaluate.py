@@ -59,18 +59,18 @@ def check_covariance(
 ) -> tuple[list[str], dict]:
     """Draw the checks of a choice, called `name`; return the text to print and the numbers behind it."""
     report = check_consistency(choice.filter(scenario), scenario.data(comparison.seeds), scenario.dt)
-    said, against, ratios = sentences(report), {}, None
+    messages, against, ratios = sentences(report), {}, None
     if report.has_truth and comparison.true is not None:
         ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
         against[f"{name}\nover {ORACLE}"] = ratios
         named = list(zip(report.states, ratios, strict=True))
-        said += [comparison_sentence(state, name, ORACLE, ratio) for state, ratio in named[:MOST_STATES]]
+        messages += [comparison_sentence(state, name, ORACLE, ratio) for state, ratio in named[:MOST_STATES]]
         if len(named) > MOST_STATES:
-            said.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
+            messages.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
     consistency_figure(path, report, title, against, comparison.tuned.scored or None)
-    data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
-    return [f"Is the {name} filter consistent?", *said, f"Picture: {path}"], data
+    data = {**as_data(report), "rmse_over_true": ratios, "sentences": messages, "picture": str(path)}
+    return [f"Is the {name} filter consistent?", *messages, f"Picture: {path}"], data
 
 
 def as_data(report: ConsistencyReport) -> dict:
@@ -78,7 +78,7 @@ def as_data(report: ConsistencyReport) -> dict:
     white, ensemble = report.whiteness, report.ensemble
     members = None
     if ensemble is not None:
-        ranks = [{"frequencies": found.frequencies, "p_value": found.p_value} for found in ensemble.ranks]
+        ranks = [{"frequencies": rank.frequencies, "p_value": rank.p_value} for rank in ensemble.ranks]
         members = {"size": ensemble.size, "ranks": ranks, "crps": ensemble.crps}
     return {
         "states": report.states,
@@ -178,28 +178,28 @@ def command(
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))
     announce_compilation()
-    found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
-    comparison, data = found.comparison, found.to_dict()
+    evaluation = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
+    comparison, data = evaluation.comparison, evaluation.to_dict()
     seeds_used = f"{chosen.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
     where = f"held-out {seeds_used}, scenario {chosen.name}"
-    shown: list[RenderableType] = [choice_table(found.choices, chosen)]
-    shown.append(comparison_table(found.evaluations, comparison.bound, where, chosen.scale_about))
-    shown += found.sentences()
+    output: list[RenderableType] = [choice_table(evaluation.choices, chosen)]
+    output.append(comparison_table(evaluation.evaluations, comparison.bound, where, chosen.scale_about))
+    output += evaluation.sentences()
     if consistency is not None:
         name = TUNED if tuned is not None else GIVEN if own else comparison.rule
         with working("checking the covariance"):
             words, data["consistency"] = check_covariance(choice, name, chosen, comparison, consistency)
-        shown += words
-    emit(shown, data, json)
+        output += words
+    emit(output, data, json)
 
 
 def _given(name: str, problem: Problem) -> Choice:
     """The filter with the given Q and R of the problem's model; ValueError if there are none."""
     if not filter_type(name).has_covariance:
         raise ValueError(f"--given must be used with a filter that has a Q and R, but got {name}")
-    found = given_noise(name, problem)
-    if found is None:
+    choice = given_noise(name, problem)
+    if choice is None:
         raise ValueError(
             f"--given must be used with a problem whose model has a given Q and R, but got {problem.name}"
         )
-    return found
+    return choice

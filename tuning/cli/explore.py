@@ -138,7 +138,7 @@ def _remove_left_over() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*-*"):
         process = folder.name.removeprefix(FOLDER).partition("-")[0]
         with suppress(OSError):
-            found = folder.lstat()
-            ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+            status = folder.lstat()
+            ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
             if ours and process.isdecimal() and not is_alive(int(process)):
                 shutil.rmtree(folder, ignore_errors=True)

@@ -59,14 +59,14 @@ def command(
     one_of("a language", language, LANGUAGES)
     watch = asked_monitor(monitor, file)
     check_targets((out / "README.md",), json, read=(file,))
-    choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
-    filter_ = choice.filter(found)
-    options: dict[str, Any] = {"single": single, "monitor": watch, "board": board, "dt": found.dt}
-    files = [str(one) for one in write_project(filter_, out, name, **options)]
-    lines, error = [f"wrote {one}" for one in files], None
+    choice, source, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
+    filter_ = choice.filter(source)
+    options: dict[str, Any] = {"single": single, "monitor": watch, "board": board, "dt": source.dt}
+    files = [str(path) for path in write_project(filter_, out, name, **options)]
+    lines, error = [f"wrote {path}" for path in files], None
     if single:
         announce_compilation()
-        data = found.data(found.training_seeds(seed, 2)[:1])
+        data = source.data(source.training_seeds(seed, 2)[:1])
         error = single_error(filter_, programs_of(filter_), data.inputs[0], data.measurements[0])
         lines.append(
             f"Single precision changes estimates by at most {error:.1g} standard deviations on a training run."

@@ -40,17 +40,17 @@ class Fit(NamedTuple):
 
 def fits_of(problem: Problem, names: tuple[str, ...] = tuple(FILTERS)) -> list[Fit]:
     """Each filter with the rule of thumb's parameters on a problem's model; nothing is compiled."""
-    found = []
+    fits = []
     for name in names:
         try:
             filter_ = untuned_choice(name, problem).filter(problem)
             memory = new_memory(filter_.kernels(), filter_.size)
         except ValueError as error:
-            found.append(Fit(name, str(error)))
+            fits.append(Fit(name, str(error)))
             continue
         kilobytes = sum(part.nbytes for part in memory) / 1e3
-        found.append(Fit(name, "", filter_.size or None, kilobytes))
-    return found
+        fits.append(Fit(name, "", filter_.size or None, kilobytes))
+    return fits
 
 
 def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
@@ -58,13 +58,13 @@ def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
     model = problem.model()
     rows = [
         [
-            one.name,
-            "no" if one.reason else "yes",
-            "" if one.ensemble_size is None else str(one.ensemble_size),
-            _size(one.kilobytes),
-            one.reason,
+            fit.name,
+            "no" if fit.reason else "yes",
+            "" if fit.ensemble_size is None else str(fit.ensemble_size),
+            _size(fit.kilobytes),
+            fit.reason,
         ]
-        for one in fits
+        for fit in fits
     ]
     counts = (model.n, "state"), (model.m, "measurement"), (model.inputs, "input")
     sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
@@ -126,32 +126,32 @@ def command(
     if name is not None:
         filter_type(name)
     if problem is not None:
-        found = find_problem(problem)
-        fits = fits_of(found, tuple(FILTERS) if name is None else (name,))
-        emit(fit_table(found, fits), {"problem": found.name, "filters": [one._asdict() for one in fits]}, json)
+        chosen = find_problem(problem)
+        fits = fits_of(chosen, tuple(FILTERS) if name is None else (name,))
+        emit(fit_table(chosen, fits), {"problem": chosen.name, "filters": [fit._asdict() for fit in fits]}, json)
         return
     entries = [entry(known) for known in FILTERS if name in (None, known)]
-    shown = overview(entries) if name is None else in_full(entries[0], console.width)
-    emit(shown, {"filters": [_plain(one) for one in entries]}, json)
+    output = overview(entries) if name is None else in_full(entries[0], console.width)
+    emit(output, {"filters": [_plain(listed) for listed in entries]}, json)
 
 
 def entry(name: str) -> Entry:
     """The description in a filter's class."""
     kind = filter_type(name)
-    own = kind.filter_class
-    text, meaning = cleandoc(own.__doc__ or ""), _meanings(own)
-    defaults = {field.name: field.default for field in dataclasses.fields(own)}
+    filter_class = kind.filter_class
+    text, meaning = cleandoc(filter_class.__doc__ or ""), _meanings(filter_class)
+    defaults = {field.name: field.default for field in dataclasses.fields(filter_class)}
     numbers = tuple(Number(number, defaults[number], meaning[number]) for number in kind.numbers)
     return Entry(name, first_sentence(text), kind.has_covariance, kind.has_ensemble, numbers, text)
 
 
 def overview(entries: list[Entry]) -> list[RenderableType]:
     """All filters in one table and all their parameters in another, each shared one once."""
-    filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
+    filters = [[entry.name, entry.about, _yes(entry.covariance), _yes(entry.ensemble)] for entry in entries]
     owners: dict[Number, list[str]] = {}
-    for one in entries:
-        for number in one.numbers:
-            owners.setdefault(number, []).append(one.name)
+    for entry in entries:
+        for number in entry.numbers:
+            owners.setdefault(number, []).append(entry.name)
     numbers = []
     for names, group in groupby(owners, owners.__getitem__):
         numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
@@ -167,15 +167,15 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
     ]
 
 
-def in_full(one: Entry, width: int) -> list[RenderableType]:
+def in_full(entry: Entry, width: int) -> list[RenderableType]:
     """One filter: its documentation, fitted to a width, and a table of its parameters."""
-    kind = filter_type(one.name).filter_class
-    has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
-    shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
-    shown.append(fitted(one.documentation, width))
-    if one.numbers:
-        shown += ["", table("Its own numbers", ["number", "default", "meaning"], list(one.numbers), words=True)]
-    return shown
+    kind = filter_type(entry.name).filter_class
+    has = f"covariance: {_yes(entry.covariance)}, ensemble: {_yes(entry.ensemble)}"
+    output: list[RenderableType] = [Text(entry.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
+    output.append(fitted(entry.documentation, width))
+    if entry.numbers:
+        output += ["", table("Its own numbers", ["number", "default", "meaning"], list(entry.numbers), words=True)]
+    return output
 
 
 def first_sentence(text: str) -> str:
@@ -212,18 +212,18 @@ def _fitted_equations(line: str, width: int) -> str:
 
 def _meanings(kind: type[Filter]) -> dict[str, str]:
     """The descriptions of attributes in the docstrings of a class and of its bases."""
-    found = {}
+    meanings = {}
     for base in reversed(kind.__mro__):
         text = cleandoc(base.__doc__ or "")
         for section in (part for part in text.split("\n\n") if part.startswith(ATTRIBUTES)):
             for name, meaning in re.findall(r"^    (\w+): (.*(?:\n     .*)*)", section, flags=re.MULTILINE):
-                found[name] = " ".join(meaning.split())
-    return found
+                meanings[name] = " ".join(meaning.split())
+    return meanings
 
 
 def _yes(answer: bool) -> str:
     return "yes" if answer else "no"
 
 
-def _plain(one: Entry) -> dict:
-    return {**one._asdict(), "numbers": [number._asdict() for number in one.numbers]}
+def _plain(entry: Entry) -> dict:
+    return {**entry._asdict(), "numbers": [number._asdict() for number in entry.numbers]}

@@ -52,25 +52,25 @@ from tuning.thruster.identification import ThrusterFamily
 
 
 def report(
-    found: Identification,
+    identification: Identification,
     checked: Mapping[str, Validation],
     runs: Sequence[Log],
     proving: Sequence[Log],
     files: Sequence[str],
 ) -> list[RenderableType]:
     """Tables and sentences for the terminal."""
-    units = {one.name: one.unit for one in found.objective.coordinates.free}
+    units = {parameter.name: parameter.unit for parameter in identification.objective.coordinates.free}
     rows = []
-    for name in found.names:
-        known = "yes" if found.determined[name] else "at the end" if found.at_end[name] else "no"
-        numbers = found.start[name], found.values[name], found.standard_errors[name]
-        test = found.null_tests.get(name)
+    for name in identification.names:
+        known = "yes" if identification.determined[name] else "at the end" if identification.at_end[name] else "no"
+        numbers = identification.start[name], identification.values[name], identification.standard_errors[name]
+        test = identification.null_tests.get(name)
         without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
         label = index_pairs(name) + (f" [{units[name]}]" if units[name] else "")
         rows.append([label, *(f"{v:.5g}" for v in numbers), known, *without])
     count, steps = len(runs), sum(log.steps for log in runs)
     title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
-    shown = [table(title, ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"], rows)]
+    output = [table(title, ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"], rows)]
     where = (
         f"Validation on {'; '.join(log.name for log in proving)}"
         if proving
@@ -85,20 +85,20 @@ def report(
         rows.append([f"fit of the simulation, {symbol} [%]", *(f"{v.fit[symbol]:.1f}" for v in checked.values())])
     rows.append(["mean NIS over channels", *(f"{v.nis:.3g}" for v in checked.values())])
     rows.append(["log-likelihood", *(f"{v.log_likelihood:.6g}" for v in checked.values())])
-    shown.append(table(where, ["", *checked], rows))
+    output.append(table(where, ["", *checked], rows))
     return [
-        *shown,
-        *found.sentences(),
+        *output,
+        *identification.sentences(),
         *(fall_sentence(checked) if proving else []),
-        *remarks(runs, proving, found),
+        *remarks(runs, proving, identification),
         *(f"wrote {path}" for path in files),
     ]
 
 
 def write_files(
-    found: Identification,
+    identification: Identification,
     family,
-    made: Sequence[Profile],
+    curves: Sequence[Profile],
     out: Path | None,
     plot: Path | None,
     logs: Sequence[str],
@@ -106,18 +106,18 @@ def write_files(
     """Write the preset file of a thruster or the values of a model, and the profiles; return the paths."""
     files = []
     if out is not None:
-        write_found(out, found, family, logs)
+        write_found(out, identification, family, logs)
         files.append(str(out))
-    if plot is not None and made:
-        save_figure(profile_figure(found, made), plot)
+    if plot is not None and curves:
+        save_figure(profile_figure(identification, curves), plot)
         files.append(str(plot))
     return files
 
 
 def as_json(
-    found: Identification,
+    identification: Identification,
     checked: Mapping[str, Validation],
-    made: Sequence[Profile],
+    curves: Sequence[Profile],
     runs: Sequence[Log],
     proving: Sequence[Log],
     files: Sequence[str],
@@ -126,29 +126,29 @@ def as_json(
     return {
         "logs": [log.name for log in runs],
         "held_out": [log.name for log in proving],
-        "values": found.values,
-        "start": found.start,
-        "standard_errors": found.standard_errors,
-        "determined": found.determined,
-        "at_end": found.at_end,
-        "left_out": {name: one._asdict() for name, one in found.null_tests.items()},
-        "begun_elsewhere": [runs[place].name for place in found.begun_elsewhere],
-        "correlations": {"names": found.names, "matrix": found.correlations},
-        "trade_off": found.traded,
-        "least_known_direction": found.least_determined,
-        "log_likelihood": found.log_likelihood,
-        "log_likelihood_at_start": found.start_log_likelihood,
-        "optima": [one._asdict() for one in found.optima],
-        "starts_that_agree": found.agreement,
-        "evaluations": found.evaluations,
-        "samples_left_out": found.left_out,
-        "interrupted": found.interrupted,
-        "validation": {name: one._asdict() for name, one in checked.items()},
-        "profiles": [{**one._asdict(), "interval": one.interval} for one in made],
+        "values": identification.values,
+        "start": identification.start,
+        "standard_errors": identification.standard_errors,
+        "determined": identification.determined,
+        "at_end": identification.at_end,
+        "left_out": {name: test._asdict() for name, test in identification.null_tests.items()},
+        "begun_elsewhere": [runs[i].name for i in identification.begun_elsewhere],
+        "correlations": {"names": identification.names, "matrix": identification.correlations},
+        "trade_off": identification.traded,
+        "least_known_direction": identification.least_determined,
+        "log_likelihood": identification.log_likelihood,
+        "log_likelihood_at_start": identification.start_log_likelihood,
+        "optima": [optimum._asdict() for optimum in identification.optima],
+        "starts_that_agree": identification.agreement,
+        "evaluations": identification.evaluations,
+        "samples_left_out": identification.left_out,
+        "interrupted": identification.interrupted,
+        "validation": {name: validation._asdict() for name, validation in checked.items()},
+        "profiles": [{**profile._asdict(), "interval": profile.interval} for profile in curves],
         "sentences": [
-            *found.sentences(),
+            *identification.sentences(),
             *(fall_sentence(checked) if proving else []),
-            *remarks(runs, proving, found),
+            *remarks(runs, proving, identification),
         ],
         "files": list(files),
     }
@@ -157,20 +157,20 @@ def as_json(
 # Options of an identification from the command line: ranges, starts and names.
 
 
-def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+def ranges_of(texts: Mapping[str, str]) -> dict[str, tuple[float, float]]:
     """Ranges from texts LOW:HIGH; ValueError for another form."""
-    found = {}
-    for name, text in given.items():
+    ranges = {}
+    for name, text in texts.items():
         low, colon, high = text.partition(":")
         if not colon:
             raise ValueError(f"--range must have the form NAME=LOW:HIGH, but got {short_repr(f'{name}={text}')}")
-        found[name] = finite(f"low of {name}", low), finite(f"high of {name}", high)
-    return found
+        ranges[name] = finite(f"low of {name}", low), finite(f"high of {name}", high)
+    return ranges
 
 
-def numbers_of(option: str, given: Mapping[str, str]) -> dict[str, float]:
+def numbers_of(option: str, texts: Mapping[str, str]) -> dict[str, float]:
     """Numbers by name."""
-    return {name: finite(f"{option} {name}", text) for name, text in given.items()}
+    return {name: finite(f"{option} {name}", text) for name, text in texts.items()}
 
 
 def names_of(text: str | None) -> list[str]:
@@ -322,17 +322,17 @@ def command(
     check_targets((out, plot), json, read=(*logs, *(held_out or []), reading.preset))
     announce_compilation()
     search: dict[str, Any] = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts}
-    whole = identified(
+    outcome = identified(
         family, runs, proving, ranges, numbers, progress_console, filter=filter_name, seed=seed, **search
     )
-    found, checked, made = whole.found, whole.validation, []
-    if plot is not None and not found.interrupted:
+    identification, checked, curves = outcome.found, outcome.validation, []
+    if plot is not None and not identification.interrupted:
         with progress_console.status("profiles ...") as status:
-            made = profiles(found, progress=lambda name: status.update(Text(f"profile of {name} ...")))
-    files = write_files(found, family, made, out, plot, [log.name for log in runs])
-    data = as_json(found, checked, made, runs, proving, files)
-    emit(report(found, checked, runs, proving, files), data, json)
-    if found.interrupted:
+            curves = profiles(identification, progress=lambda name: status.update(Text(f"profile of {name} ...")))
+    files = write_files(identification, family, curves, out, plot, [log.name for log in runs])
+    data = as_json(identification, checked, curves, runs, proving, files)
+    emit(report(identification, checked, runs, proving, files), data, json)
+    if identification.interrupted:
         sys.exit(INTERRUPTED)
 
 
@@ -378,26 +378,26 @@ def identify_bollard(
     read = read_table(path)
     supplies = np.unique(read.supply).tolist()
     held_out = supplies[2:-1:2] or supplies[1:2]  # between others, so that nothing is extrapolated
-    found = identify(read, held_out, preset_parameters(preset or INFERRED))
-    errors, parameters, timed = relative_errors(found, read, held_out), found.thruster, None
+    fit = identify(read, held_out, preset_parameters(preset or INFERRED))
+    errors, parameters, timed = relative_errors(fit, read, held_out), fit.thruster, None
     if step is not None:
         announce_compilation()
         timed, parameters = from_step(step, parameters, preset or INFERRED, **options)
     identified = {
         "table": path.name,
         "held_out_supplies": held_out,
-        **{name: float(value) for name, value in found.pulse_widths._asdict().items()},
+        **{name: float(value) for name, value in fit.pulse_widths._asdict().items()},
     }
     write_preset(out, PresetFile(parameters, identified=identified), "A thruster from its bollard table.")
     data = {
         "thruster": parameters._asdict(),
-        "pulse_widths": found.pulse_widths._asdict(),
+        "pulse_widths": fit.pulse_widths._asdict(),
         "held_out_supplies": held_out,
         "errors": errors,
         "step": timed and {"values": timed.values, "standard_errors": timed.standard_errors},
         "files": [str(out)],
     }
-    emit(_report(found, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
+    emit(_report(fit, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
 
 
 def check_of_table(for_logs: Mapping[str, Any]) -> None:
@@ -439,16 +439,16 @@ def from_step(
     def model(**values: float):
         return family.model(**values_of(**values))
 
-    free = [RATE, *(one for one in family.free if one.name not in MOTOR)]
-    found = identify_logs(family.data, model, free)
-    return found, family.parameters(values_of(**found.values))
+    free = [RATE, *(parameter for parameter in family.free if parameter.name not in MOTOR)]
+    identification = identify_logs(family.data, model, free)
+    return identification, family.parameters(values_of(**identification.values))
 
 
 def _report(
-    found: Identified, errors: dict, held_out, timed: Identification | None, out: Path
+    fit: Identified, errors: dict, held_out, timed: Identification | None, out: Path
 ) -> list[RenderableType]:
-    rows = [[name, f"{getattr(found.thruster, name):.5g}"] for name in FITTED]
-    rows += [[name, f"{value:.5g}"] for name, value in found.pulse_widths._asdict().items()]
+    rows = [[name, f"{getattr(fit.thruster, name):.5g}"] for name in FITTED]
+    rows += [[name, f"{value:.5g}"] for name, value in fit.pulse_widths._asdict().items()]
     part: list[RenderableType] = [table("Fitted to the table", ["", "value"], rows)]
     rows = [
         [quantity, *(f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values())]

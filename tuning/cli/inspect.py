@@ -75,8 +75,8 @@ def command(
     ours = analyse(linear_model(plant.parameters, point[:2], voltage, ambient_velocity), dt, spread)
     title = f"Preset {preset} at {voltage:g} V, U_0 = {ambient_velocity:g} m/s, dt = {dt:g} s"
     columns, words, published = {"this thruster": ours}, [], None
-    if (found := published_for(preset)) is not None:
-        name, model = found
+    if (known := published_for(preset)) is not None:
+        name, model = known
         theirs = analyse(LinearModel(*map(np.array, (model.a, model.b, model.c))), dt, spread)
         columns[f"published: {name}"] = theirs
         words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]

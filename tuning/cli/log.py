@@ -69,12 +69,12 @@ def _is_foreign(log: Path) -> bool:
     if log.suffix.lower() not in SUFFIXES or not log.is_file():
         return False
     table, room = read_table(log), logs_package()
-    for one in quantities_of(room.Preset(room.DEFAULT_PRESET, None, ANY_DT).state_space_model()):
+    for quantity in quantities_of(room.Preset(room.DEFAULT_PRESET, None, ANY_DT).state_space_model()):
         try:
-            found = find_columns([one], table.names, {}, {}, table.file)
+            columns = find_columns([quantity], table.names, {}, {}, table.file)
         except ValueError:  # a missing one
             continue
-        if one.key in found:
+        if quantity.key in columns:
             return False
     return True
 
@@ -82,79 +82,81 @@ def _is_foreign(log: Path) -> bool:
 def found_in(log: Path, only: str | None, stamps: str | None = None) -> Contents:
     """What is in a file, fields whose names contain a text in any case; ValueError if there are none."""
     every = contents(log, stamps)
-    some = [one for one in every.fields if only is None or only.casefold() in one.name.casefold()]
-    if not some:
+    matching = [field for field in every.fields if only is None or only.casefold() in field.name.casefold()]
+    if not matching:
         what = "some field of numbers" if only is None else f"a field whose name contains {only!r}"
-        others = f"; not read are {_listed(every.unread)}" if every.unread else ""
-        raise ValueError(f"a log must have {what}, but {log} has none among {len(every.fields)} fields{others}")
+        ignored = f"; not read are {_listed(every.unread)}" if every.unread else ""
+        raise ValueError(f"a log must have {what}, but {log} has none among {len(every.fields)} fields{ignored}")
     unread = {
         name: why for name, why in every.unread.items() if only is None or only.casefold() in name.casefold()
     }
-    return Contents(some, unread, every.damage)
+    return Contents(matching, unread, every.damage)
 
 
-def remarks(some: Contents) -> list[str]:
+def remarks(contents: Contents) -> list[str]:
     """What of a file is damaged or not read, in sentences."""
-    said = [f"{one[:1].upper()}{one[1:]}." for one in some.damage]
-    return [*said, f"Not read: {_listed(some.unread)}."] if some.unread else said
+    sentences = [f"{damage[:1].upper()}{damage[1:]}." for damage in contents.damage]
+    return [*sentences, f"Not read: {_listed(contents.unread)}."] if contents.unread else sentences
 
 
 def _listed(unread: Mapping[str, str]) -> str:
     return listed(f"{name} ({why})" for name, why in unread.items())
 
 
-def as_table(log: Path, some: Sequence[Field], is_terminal: bool) -> RenderableType:
+def as_table(log: Path, fields: Sequence[Field], is_terminal: bool) -> RenderableType:
     """The table of fields: by topics for a terminal, or lines of plain text whose names nothing folds."""
     of_times = ["rate\n[Hz]", "longest\ngap [s]", "begin\n[s]", "end\n[s]"]
     columns = ["field", "samples", *of_times, "unit", "least", "greatest", "course"]
-    rows = _by_topics(some) if is_terminal else [[one.name, *_counts(one), *_values(one)] for one in some]
+    rows = (
+        _by_topics(fields) if is_terminal else [[field.name, *_counts(field), *_values(field)] for field in fields]
+    )
     form = format_of(log)
-    title = f"{log}: {form.kind if form else 'table'}, {len(some)} {'fields' if form else 'columns'}"
+    title = f"{log}: {form.kind if form else 'table'}, {len(fields)} {'fields' if form else 'columns'}"
     caption = "To read it as a log: --column NAME=FIELD for each input and measurement"
-    clocks = dict.fromkeys(CLOCKS[one.clock] for one in some if one.clock)
+    clocks = dict.fromkeys(CLOCKS[field.clock] for field in fields if field.clock)
     caption += f"; times: {' and '.join(clocks)}" if clocks else ""
-    shown = table(title, columns, rows, caption=caption)
-    return shown if is_terminal else plain_text([shown], WIDE)
+    output = table(title, columns, rows, caption=caption)
+    return output if is_terminal else plain_text([output], WIDE)
 
 
-def as_json(log: Path, some: Contents) -> dict:
+def as_json(log: Path, contents: Contents) -> dict:
     """The same as data."""
     form = format_of(log)
     names: tuple[str, ...] = ("name", "topic", "samples", "rate_hz", "longest_gap_s", "begin_s", "end_s", "stamps")
     names += ("unit", "least", "greatest", "course")
-    rows = [dict(zip(names, one, strict=True)) for one in some.fields]
-    found = {"log": str(log), "format": form.kind if form else "table", "fields": rows}
-    return {**found, "not_read": some.unread, "damage": list(some.damage)}
+    rows = [dict(zip(names, field, strict=True)) for field in contents.fields]
+    data = {"log": str(log), "format": form.kind if form else "table", "fields": rows}
+    return {**data, "not_read": contents.unread, "damage": list(contents.damage)}
 
 
-def _by_topics(some: Sequence[Field]) -> list[list[str]]:
+def _by_topics(fields: Sequence[Field]) -> list[list[str]]:
     """Rows of fields under one of their topic, which has what they have in common."""
     rows = []
-    for (topic, *counts), group in groupby(some, lambda one: (one.topic, *_counts(one))):
+    for (topic, *counts), group in groupby(fields, lambda field: (field.topic, *_counts(field))):
         rows += [[topic, *counts, *[""] * 4]] if topic else []
-        for one in group:
-            name, own = (f"  {one.name[len(topic) :]}", [""] * len(counts)) if topic else (one.name, counts)
-            rows.append([name, *own, *_values(one)])
+        for field in group:
+            name, cells = (f"  {field.name[len(topic) :]}", [""] * len(counts)) if topic else (field.name, counts)
+            rows.append([name, *cells, *_values(field)])
     return rows
 
 
-def _counts(one: Field) -> list[str]:
-    ends = [time_text(end, one.gap, 4) if math.isfinite(end) else "" for end in (one.begin, one.end)]
-    return [str(one.samples), _short(one.rate), _short(one.gap), *ends]
+def _counts(field: Field) -> list[str]:
+    ends = [time_text(end, field.gap, 4) if math.isfinite(end) else "" for end in (field.begin, field.end)]
+    return [str(field.samples), _short(field.rate), _short(field.gap), *ends]
 
 
-def _values(one: Field) -> list[str]:
-    return [one.unit, _short(one.least), _short(one.greatest), sparkline(one.course)]
+def _values(field: Field) -> list[str]:
+    return [field.unit, _short(field.least), _short(field.greatest), sparkline(field.course)]
 
 
 def sparkline(course: Sequence[float]) -> str:
     """Numbers as blocks of eight heights, from least to greatest, a space for NaN; nothing if all are equal."""
-    known = [one for one in course if math.isfinite(one)]
+    known = [x for x in course if math.isfinite(x)]
     low, high = min(known, default=0.0), max(known, default=0.0)
     if low == high:
         return ""
-    heights = [7.0 * ((one / 2 - low / 2) / (high / 2 - low / 2)) for one in course]  # halves do not overflow
-    return "".join(BLOCKS[round(one)] if math.isfinite(one) else " " for one in heights)
+    heights = [7.0 * ((x / 2 - low / 2) / (high / 2 - low / 2)) for x in course]  # halves do not overflow
+    return "".join(BLOCKS[round(height)] if math.isfinite(height) else " " for height in heights)
 
 
 def _short(number: float) -> str:
@@ -209,12 +211,12 @@ def command(
     of_log = {key: value for key, value in reading.named().items() if key != "stamps"}
     if is_listed(log, only, any((*of_log.values(), plot, out))):
         check_targets((), json, read=(log,))
-        some = found_in(log, only, reading.stamps)
-        shown, said = as_table(log, some.fields, console.is_terminal), remarks(some)
+        selected = found_in(log, only, reading.stamps)
+        output, notes = as_table(log, selected.fields, console.is_terminal), remarks(selected)
         with printed_whole():
-            emit([shown, *said] if console.is_terminal else [], as_json(log, some), json)
-            if isinstance(shown, str) and json != "-":
-                typer.echo("\n".join([shown, *said]))
+            emit([output, *notes] if console.is_terminal else [], as_json(log, selected), json)
+            if isinstance(output, str) and json != "-":
+                typer.echo("\n".join([output, *notes]))
         return
     if plot is not None:
         check_picture(plot, "--plot")
@@ -228,8 +230,8 @@ def command(
         from thruster_env.logs.write import findings_figure
 
         findings_figure(plot, recorded)
-    files = [str(one) for one in (plot, out) if one is not None]
-    emit([*_report(recorded), *(f"wrote {one}" for one in files)], _as_json(recorded, files), json)
+    files = [str(path) for path in (plot, out) if path is not None]
+    emit([*_report(recorded), *(f"wrote {path}" for path in files)], _as_json(recorded, files), json)
 
 
 def _report(log: Log) -> list[RenderableType]:
@@ -237,16 +239,18 @@ def _report(log: Log) -> list[RenderableType]:
     for channel in log.channels:
         values = log.series(channel).values
         kind, _, symbol = channel.partition(":")
-        some = {"input": log.input_quantities, "measurement": log.measured}.get(kind, [*log.referred.values()])
-        unit = next((one.unit for one in some if one.symbol == symbol), "")
+        quantities = {"input": log.input_quantities, "measurement": log.measured}.get(
+            kind, [*log.referred.values()]
+        )
+        unit = next((quantity.unit for quantity in quantities if quantity.symbol == symbol), "")
         name = f"{kind} {symbol} [{unit}]" if unit else f"{kind} {symbol}"
         ends = [f"{values.min():.5g}", f"{values.max():.5g}", f"{values.std():.5g}"] if len(values) else [""] * 3
         rows.append([name, str(len(values)), *ends])
     on_grid = ", put on a grid" if log.irregular else ""
     title = f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s{on_grid}"
     columns = ["channel", "samples", "smallest", "largest", "standard\ndeviation"]
-    said = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
-    return [table(title, columns, rows), *said]
+    messages = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
+    return [table(title, columns, rows), *messages]
 
 
 def _as_json(log: Log, files: list[str]) -> dict:
@@ -258,6 +262,6 @@ def _as_json(log: Log, files: list[str]) -> dict:
         "irregular": log.irregular,
         "samples": {channel: len(log.series(channel).values) for channel in log.channels},
         "pieces": [list(piece) for piece in log.pieces],
-        "findings": [asdict(one) for one in log.findings],
+        "findings": [asdict(finding) for finding in log.findings],
         "files": files,
     }

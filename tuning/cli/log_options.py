@@ -33,12 +33,14 @@ def with_groups(command: Callable) -> Callable:
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     parameters: list[Parameter] = []
-    for one in signature(command).parameters.values():
-        if one.name not in groups:
-            parameters.append(one.replace(annotation=hints[one.name], kind=Parameter.POSITIONAL_OR_KEYWORD))
+    for parameter in signature(command).parameters.values():
+        if parameter.name not in groups:
+            parameters.append(
+                parameter.replace(annotation=hints[parameter.name], kind=Parameter.POSITIONAL_OR_KEYWORD)
+            )
             continue
-        of_fields = get_type_hints(groups[one.name], include_extras=True)
-        for part in fields(groups[one.name]):
+        of_fields = get_type_hints(groups[parameter.name], include_extras=True)
+        for part in fields(groups[parameter.name]):
             kind, hint = Parameter.POSITIONAL_OR_KEYWORD, of_fields[part.name]
             parameters.append(Parameter(part.name, kind, default=part.default, annotation=hint))
     flat = signature(command).replace(parameters=parameters)
@@ -47,15 +49,16 @@ def with_groups(command: Callable) -> Callable:
     def with_fields(*args, **kwargs):
         bound = flat.bind(*args, **kwargs)
         bound.apply_defaults()
-        given = bound.arguments
-        made = {
-            name: group(**{part.name: given.pop(part.name) for part in fields(group)})
+        arguments = bound.arguments
+        of_groups = {
+            name: group(**{part.name: arguments.pop(part.name) for part in fields(group)})
             for name, group in groups.items()
         }
-        return command(**given, **made)
+        return command(**arguments, **of_groups)
 
     taking: Any = with_fields
-    taking.__signature__, taking.__annotations__ = flat, {one.name: one.annotation for one in parameters}
+    taking.__signature__ = flat
+    taking.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return taking
 
 
@@ -195,17 +198,17 @@ def problems_of(
     from tuning.thruster.logs import of_preset
 
     options = {**reading.named(), **logs.named()}
-    given = {name: value for name, value in options.items() if value is not None}
+    chosen = {name: value for name, value in options.items() if value is not None}
     if logs.log:
         if names:
             raise ValueError(
                 f"a study must be of --log or of --problem, but got both, {logs.log[0]} and {names[0]}"
             )
-        return (log_problem(logs.log, **given),)
-    preset = given.pop("preset", None)
-    if given:
-        first = next(iter(given))
+        return (log_problem(logs.log, **chosen),)
+    preset = chosen.pop("preset", None)
+    if chosen:
+        first = next(iter(chosen))
         option = {"sensors": "sensor", "columns": "column", "grid": "no-grid"}.get(first, first).replace("_", "-")
-        value = "" if first == "grid" else f" {short_repr(given[first])}"
+        value = "" if first == "grid" else f" {short_repr(chosen[first])}"
         raise ValueError(f"--{option} must come with --log, but got --{option}{value} without one")
     return tuple(of_preset(find_problem(name), preset) for name in names or [default])

@@ -34,7 +34,7 @@ def spelt(choices: Iterable[str]) -> Callable:
     known = tuple(choices)
 
     def callback(value):
-        return [any_case(one, known) for one in value] if isinstance(value, list) else any_case(value, known)
+        return [any_case(choice, known) for choice in value] if isinstance(value, list) else any_case(value, known)
 
     return callback
 
@@ -148,13 +148,13 @@ LogModelOption = Annotated[
 ]
 
 
-def asked_monitor(given: str | None, tuned: Path | None) -> Monitor | None:
+def asked_monitor(argument: str | None, tuned: Path | None) -> Monitor | None:
     """The monitor of --monitor: steps between false alarms, or that of the tuned file."""
-    if given != TUNED:
+    if argument != TUNED:
         try:
-            return monitor_of(None if given is None else float(given))
+            return monitor_of(None if argument is None else float(argument))
         except ValueError as error:
-            raise ValueError(f"--monitor must be steps, or {TUNED!r}, but got {given}: {error}") from None
+            raise ValueError(f"--monitor must be steps, or {TUNED!r}, but got {argument}: {error}") from None
     if tuned is None:
         raise ValueError(f"--monitor {TUNED} must come with a tuned file, but got none")
     return tuned_monitor(tuned)

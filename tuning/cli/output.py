@@ -65,10 +65,10 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
         json_target: of `--json`.
         read: paths to be read, None for those not given.
     """
-    named = [one for one in (*targets, None if json_target == "-" else json_target) if one is not None]
-    given = [one for one in read if one is not None]
+    named = [path for path in (*targets, None if json_target == "-" else json_target) if path is not None]
+    inputs = [path for path in read if path is not None]
     for target in named:
-        check_not_read(target, given)
+        check_not_read(target, inputs)
     for target in named:
         check_not_among(target)
         check_target(target)
@@ -79,8 +79,8 @@ def warn_beyond(preset: str, voltage: float) -> None:
     """Say on standard error that a preset is driven by a larger voltage [V] than it is valid for."""
     known = largest_known_voltage(preset)
     if abs(voltage) > known:
-        said = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
-        progress_console.print(f"thruster: warning: {said}")
+        message = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
+        progress_console.print(f"thruster: warning: {message}")
 
 
 @cache

@@ -130,41 +130,41 @@ def command(
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
     if model is not None:  # then it is what is played
-        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
-        _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
-        played, shown, video = _of_policy(model, out, window, seed, picture, json)
+        arguments = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
+        _check_options(what, arguments, tuple(name for name in chosen if name != "MODEL"))
+        played, output, video = _of_policy(model, out, window, seed, picture, json)
     else:
         video = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
         check_drawing(video)
         _check_even(video, picture)
         check_targets((video,), json, read=(log, tuned, preset))
         options = {"filter": filter_name, "tuned": tuned, "size": picture}
-        played, shown = _without_policy(
+        played, output = _without_policy(
             what, chosen[what], video, seed or 0, preset, steps, sensor, column, options
         )
     data = {**played._asdict(), "video": None if video is None else str(video)}
     if video is not None:
-        shown.append(f"Video: {video}")
-    emit(shown, data, json)
+        output.append(f"Video: {video}")
+    emit(output, data, json)
 
 
 def one_given(chosen: dict) -> str:
     """The only name with a value; ValueError unless there is exactly one."""
-    given = [name for name, value in chosen.items() if value is not None]
-    if len(given) != 1:
+    names = [name for name, value in chosen.items() if value is not None]
+    if len(names) != 1:
         rule = f"play must be given one of {', '.join(chosen)}"
-        raise ValueError(f"{rule}, but got {' and '.join(given) or 'none'}")
-    return given[0]
+        raise ValueError(f"{rule}, but got {' and '.join(names) or 'none'}")
+    return names[0]
 
 
 def size_of(text: str) -> tuple[int, int]:
     """A picture's (width, height) [px] from a text such as 640x400; ValueError for any other."""
-    found = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower(), re.ASCII)
-    if found is None:
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower(), re.ASCII)
+    if match is None:
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, as 640x400, but got {short_repr(text)}")
     width, height = (
         at_least(f"the {side} of --size", int(value), SMALLEST, LARGEST)
-        for side, value in zip(("width", "height"), found.groups(), strict=True)
+        for side, value in zip(("width", "height"), match.groups(), strict=True)
     )
     return width, height
 
@@ -177,9 +177,9 @@ def _check_even(video: Path | None, size: tuple[int, int] | None) -> None:
                 raise ValueError(f"the {side} of --size must be even for an .mp4, but got {value}")
 
 
-def _check_options(what: str, given: dict, fitting: tuple[str, ...]) -> None:
+def _check_options(what: str, options: dict, fitting: tuple[str, ...]) -> None:
     """Raise ValueError for an option that does not apply to what is played."""
-    for name, value in given.items():
+    for name, value in options.items():
         if value is not None and what not in fitting:
             raise ValueError(f"{name} must come with {' or '.join(fitting)}, but got it with {what}")
 
@@ -210,26 +210,28 @@ def _of_policy(
     check_targets((video,), json)
     announce_compilation()
     played = _drawn(lambda on_step: play(folder, video, seed, on_step, size))
-    said = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
-    return played, [said], video
+    sentence = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
+    return played, [sentence], video
 
 
-def _without_policy(what, given, video, seed, preset, steps, sensor, column, options) -> tuple[Played, list[str]]:
+def _without_policy(
+    what, argument, video, seed, preset, steps, sensor, column, options
+) -> tuple[Played, list[str]]:
     from tuning.logs.read import read_named
 
     announce_compilation()
     if what == "--log":
-        log, offer = read_named(given, preset, None, sensor, column)
+        log, offer = read_named(argument, preset, None, sensor, column)
         played = _drawn(lambda on_step: play_log(video, log, offer, on_step, seed=seed, **options))
         return played, [f"{log.name}: {played.steps} steps, {played.seconds:.1f} s."]
     options |= {"preset": preset or "tunnel", "steps": STEPS if steps is None else steps}
     if what == "--policy":
-        one_of("policy", given, POLICIES)
+        one_of("policy", argument, POLICIES)
         played = _drawn(lambda on_step: play_pi(video, seed, on_step, **options))
-        said = f"return {played.total_reward:.3f} in "
+        reward = f"return {played.total_reward:.3f} in "
     else:
-        played, said = _drawn(lambda on_step: play_voltages(video, seed, on_step, given, **options)), ""
-    return played, [f"Episode {seed}: {said}{played.steps} steps, {played.seconds:.1f} s."]
+        played, reward = _drawn(lambda on_step: play_voltages(video, seed, on_step, argument, **options)), ""
+    return played, [f"Episode {seed}: {reward}{played.steps} steps, {played.seconds:.1f} s."]
 
 
 def _drawn(play) -> Played:
@@ -270,19 +272,19 @@ def play_pi(video: Path | None, seed: int, on_step: OnStep, **arguments) -> Play
 
 
 def play_voltages(
-    video: Path | None, seed: int, on_step: OnStep, given: float | str, steps: int, **arguments
+    video: Path | None, seed: int, on_step: OnStep, voltage: float | str, steps: int, **arguments
 ) -> Played:
     """A thruster under a constant voltage [V], or a sequence by the name of an excitation."""
-    if not isinstance(given, str):
-        warn_beyond(arguments.get("preset", "tunnel"), given)
+    if not isinstance(voltage, str):
+        warn_beyond(arguments.get("preset", "tunnel"), voltage)
     with estimated_env(video, steps=steps, **arguments) as env:
         thruster: Any = env.unwrapped
         plant = thruster.plant
-        if isinstance(given, str):
-            excitation = excitation_of({"name": one_of("excitation", given, SEQUENCES)})
+        if isinstance(voltage, str):
+            excitation = excitation_of({"name": one_of("excitation", voltage, SEQUENCES)})
             voltages = voltages_of(excitation, plant, episode_keys([seed]), steps)[0]
         else:
-            voltages = np.full(steps, within("voltage", given, plant.max_voltage))
+            voltages = np.full(steps, within("voltage", voltage, plant.max_voltage))
         moment = thruster.moment_of  # there is a reference, but nobody follows it
         thruster.moment_of = lambda report: moment(report)._replace(reference=None)
         return _played(env, lambda observation, step: voltages[[step]], video, seed, on_step)
@@ -311,8 +313,8 @@ def estimated_env(
     mode = "human" if video is None else "rgb_array"
     env = gym.make(ENV, preset=preset, render_mode=mode, render_size=size, max_episode_steps=steps)
     try:
-        given = {"filter": filter} if tuned is None else {"tuned": str(tuned)}
-        yield EstimateState(env, observation="measurement+estimate", **given)
+        source = {"filter": filter} if tuned is None else {"tuned": str(tuned)}
+        yield EstimateState(env, observation="measurement+estimate", **source)
     finally:
         env.close()
 
@@ -357,7 +359,7 @@ def play_log(
         size: of pictures, (width, height) [px]; None for the env's own.
         seed: of the filter's random numbers.
     """
-    found = estimate_log(log, filter, offer, tuned=tuned, seed=seed)
+    estimates = estimate_log(log, filter, offer, tuned=tuned, seed=seed)
     every = steps_a_frame(video, log.dt)
     largest = float(np.abs(log.inputs).max())
     plant = offer.plant._replace(max_voltage=max(offer.plant.max_voltage, largest), dt=log.dt)
@@ -365,7 +367,7 @@ def play_log(
     renderer = renderer_of(plant, mode, max(1, round(1 / log.dt)), size)
     frames: list[np.ndarray] = []
     try:
-        for row, (moment, overlay) in enumerate(zip(moments(log), overlays(found), strict=True)):
+        for row, (moment, overlay) in enumerate(zip(moments(log), overlays(estimates), strict=True)):
             renderer.add(moment, overlay)
             if video is None or row % every == 0:
                 frame = renderer.draw()
@@ -382,7 +384,7 @@ def play_log(
 def moments(log: Log) -> Iterator[Moment]:
     """The recorded values, row by row; NaN where there are none."""
     columns: Mapping[str, np.ndarray] = {
-        **{one.symbol: log.measurements[:, i] for i, one in enumerate(log.measured)},
+        **{quantity.symbol: log.measurements[:, i] for i, quantity in enumerate(log.measured)},
         **{channel.rpartition(":")[2]: values for channel, values in log.references.items()},
     }
     nowhere = np.full(log.steps + 1, np.nan)
@@ -393,9 +395,9 @@ def moments(log: Log) -> Iterator[Moment]:
         yield Moment(k * log.dt, omega[k], flow[k], thrust[k], measured[k], None, voltages[k])
 
 
-def overlays(found: LogEstimate) -> Iterator[Overlay]:
+def overlays(estimates: LogEstimate) -> Iterator[Overlay]:
     """The filter's estimates, row by row."""
-    thrusts, stds = found.output("T")
-    for mean, std, thrust, thrust_std in zip(found.means, found.stds, thrusts, stds, strict=True):
+    thrusts, stds = estimates.output("T")
+    for mean, std, thrust, thrust_std in zip(estimates.means, estimates.stds, thrusts, stds, strict=True):
         pairs = [number for pair in zip(mean[:2], std[:2], strict=True) for number in pair]
-        yield Overlay(found.filter.name, thrust, thrust_std, *pairs)
+        yield Overlay(estimates.filter.name, thrust, thrust_std, *pairs)

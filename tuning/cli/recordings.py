@@ -83,8 +83,11 @@ def command(
         "structures": "the contribution of each effect",
         "numbers": "numbers found",
     }
-    made = tables_of(runs, estimates, tasks)
-    shown = [table(titles[name], *one) for name, one in made.items()]
-    named = {name: [dict(zip(one.header, row, strict=True)) for row in one.rows] for name, one in made.items()}
-    said = sentences(estimates, runs)
-    emit([*shown, *said], {**named, "answers": said}, json)
+    tables = tables_of(runs, estimates, tasks)
+    output = [table(titles[name], *content) for name, content in tables.items()]
+    named = {
+        name: [dict(zip(content.header, row, strict=True)) for row in content.rows]
+        for name, content in tables.items()
+    }
+    answers = sentences(estimates, runs)
+    emit([*output, *answers], {**named, "answers": answers}, json)

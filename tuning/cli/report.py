@@ -54,12 +54,14 @@ def command(
     """
     quiet_optuna()
     announce_compilation()
-    of_files = [one for source in sources if is_file(source) for one in problems_in(Path(source), model, preset)]
-    given = [*map(find_problem, problem or []), *of_files]
+    of_files = [
+        stored for source in sources if is_file(source) for stored in problems_in(Path(source), model, preset)
+    ]
+    problems = [*map(find_problem, problem or []), *of_files]
     with working(f"reporting on {' and '.join(sources)}"):
         if len(sources) == 1:
-            report = write_report(sources[0], storage, out, given)
+            report = write_report(sources[0], storage, out, problems)
         else:
-            report = write_two_studies([Source(one, storage, given) for one in sources], out)
+            report = write_two_studies([Source(source, storage, problems) for source in sources], out)
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

@@ -125,21 +125,21 @@ def command(
     names = tuple(STUDIES) if study == ALL else (study,)
     runs = at_least("runs", RUNS if runs is None else runs, 2, MOST_RUNS)
     members = at_least("members", MEMBERS if members is None else members, 2, LARGEST_ENSEMBLE)
-    shown, data = reproduce(names, runs, members, seed)
+    output, data = reproduce(names, runs, members, seed)
     if series is not None:
         drawn = all_series(members=members, seed=seed)
-        shown += ["", f"Picture: {series_figure(series, drawn, members)}"]
-        data |= {"series": [one._asdict() for one in drawn], "picture": str(series)}
-    emit(shown, data, json)
+        output += ["", f"Picture: {series_figure(series, drawn, members)}"]
+        data |= {"series": [run._asdict() for run in drawn], "picture": str(series)}
+    emit(output, data, json)
 
 
 def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, seed: int = 0):
     """Run the published experiments of some studies; return what to show, as a list and as plain data."""
     comparisons = _compare(runs, members, seed)
     blank = Text()
-    shown, general = [], general_statements(comparisons)
+    output, general = [], general_statements(comparisons)
     for case in dict.fromkeys(c.case for c in comparisons):
-        shown += [_own_table(case, [c for c in comparisons if c.case == case], runs, members), blank]
+        output += [_own_table(case, [c for c in comparisons if c.case == case], runs, members), blank]
     studies: dict[str, Any] = {}
     data = {
         "settings": {"runs": runs, "members": members, "seed": seed},
@@ -149,17 +149,17 @@ def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, 
         "statements": general,
     }
     for name in names:
-        found = findings(STUDIES[name], comparisons)
-        for case in dict.fromkeys(f.case for f in found):
-            shown += [_published_table(name, case, [f for f in found if f.case == case]), blank]
-        statements = study_statements(STUDIES[name], found)
-        shown += [Text(f"{name}: {STUDIES[name].source}"), list_of(statements), blank]
+        results = findings(STUDIES[name], comparisons)
+        for case in dict.fromkeys(f.case for f in results):
+            output += [_published_table(name, case, [f for f in results if f.case == case]), blank]
+        statements = study_statements(STUDIES[name], results)
+        output += [Text(f"{name}: {STUDIES[name].source}"), list_of(statements), blank]
         studies[name] = {
             "source": STUDIES[name].source,
-            "rows": [_plain_finding(f) for f in found],
+            "rows": [_plain_finding(f) for f in results],
             "statements": statements,
         }
-    return [*shown, Text("Conclusions from the runs"), list_of(general)], data
+    return [*output, Text("Conclusions from the runs"), list_of(general)], data
 
 
 def _compare(runs: int, members: int, seed: int):
@@ -187,9 +187,9 @@ def _own_table(case: str, comparisons: list, runs: int, members: int):
     return fitted(table(title, columns, rows, caption=caption), rows)
 
 
-def _published_table(name: str, case: str, found: list):
+def _published_table(name: str, case: str, findings: list):
     rows = []
-    for f in found:
+    for f in findings:
         free = f.from_unupdated is not None
         rows.append(
             [

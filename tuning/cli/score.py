@@ -112,11 +112,11 @@ def command(
 def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | None) -> None:
     """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
     for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
-        found = sorted({getattr(setup, name) for setup in setups})
-        if len(found) > 1:
+        values = sorted({getattr(setup, name) for setup in setups})
+        if len(values) > 1:
             way_out = ": give one with --scenario" if name == "scenario" else ""
             raise ValueError(
-                f"models to compare must have one {name.replace('_', ' ')}, but got {', '.join(found)}{way_out}"
+                f"models to compare must have one {name.replace('_', ' ')}, but got {', '.join(values)}{way_out}"
             )
 
 
@@ -146,11 +146,11 @@ def _classical(
 
 def _each_arm(setups) -> list[TrainingConfiguration]:
     """One setup for each way to observe, filter arguments included."""
-    found: list[TrainingConfiguration] = []
+    arms: list[TrainingConfiguration] = []
     for setup in setups:
-        if all((setup.observe, setup.filter_arguments) != (one.observe, one.filter_arguments) for one in found):
-            found.append(setup)
-    return found
+        if all((setup.observe, setup.filter_arguments) != (arm.observe, arm.filter_arguments) for arm in arms):
+            arms.append(setup)
+    return arms
 
 
 def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
@@ -168,9 +168,9 @@ def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
         f"±: half of the 95 % interval. The other columns are root mean square errors: {kind.errors}; blank: "
         "no such step."
     )
-    shown: list[RenderableType] = [table(title, columns, rows, caption=caption)]
-    learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
-    return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]
+    output: list[RenderableType] = [table(title, columns, rows, caption=caption)]
+    learnt = [(number, policy) for number, policy in enumerate(scored, start=1) if policy.folder is not None]
+    return output + [f"{number} {policy.label}: {policy.folder}" for number, policy in learnt]
 
 
 def as_json(scored: Sequence[Scored], seeds: range) -> dict:

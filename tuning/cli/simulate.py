@@ -79,7 +79,7 @@ def command(
     check_targets((out,), json)
     steps = at_least("steps", steps, 1, MOST_STEPS)
     sensors = sensor or ["thrust"]
-    variances = {**{name: one.variance for name, one in CHANNELS.items()}, "thrust": measurement_noise}
+    variances = {**{name: channel.variance for name, channel in CHANNELS.items()}, "thrust": measurement_noise}
     plant = make_plant(
         preset,
         dt,

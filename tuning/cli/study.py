@@ -101,8 +101,8 @@ def policies(
     from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
-    given: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
-    comparison = comparison._replace(**{name: value for name, value in given.items() if value is not None})
+    changes: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
+    comparison = comparison._replace(**{name: value for name, value in changes.items() if value is not None})
     target = page or out / PAGE
     check_page(target)
     announce_compilation()
@@ -127,14 +127,14 @@ def policies(
         raise
     written = write_report(results, comparison, target, rough=quick)
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
-    said, files = answers(results), [str(path) for path in written]
+    conclusions, files = answers(results), [str(path) for path in written]
     summary = summary_rows(results)
     tables = [table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
     data = {
         "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
         "summary": summary,
-        "answers": said,
+        "answers": conclusions,
         "files": files,
     }
     tables.append(table("in short, with 95 % intervals", ["", *comparison.noises], summary))
-    emit([*tables, *said, *[f"wrote {path}" for path in files]], data, json)
+    emit([*tables, *conclusions, *[f"wrote {path}" for path in files]], data, json)

@@ -72,23 +72,25 @@ def kinds_table(kinds: Sequence[TypeResult], plan: Plan) -> Table:
 MOST_FACTORS = 4  # of a start, that fit into a caption
 
 
-def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
+def gradient_table(result: GradientResult, seed_word: str = "seeds") -> Table:
     """Where each start led, and how well the data determine the optimum."""
-    likeliest = found.objective == LIKELIHOOD
-    starts = "; ".join(", ".join(f"{factor:g}" for factor in one) for one in found.starts)
-    caption = f"starts: factors {starts} on the untuned values" if len(found.free) <= MOST_FACTORS else None
+    likeliest = result.objective == LIKELIHOOD
+    starts = "; ".join(", ".join(f"{factor:g}" for factor in factors) for factors in result.starts)
+    caption = f"starts: factors {starts} on the untuned values" if len(result.free) <= MOST_FACTORS else None
     rows = []
-    for i, (one, error) in enumerate(zip(found.free, found.standard_errors.tolist(), strict=True)):
+    for i, (parameter, error) in enumerate(zip(result.free, result.standard_errors.tolist(), strict=True)):
         of_factor = f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}"
-        values = [f"{optimum.parameters[i]:.4g}" for optimum in found.optima]
-        name = index_pairs(one.name) + (f" [{one.unit}]" if one.unit else "")
-        rows.append([name, *values, of_factor if one.log else f"± {error:.2g}"])
-    levels = [one.level if likeliest else reported(found.objective, one.level) for one in found.optima]
+        values = [f"{optimum.parameters[i]:.4g}" for optimum in result.optima]
+        name = index_pairs(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+        rows.append([name, *values, of_factor if parameter.log else f"± {error:.2g}"])
+    levels = [
+        optimum.level if likeliest else reported(result.objective, optimum.level) for optimum in result.optima
+    ]
     rows.append(
-        [reported_name(found.objective), *(f"{one:{'.2f' if likeliest else '.6g'}}" for one in levels), ""]
+        [reported_name(result.objective), *(f"{level:{'.2f' if likeliest else '.6g'}}" for level in levels), ""]
     )
-    rows.append(["evaluations", *(str(one.evaluations) for one in found.optima), ""])
-    what = f"{'Maximum' if found.objective in PROPER else 'Minimum'} of {reported_name(found.objective)}"
+    rows.append(["evaluations", *(str(optimum.evaluations) for optimum in result.optima), ""])
+    what = f"{'Maximum' if result.objective in PROPER else 'Minimum'} of {reported_name(result.objective)}"
     what = "Maximum of the innovations' likelihood" if likeliest else what
-    titles = [f"start {i + 1}" for i in range(len(found.starts))]
+    titles = [f"start {i + 1}" for i in range(len(result.starts))]
     return table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)

@@ -201,17 +201,17 @@ def report(setup: TrainingConfiguration, trained: Trained) -> list[RenderableTyp
     speed = (
         f"{trained.learnt / trained.seconds:.0f} steps/s" if trained.learnt else "training was already complete"
     )
-    shown: list[RenderableType] = []
+    output: list[RenderableType] = []
     if rows:
         caption = f"0 is perfect; actions of zero have {trained.idle:.3f} on the same episodes."
-        shown += [title, table("", ["steps", "mean return"], rows, caption=caption)]
+        output += [title, table("", ["steps", "mean return"], rows, caption=caption)]
         if curve[-1][1] <= trained.idle:
-            shown.append("At the end the policy is no better than actions of zero: it needs more --steps.")
-    shown.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
-    shown.append(f"Policy: {trained.folder}")
+            output.append("At the end the policy is no better than actions of zero: it needs more --steps.")
+    output.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
+    output.append(f"Policy: {trained.folder}")
     if trained.interrupted:
-        return [*shown, "Interrupted: a checkpoint is saved, and the same command continues from it."]
-    return [*shown, f"Watch it: thruster play {trained.folder}", f"Score it: thruster score {trained.folder}"]
+        return [*output, "Interrupted: a checkpoint is saved, and the same command continues from it."]
+    return [*output, f"Watch it: thruster play {trained.folder}", f"Score it: thruster score {trained.folder}"]
 
 
 def as_json(setup: TrainingConfiguration, trained: Trained) -> dict:

@@ -92,7 +92,7 @@ def command(
     if report is not None and report.suffix != PAGE:
         raise ValueError(f"--report must end in {PAGE}, but got {report}")
     check_targets([report, out], json, [start, *(against or [])])
-    given = {"width": width, "ensemble_size": ensemble_size}
+    options = {"width": width, "ensemble_size": ensemble_size}
     announce_compilation()
     training = train_estimator(
         kind,
@@ -102,7 +102,7 @@ def command(
         batch=batch,
         window=window,
         rate=rate,
-        options={name: value for name, value in given.items() if value is not None},
+        options={name: value for name, value in options.items() if value is not None},
         start=start,
         against=against or (),
         seeds=seeds,
@@ -111,15 +111,15 @@ def command(
         preset=preset,
     )
     seconds = f"{training.seconds:.0f} s for {training.checks[-1].step} updates."
-    told: list[RenderableType] = [
+    output: list[RenderableType] = [
         training.table(),
         *training.sentences(),
         seconds,
         f"Trained estimator: {training.file}",
     ]
-    told.append(f"Use it: thruster compare {training.file} --filter ekf --problem {training.problem.name}")
+    output.append(f"Use it: thruster compare {training.file} --filter ekf --problem {training.problem.name}")
     if report is not None:
-        told.append(f"Page: {training.report(report)}")
-    emit(told, training.as_data(), json)
+        output.append(f"Page: {training.report(report)}")
+    emit(output, training.as_data(), json)
     if training.interrupted:
         sys.exit(130)

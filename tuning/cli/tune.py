@@ -79,50 +79,50 @@ MOST_VALUES = 8  # of a baseline, in a sentence
 def report(tuning: Tuning) -> list[RenderableType]:
     """The gain of a tuning, the path of its filter and the next command; then tables and sentences."""
     result, plan = tuning.result, tuning.plan
-    shown: list[RenderableType] = [*tuning.chosen]
+    output: list[RenderableType] = [*tuning.chosen]
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
-        said, doubts = gains(comparison, scenario.seed_word), model_doubts(scenario, comparison, plan.seed)
-        headline = 1 if comparison.tuned.has_truth else len(said)
-        shown += [f"{where}{said[0]}", *said[1:headline], *doubts, *said[headline:]]
+        gained, doubts = gains(comparison, scenario.seed_word), model_doubts(scenario, comparison, plan.seed)
+        headline = 1 if comparison.tuned.has_truth else len(gained)
+        output += [f"{where}{gained[0]}", *gained[1:headline], *doubts, *gained[headline:]]
     if result.consistent is False:
-        shown.append(_none_consistent(result, plan))
-    shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
-    shown += [one for scenario in plan.scenarios for one in scenario.remarks]
+        output.append(_none_consistent(result, plan))
+    output += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
+    output += [remark for scenario in plan.scenarios for remark in scenario.remarks]
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         choice, size = result.choice, baseline_size(result.choice)
-        found = {TUNED: choice, **baselines(choice.name, scenario, plan.seed, comparison.default, size)}
+        known = {TUNED: choice, **baselines(choice.name, scenario, plan.seed, comparison.default, size)}
         evaluations = comparison.evaluations
-        choices = {name: found[name] for name in evaluations}
+        choices = {name: known[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
-        shown += [
+        output += [
             choice_table(choices, scenario),
             comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
         ]
-        shown += [consistency_sentence(comparison), memory_sentence(comparison.tuned, scenario)]
-        shown += residual_sentences(scenario, plan.seed)
-    shown += at_ends(result.choice, plan)
-    shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
-    shown += _search_sentences(tuning)
+        output += [consistency_sentence(comparison), memory_sentence(comparison.tuned, scenario)]
+        output += residual_sentences(scenario, plan.seed)
+    output += at_ends(result.choice, plan)
+    output += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
+    output += _search_sentences(tuning)
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
     trained += f"; {over} stopped at the budget" if over else ""
-    return [*shown, f"Study {tuning.study!r}: {trained}."]
+    return [*output, f"Study {tuning.study!r}: {trained}."]
 
 
 def blown_up(tuning: Tuning) -> list[str]:
     """Advice on a model that diverges between samples, where no Q and R help; empty if it does not."""
-    found = []
+    advice = []
     for scenario, comparison in zip(tuning.plan.scenarios, tuning.comparisons, strict=True):
         data = scenario.data(comparison.seeds)
-        found.append(blow_up_on(tuning.result.choice.filter(scenario), data, scenario.dt))
-    return [one for one in dict.fromkeys(found) if one]
+        advice.append(blow_up_on(tuning.result.choice.filter(scenario), data, scenario.dt))
+    return [sentence for sentence in dict.fromkeys(advice) if sentence]
 
 
 def way_out(tuning: Tuning) -> list[str]:
     """Advice if the tuned filter is significantly worse than a baseline but the oracle; empty otherwise."""
-    better = [name for one in tuning.comparisons if (name := _best_instead(one))]
+    better = [name for comparison in tuning.comparisons if (name := _best_instead(comparison))]
     if not better:
         return []
     if tuning.plan.forget is not None:
@@ -147,18 +147,20 @@ def way_out(tuning: Tuning) -> list[str]:
 def _best_instead(comparison: Comparison) -> str:
     """The best baseline but the oracle that is significantly better than the tuned filter; empty without one."""
     if comparison.tuned.has_truth:
-        found = {name: one.value for name, one in comparison.ratios.items() if one.low > 1 and not slightly(one)}
+        margins = {
+            name: ratio.value for name, ratio in comparison.ratios.items() if ratio.low > 1 and not slightly(ratio)
+        }
     else:
-        found = {name: -one.value for name, one in comparison.likelihood_gains.items() if one.high < 0}
-    found.pop(ORACLE, None)
-    return max(found, key=lambda name: found[name], default="")
+        margins = {name: -gain.value for name, gain in comparison.likelihood_gains.items() if gain.high < 0}
+    margins.pop(ORACLE, None)
+    return max(margins, key=lambda name: margins[name], default="")
 
 
 def _noise_words(tuning: Tuning, name: str) -> str:
     """The values of a baseline, after its name; of many where they are."""
     choice, plan = tuning.result.choice, tuning.plan
-    found = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
-    values = parameters_of(found[name]) if name in found else {}
+    choices = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
+    values = parameters_of(choices[name]) if name in choices else {}
     if not 0 < len(values) <= MOST_VALUES:
         return ", whose Q and R are in the table"
     return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
@@ -166,56 +168,60 @@ def _noise_words(tuning: Tuning, name: str) -> str:
 
 def next_steps(tuning: Tuning) -> list[str]:
     """The path of the tuned filter, and the next command; for an interrupted study how to continue it."""
-    shown = [f"Tuned filter: {tuning.file}"]
+    output = [f"Tuned filter: {tuning.file}"]
     problems = tuning.plan.scenarios
     plain = [*map(within, problems)]
-    given = [f"--problem {one.name}" for one in plain if is_code(one.name) and one.name not in built_in()]
-    given += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, plain)) if name is not None]
-    shown.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *given]))
+    options = [
+        f"--problem {problem.name}"
+        for problem in plain
+        if is_code(problem.name) and problem.name not in built_in()
+    ]
+    options += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, plain)) if name is not None]
+    output.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *options]))
     if tuning.result.interrupted:
-        shown.append("Interrupted: this is the result of the finished trials; the same command continues.")
-    return shown
+        output.append("Interrupted: this is the result of the finished trials; the same command continues.")
+    return output
 
 
 def _search_sentences(tuning: Tuning) -> list[RenderableType]:
     """Results of the search: sizes, the price of consistency, optimism, a front, a maximum."""
     result, plan, word = tuning.result, tuning.plan, tuning.scenario.seed_word
     if tuning.gradient is not None and tuning.rival is not None:  # which come together
-        said = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
-        return [gradient_table(tuning.gradient, word), *said]
-    shown: list[RenderableType] = []
+        text = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
+        return [gradient_table(tuning.gradient, word), *text]
+    output: list[RenderableType] = []
     kinds = filter_types_tried(result.trials)
     if kinds:
-        shown.append(kinds_table(kinds, plan))
+        output.append(kinds_table(kinds, plan))
     if plan.budget is not None:
-        shown.append(
+        output.append(
             f"A step of the tuned {result.choice.name} takes {result.microseconds:.3g} microseconds of one core; "
             f"the budget is {plan.budget:g}."
         )
     if result.sizes:
-        kept, ladder = result.choice.numbers["ensemble_size"], size_ladder(result.choice.name)
+        size, ladder = result.choice.numbers["ensemble_size"], size_ladder(result.choice.name)
         ratios = ", ".join(
             f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
         )
-        shown.append(
+        output.append(
             f"Score relative to the best, by ensemble size{_sized_trial(result)}, on separate {word}, with the "
             f"upper end of its 95 % interval: {ratios}. "
-            f"{_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
+            f"{_size_sentence(size, result)}{_seeds_sentence(result, word)}"
         )
     met = result.validation
     in_band = met is None or (not met.gave_way and met.named(met.chosen).consistent)
     if result.consistent is not False and result.free_value is not None and in_band:
-        shown.append(_band_sentence(plan.objectives[0], result.free_value, result.best_value, word))
+        output.append(_band_sentence(plan.objectives[0], result.free_value, result.best_value, word))
     if plan.objectives == ("score",):  # which needs truth
-        found = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
-        trained, proved = apart(result.best_value, found)
-        shown.append(
+        score = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
+        trained, proved = apart(result.best_value, score)
+        output.append(
             f"Optimism: the score of the tuned filter is {trained} on the training {word}, which chose it, and "
             f"{proved} on the held-out {word}."
         )
     if result.front:
-        shown.append(front_table(plan, result.front))
-    return shown
+        output.append(front_table(plan, result.front))
+    return output
 
 
 def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
@@ -235,14 +241,14 @@ def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
     word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
-    found = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
+    means = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
     low, high = (channels * end for end in NIS_BAND)
     end = "largest" if plan.objectives[0] in PROPER else "smallest"
     best = f"the trial with the {end} {reported_name(plan.objectives[0])}"
     which = "the baseline above" if gave_way(result) else best
     return (
         f"No trial was consistent: a mean NIS must lie between {low:g} and {high:g}, where {channels} is right, "
-        f"but the tuned filter's is {' and '.join(found)} on the training {word}. It is {which}; do not rely on "
+        f"but the tuned filter's is {' and '.join(means)} on the training {word}. It is {which}; do not rely on "
         "its covariance."
     )
 
@@ -333,23 +339,23 @@ def as_json(tuning: Tuning) -> dict:
     if tuning.known is not None:
         data["innovations_alone"] = as_data(tuning.known)
     if tuning.gradient is not None and tuning.rival is not None:
-        found = tuning.gradient
+        gradient = tuning.gradient
         data["gradient"] = {
-            "log_likelihood" if found.objective == LIKELIHOOD else found.objective: found.best.level,
-            "standard_errors_of_logarithms": _errors(found, log=True),
-            "standard_errors": _errors(found, log=False),
-            "identified": dict(zip(found.names, found.identified.tolist(), strict=True)),
-            "agree": found.agree,
-            "seconds": found.seconds,
+            "log_likelihood" if gradient.objective == LIKELIHOOD else gradient.objective: gradient.best.level,
+            "standard_errors_of_logarithms": _errors(gradient, log=True),
+            "standard_errors": _errors(gradient, log=False),
+            "identified": dict(zip(gradient.names, gradient.identified.tolist(), strict=True)),
+            "agree": gradient.agree,
+            "seconds": gradient.seconds,
             "score_over_optuna": score_ratio(tuning.comparison.tuned, tuning.rival.tuned),
         }
     return data
 
 
-def _errors(found: GradientResult, log: bool) -> dict[str, float]:
+def _errors(gradient: GradientResult, log: bool) -> dict[str, float]:
     """Standard errors of the parameters on logarithmic scales, or of the others, by name."""
-    pairs = zip(found.free, found.standard_errors.tolist(), strict=True)
-    return {one.name: error for one, error in pairs if one.log == log}
+    pairs = zip(gradient.free, gradient.standard_errors.tolist(), strict=True)
+    return {parameter.name: error for parameter, error in pairs if parameter.log == log}
 
 
 def ratios_as_json(comparison: Comparison) -> dict:
@@ -359,19 +365,19 @@ def ratios_as_json(comparison: Comparison) -> dict:
     return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
 
 
-def _size_sentence(kept: int, result: StudyResult) -> str:
-    ends, without = {row.size: row.ratio.high for row in result.sizes}, left_out(result.sizes, kept)
+def _size_sentence(chosen: int, result: StudyResult) -> str:
+    ends, without = {row.size: row.ratio.high for row in result.sizes}, left_out(result.sizes, chosen)
     among = ""
     if without:
         among = f", where N = {', '.join(map(str, without))} is left out: the mean NIS is outside its band"
     if gave_way(result):
         return (
-            f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}, but at least that of "
+            f"N = {chosen} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}, but at least that of "
             f"the rule of thumb{among}."
         )
-    if ends[kept] < 1 + SIZE_TOLERANCE:
-        return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
-    return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
+    if ends[chosen] < 1 + SIZE_TOLERANCE:
+        return f"N = {chosen} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
+    return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {chosen} is a compromise."
 
 
 def _sized_trial(result: StudyResult) -> str:
@@ -385,9 +391,9 @@ def _seeds_sentence(result: StudyResult, word: str) -> str:
     counts = {row.seeds for row in result.sizes}
     if len(counts) < 2:
         return ""
-    whole = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
+    sizes = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
     return (
-        f" The others were excluded on the first {min(counts)} {word} before N = {whole} were run on "
+        f" The others were excluded on the first {min(counts)} {word} before N = {sizes} were run on "
         f"{max(counts)}."
     )
 
@@ -567,7 +573,7 @@ def command(
     aim = aim_of(method, objective)
     check_keepable(filter_name)
     unknown = unknowns_of(augment or ())
-    scenarios = tuple(augmented(one, unknown) for one in problems_of(scenario, logs, reading, "mismatch"))
+    scenarios = tuple(augmented(problem, unknown) for problem in problems_of(scenario, logs, reading, "mismatch"))
     check_targets(
         (out,), json, read=(*(logs.log or []), *(logs.held_out or []), *(scenario or []), reading.preset)
     )

@@ -68,9 +68,9 @@ def command(
     from tuning.experiments.users.runs import QUICK, Panel, run_panel
     from tuning.experiments.users.tables import csv_text, header, markdown, rows_of, sentences
 
-    given: dict[str, Any] = {"problems": problem, "filters": filters, "trials": trials, "seed": seed}
+    arguments: dict[str, Any] = {"problems": problem, "filters": filters, "trials": trials, "seed": seed}
     changes: dict[str, Any] = {
-        name: tuple(one) if isinstance(one, list) else one for name, one in given.items() if one
+        name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items() if value
     }
     panel = (QUICK if quick else Panel())._replace(**changes)
     files = out / "users.csv", out / "users.md"
@@ -92,20 +92,21 @@ def command(
         raise
     for file, text in zip(files, (csv_text(cases), markdown(cases) + "\n"), strict=True):
         write_whole(file, text)
-    said = sentences(cases)
+    conclusions = sentences(cases)
     heads, rows = header(cases), rows_of(cases)
     data = {
         "cases": [
             {
                 **case._asdict(),
                 "baselines": {
-                    name: {**one.ratio._asdict(), "chance": one.chance} for name, one in case.baselines.items()
+                    name: {**paired.ratio._asdict(), "chance": paired.chance}
+                    for name, paired in case.baselines.items()
                 },
             }
             for case in cases
         ],
-        "answers": said,
+        "answers": conclusions,
         "files": [str(file) for file in files],
     }
     title = f"scores of tuned filters over those of baselines, held out; {panel.trials} trials"
-    emit([table(title, heads, rows), *said, *[f"wrote {file}" for file in files]], data, json)
+    emit([table(title, heads, rows), *conclusions, *[f"wrote {file}" for file in files]], data, json)

@@ -48,23 +48,23 @@ def particulars_table() -> Table:
     return table("ngatini2019, table I: the vehicle", ["", "published", "ours"], rows, words=True)
 
 
-def published_table(paper: str, result: PathResult, found: list[Finding]) -> Table:
+def published_table(paper: str, result: PathResult, findings: list[Finding]) -> Table:
     """The printed RMSE of one path beside ours by each transformation."""
     rows = []
-    for one in found:
-        if one.printed is None and one.label not in ("EKF8", MEASUREMENTS):
+    for finding in findings:
+        if finding.printed is None and finding.label not in ("EKF8", MEASUREMENTS):
             continue  # the tables below have it
-        printed = "" if one.printed is None else _printed_pose(one.printed)
-        seconds = "" if one.printed is None else f"{one.printed.seconds:.3g}"
-        ours = [_pose(one.scores, field) for field in FIELDS]
-        spent = digits(one.scores.seconds.mean()) if one.scores.seconds.any() else ""
+        printed = "" if finding.printed is None else _printed_pose(finding.printed)
+        seconds = "" if finding.printed is None else f"{finding.printed.seconds:.3g}"
+        ours = [_pose(finding.scores, field) for field in FIELDS]
+        spent = digits(finding.scores.seconds.mean()) if finding.scores.seconds.any() else ""
         rows.append(
             [
-                one.label.replace(", ", ",\n").replace(" N", "\nN"),
+                finding.label.replace(", ", ",\n").replace(" N", "\nN"),
                 printed,
                 *ours,
                 f"{seconds}\n{spent}".strip("\n"),
-                one.why,
+                finding.why,
             ]
         )
     bound = "\n".join(digits(value) for value in result.bound.pose)
@@ -98,15 +98,15 @@ def velocity_table(result: PathResult) -> Table:
 def position_table(result: PathResult) -> Table:
     """RMSE of position with intervals, and over that of the EKF on the same runs."""
     scores, base, rows = result.scores, result.scores["EKF8"], []
-    for label, one in scores.items():
+    for label, errors in scores.items():
         cells = [label]
         for field in ("planar", "full"):
-            if np.isnan(getattr(one, field)).any():
+            if np.isnan(getattr(errors, field)).any():
                 cells += ["", ""]
                 continue
-            own = Interval(*(math.sqrt(v) for v in _mean_square(one, field)))
-            ratio = "" if one is base else with_interval(position_ratio(one, base, field))
-            cells += [text.replace(" [", "\n[") for text in (with_interval(own), ratio)]
+            interval = Interval(*(math.sqrt(v) for v in _mean_square(errors, field)))
+            ratio = "" if errors is base else with_interval(position_ratio(errors, base, field))
+            cells += [text.replace(" [", "\n[") for text in (with_interval(interval), ratio)]
         rows.append(cells)
     columns = ["filter", "by yaw alone [m]", "over EKF8", "full [m]", "over EKF8"]
     caption = "Root of the mean square distance over a run, 95 % intervals; ratios are paired by run."
@@ -121,10 +121,10 @@ def end_table(results: list[PathResult]) -> Table:
             continue
         for label, printed in zip((ENKF, FKF), ngatini2017.PATHS[result.path][:2], strict=True):
             names = list(printed.final_percent)
-            places = [("x", "y", "z", "angle").index("angle" if name == "psi" else name) for name in names]
-            ends, scores = np.abs(result.end[places]), result.scores[label]
+            indices = [("x", "y", "z", "angle").index("angle" if name == "psi" else name) for name in names]
+            ends, scores = np.abs(result.end[indices]), result.scores[label]
             ours = [
-                "\n".join(digits(100 * value) for value in getattr(scores, field)[:, places].mean(axis=0) / ends)
+                "\n".join(digits(100 * value) for value in getattr(scores, field)[:, indices].mean(axis=0) / ends)
                 for field in ("planar_end", "full_end")
             ]
             published = "\n".join(f"{value:g}" for value in printed.final_percent.values())
@@ -149,15 +149,17 @@ def outside_table(results: list[PathResult]) -> Table:
     return table(title, ["path", *"uvwpqr", "any"], rows)
 
 
-def plain_result(paper: str, result: PathResult, found: list[Finding]) -> dict:
+def plain_result(paper: str, result: PathResult, findings: list[Finding]) -> dict:
     """One path as plain data."""
-    here = {one.label: one for one in found if one.path == result.path and result.world == "vehicle"}
+    here = {
+        finding.label: finding for finding in findings if finding.path == result.path and result.world == "vehicle"
+    }
     filters = {}
     for label, scores in result.scores.items():
         printed = here[label].printed if label in here else None
         filters[label] = {
             "rmse": {
-                field: [one._asdict() for one in scores.intervals(field)]
+                field: [interval._asdict() for interval in scores.intervals(field)]
                 for field in ("velocities", "attitude", "full", "planar", "planar_both")
             },
             "nees": scores.nees_interval._asdict(),
@@ -202,30 +204,30 @@ def reproduce_vehicle(
 ) -> tuple[list[RenderableType], dict]:
     """Run a paper's filters on its paths; return what to show, as a list and as plain data."""
     results = _run(paper, runs, seed, steps)
-    found, said = findings(paper, results), statements(paper, results)
-    shown: list[RenderableType] = [] if paper == "ngatini2017" else [particulars_table(), Text()]
+    compared, conclusions = findings(paper, results), statements(paper, results)
+    output: list[RenderableType] = [] if paper == "ngatini2017" else [particulars_table(), Text()]
     for result in results:
-        here = [one for one in found if one.path == result.path and result.world == "vehicle"]
+        here = [finding for finding in compared if finding.path == result.path and result.world == "vehicle"]
         if here:
-            shown += [published_table(paper, result, here), Text()]
-        shown += [velocity_table(result), Text(), position_table(result), Text()]
+            output += [published_table(paper, result, here), Text()]
+        output += [velocity_table(result), Text(), position_table(result), Text()]
     if paper == "ngatini2017":
-        shown += [end_table(results), Text(), outside_table(results), Text()]
+        output += [end_table(results), Text(), outside_table(results), Text()]
     source = PAPERS[paper].source
-    shown += [Text("Conclusions from the runs"), list_of(said), Text(), Text(f"{paper}: {source}")]
-    shown.append(list_of(PAPERS[paper].remarks))
+    output += [Text("Conclusions from the runs"), list_of(conclusions), Text(), Text(f"{paper}: {source}")]
+    output.append(list_of(PAPERS[paper].remarks))
     data = {
         "settings": {"runs": runs, "seed": seed, "steps": steps},
         "source": source,
-        "results": [plain_result(paper, result, found) for result in results],
-        "statements": said,
+        "results": [plain_result(paper, result, compared) for result in results],
+        "statements": conclusions,
         "remarks": list(PAPERS[paper].remarks),
     }
     if series is not None:
         drawn = path_runs(paper, seed=seed, steps=steps)
-        shown += [Text(), Text(f"Picture: {paths_figure(series, drawn)}")]
-        data |= {"series": [one._asdict() for one in drawn], "picture": str(series)}
-    return shown, data
+        output += [Text(), Text(f"Picture: {paths_figure(series, drawn)}")]
+        data |= {"series": [run._asdict() for run in drawn], "picture": str(series)}
+    return output, data
 
 
 def _run(paper: str, runs: int, seed: int, steps: int | None) -> list[PathResult]:

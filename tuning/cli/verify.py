@@ -35,31 +35,39 @@ def command(
     """
     announce_compilation()
     with working(f"recomputing the metrics of {file}"):
-        found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
-    emit(_report(file, found), _as_json(file, found), json)
-    if not found.holds:
+        verification = verify(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
+    emit(_report(file, verification), _as_json(file, verification), json)
+    if not verification.holds:
         sys.exit(1)
 
 
-def _report(file: Path, found: Verification) -> list[RenderableType]:
-    shown: list[RenderableType] = []
-    if found.holds:
-        shown.append(f"{file} holds: {found.checked} numbers are the same within {TOLERANCE:g} of their size.")
+def _report(file: Path, verification: Verification) -> list[RenderableType]:
+    output: list[RenderableType] = []
+    if verification.holds:
+        output.append(
+            f"{file} holds: {verification.checked} numbers are the same within {TOLERANCE:g} of their size."
+        )
     else:
-        rows = [[d.place, str(d.stored), str(d.found), f"{d.relative:.1e}"] for d in found.differences[:LISTED]]
-        shown.append(f"{file} does not hold: {len(found.differences)} of {found.checked} numbers differ.")
-        shown.append(table("The largest differences", ["number", "stored", "found", "relative"], rows))
-    if found.packages:
-        changes = ", ".join(f"{name} {then} then, {now} now" for name, (then, now) in found.packages.items())
-        shown.append(f"Packages whose versions have changed since the file was made: {changes}.")
-    return shown
+        rows = [
+            [d.place, str(d.stored), str(d.found), f"{d.relative:.1e}"] for d in verification.differences[:LISTED]
+        ]
+        output.append(
+            f"{file} does not hold: {len(verification.differences)} of {verification.checked} numbers differ."
+        )
+        output.append(table("The largest differences", ["number", "stored", "found", "relative"], rows))
+    if verification.packages:
+        changes = ", ".join(
+            f"{name} {then} then, {now} now" for name, (then, now) in verification.packages.items()
+        )
+        output.append(f"Packages whose versions have changed since the file was made: {changes}.")
+    return output
 
 
-def _as_json(file: Path, found: Verification) -> dict:
+def _as_json(file: Path, verification: Verification) -> dict:
     return {
         "file": str(file),
-        "holds": found.holds,
-        "checked": found.checked,
-        "differences": [{**d._asdict(), "relative": d.relative} for d in found.differences],
-        "packages": {name: {"stored": then, "here": now} for name, (then, now) in found.packages.items()},
+        "holds": verification.holds,
+        "checked": verification.checked,
+        "differences": [{**d._asdict(), "relative": d.relative} for d in verification.differences],
+        "packages": {name: {"stored": then, "here": now} for name, (then, now) in verification.packages.items()},
     }

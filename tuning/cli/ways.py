@@ -27,20 +27,20 @@ def command(
 
     Example: thruster ways em
     """
-    shown = None if name is None else find_way(name)  # a clear error for an unknown one
+    chosen = None if name is None else find_way(name)  # a clear error for an unknown one
     data: dict[str, Any] = {
-        one: {"about": way.about, "when": way.when, "source": way.source, NEEDS: list(way.needs)}
-        for one, way in WAYS.items()
-        if name in (None, one)
+        label: {"about": way.about, "when": way.when, "source": way.source, NEEDS: list(way.needs)}
+        for label, way in WAYS.items()
+        if name in (None, label)
     }
-    if shown is not None:
-        text = (shown.follow.__doc__ or "").strip()
-        emit([f"{name}: {shown.about}.", f"Use it {shown.when}.", f"Source: {shown.source}", text], data, json)
+    if chosen is not None:
+        text = (chosen.follow.__doc__ or "").strip()
+        emit([f"{name}: {chosen.about}.", f"Use it {chosen.when}.", f"Source: {chosen.source}", text], data, json)
         return
-    rows = [[one, way.about, way.when, _needs(way.needs)] for one, way in WAYS.items()]
+    rows = [[label, way.about, way.when, _needs(way.needs)] for label, way in WAYS.items()]
     emit([table("ways of tuning: thruster tune --way NAME", HEADS, rows, words=True)], data, json)
 
 
 def _needs(needs: tuple[str, ...]) -> str:
     words = {TRUTH: "true states", GRADIENT: "a gradient"}
-    return ", ".join(words[one] for one in needs if one in words)
+    return ", ".join(words[need] for need in needs if need in words)

@@ -70,10 +70,10 @@ def command(
     from tuning.experiments.ways.tables import figure, tables
 
     protocol = FAST if quick else Protocol()
-    given: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
-    given["ways"] = tuple(way) if way else None
-    given["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
-    protocol = protocol._replace(**{name: one for name, one in given.items() if one is not None})
+    changes: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
+    changes["ways"] = tuple(way) if way else None
+    changes["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
+    protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
     text = None if page is None else page.read_text(encoding="utf-8")
     announce_compilation()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -84,20 +84,26 @@ def command(
                 protocol,
                 out,
                 jobs,
-                lambda said, done, count: progress.update(bar, description=said, completed=done, total=count),
+                lambda description, done, count: progress.update(
+                    bar, description=description, completed=done, total=count
+                ),
             )
     except KeyboardInterrupt:
         progress_console.print(f"Interrupted: finished results are in {out}, and the same command continues.")
         raise
-    made = tables(results, protocol)
+    makers = tables(results, protocol)
     written = [figure(results, protocol, (out if page is None else page.parent) / "ways_groups.png")]
     if page is not None and text is not None:
-        write_whole(page, with_tables(text, made))
+        write_whole(page, with_tables(text, makers))
         written.append(page)
-    shown = {name: make() for name, make in made.items()}
+    texts = {name: make() for name, make in makers.items()}
     data = {
-        "results": [one._asdict() for one in results],
-        "predictions": [one._asdict() for one in PREDICTIONS],
-        "files": [str(one) for one in written],
+        "results": [result._asdict() for result in results],
+        "predictions": [prediction._asdict() for prediction in PREDICTIONS],
+        "files": [str(path) for path in written],
     }
-    emit([*(f"{name}\n\n{one}" for name, one in shown.items()), *[f"wrote {one}" for one in written]], data, json)
+    emit(
+        [*(f"{name}\n\n{content}" for name, content in texts.items()), *[f"wrote {path}" for path in written]],
+        data,
+        json,
+    )

@@ -29,7 +29,7 @@ def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:
         return NO_TRIALS
     early = sum(trial.state == TrialState.PRUNED for trial in trials)
     first, last = (
-        f"trial {one.number + 1} has {reported(objective, one.values[0]):.4g}" for one in (done[0], best)
+        f"trial {trial.number + 1} has {reported(objective, trial.values[0]):.4g}" for trial in (done[0], best)
     )
     return (
         f"{reported_name(objective)} of {len(trials)} trials, {early} of them pruned: {first}; the best, {last}."
@@ -38,17 +38,17 @@ def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:
 
 def of_comparison(comparison: Comparison) -> str:
     """RMSE of every filter, state by state, and the bound."""
-    told = []
+    sentences = []
     for i, state in enumerate(comparison.tuned.states):
-        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in comparison.evaluations.items()]
+        values = [f"{name} {evaluation.rmse[i].value:.3g}" for name, evaluation in comparison.evaluations.items()]
         values += [f"bound {comparison.bound[i]:.3g}"] if isfinite(comparison.bound[i]) else []
-        told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
-    return f"Bars with whiskers. {'; '.join(told)}."
+        sentences.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
+    return f"Bars with whiskers. {'; '.join(sentences)}."
 
 
-def of_importances(found: Mapping[str, float]) -> str:
+def of_importances(importances: Mapping[str, float]) -> str:
     """Every importance."""
-    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in found.items())}."
+    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in importances.items())}."
 
 
 def of_slices(trials: Sequence[FrozenTrial]) -> str:
@@ -57,66 +57,66 @@ def of_slices(trials: Sequence[FrozenTrial]) -> str:
     best = best_trial(done) if done else None
     if best is None:
         return NO_TRIALS
-    told = []
+    ranges = []
     for name, value in best.params.items():
         if isinstance(value, (int, float)):
             tried = [trial.params[name] for trial in done if name in trial.params]
-            told.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
-    return f"Scatter of {len(done)} complete trials. The best has {'; '.join(told)}."
+            ranges.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
+    return f"Scatter of {len(done)} complete trials. The best has {'; '.join(ranges)}."
 
 
 def of_front(front: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     """Both ends of a Pareto front."""
     ends = sorted(trial.values for trial in front)
-    told = [
+    described = [
         " and ".join(
             f"{reported_name(name)} {reported(name, value):.3g}"
             for name, value in zip(objectives, end, strict=True)
         )
         for end in ends
     ]
-    return f"Pareto front of {len(front)} trials, from {told[0]} to {told[-1]}."
+    return f"Pareto front of {len(front)} trials, from {described[0]} to {described[-1]}."
 
 
-def of_sizes(sizes: Sequence[SizeRow], kept: int) -> str:
+def of_sizes(sizes: Sequence[SizeRow], chosen: int) -> str:
     """RMSE at the smallest, the kept and the largest size."""
-    states, told = sizes[0].evaluation.states, []
+    states, sentences = sizes[0].evaluation.states, []
     for i, state in enumerate(states):
-        some = {sizes[0].size, kept, sizes[-1].size}
-        values = [f"{row.evaluation.rmse[i].value:.3g} at N = {row.size}" for row in sizes if row.size in some]
-        told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
-    return f"{'; '.join(told)}."
+        ends = {sizes[0].size, chosen, sizes[-1].size}
+        values = [f"{row.evaluation.rmse[i].value:.3g} at N = {row.size}" for row in sizes if row.size in ends]
+        sentences.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
+    return f"{'; '.join(sentences)}."
 
 
 def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
     """RMSE of each filter in one run and the share of the truth, or of the innovations, in its band."""
-    told = []
+    sentences = []
     for name, filter_ in filters.items():
-        found, parts = one_run(filter_, data, index, dt), []
-        values, covs, what = _against(found.errors, found.innovations, found.estimates)
-        quantities = filter_.model.states if found.errors is not None else filter_.model.measurements
+        run, parts = one_run(filter_, data, index, dt), []
+        values, covs, what = _against(run.errors, run.innovations, run.estimates)
+        quantities = filter_.model.states if run.errors is not None else filter_.model.measurements
         for i in range(values.shape[-1]):
-            there = np.isfinite(values[:, i]) & np.isfinite(covs[:, i, i])
-            inside = np.abs(values[there, i]) <= TWO_SIDED * np.sqrt(covs[there, i, i])
+            finite = np.isfinite(values[:, i]) & np.isfinite(covs[:, i, i])
+            inside = np.abs(values[finite, i]) <= TWO_SIDED * np.sqrt(covs[finite, i, i])
             size = np.sqrt(np.mean(values[np.isfinite(values[:, i]), i] ** 2))
-            share = f", {100 * inside.mean():.0f} % in the band" if there.any() else ""
+            share = f", {100 * inside.mean():.0f} % in the band" if finite.any() else ""
             parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
-        told.append(f"{name}: {what} {'; '.join(parts)}")
-    return f"{'. '.join(told)}."
+        sentences.append(f"{name}: {what} {'; '.join(parts)}")
+    return f"{'. '.join(sentences)}."
 
 
 def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
     """Range and mean of every column of values (K, m), and how many are missing."""
-    told = []
+    sentences = []
     for name, unit, column in zip(names, units, values.T, strict=True):
-        there = column[np.isfinite(column)]
-        if not there.size:
-            told.append(f"{name}: nothing")
+        finite = column[np.isfinite(column)]
+        if not finite.size:
+            sentences.append(f"{name}: nothing")
             continue
-        missing = f", {len(column) - len(there)} of {len(column)} missing" if len(there) < len(column) else ""
-        ends = f"from {there.min():.3g} to {there.max():.3g} {unit}".rstrip()
-        told.append(f"{name} {ends}, mean {there.mean():.3g}{missing}")
-    return f"{'; '.join(told)}."
+        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
+        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
+        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
+    return f"{'; '.join(sentences)}."
 
 
 def _against(errors, innovations: np.ndarray, estimates: Estimates):

@@ -31,28 +31,28 @@ from tuning.search.validation import choice_from
 FULL_NOISE = {FULL_Q: "--full-q", FULL_QR: "--full-q --full-r"}  # by the option that lets it compete with trials
 
 
-def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
+def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[str]:
     """The choice and its reason, the runs in which what was given fails, and what a mean NIS in its band costs.
 
     Args:
-        found: from `tuning.search.validation.as_data`, or of a tuned file; nothing is said of None.
+        validation: from `tuning.search.validation.as_data`, or of a tuned file; None gives no sentence.
         plan: of the study.
     """
-    if not found:
+    if not validation:
         return []
-    met = {one["name"]: one for one in found["met"]}
-    candidate, baseline, chosen = found["candidate"], found["baseline"], found["chosen"]
+    met = {contender["name"]: contender for contender in validation["met"]}
+    candidate, baseline, chosen = validation["candidate"], validation["baseline"], validation["chosen"]
     likely = plan.objectives[0] in PROPER
     over, what = met[candidate]["over"], _what(plan)
-    where = f"{len(_range(found['seeds']))} validation {plan.scenarios[0].seed_word}"
-    if not found["own_seeds"]:
+    where = f"{len(_range(validation['seeds']))} validation {plan.scenarios[0].seed_word}"
+    if not validation["own_seeds"]:
         where = f"the training {plan.scenarios[0].seed_word}, because there are too few to set some aside"
     best, the, members = f"the best baseline, the {called(baseline)}", _the(candidate), _members(met[chosen])
     if candidate == baseline:
-        said = [f"The study returns the {called(baseline)}: every trial is the same filter as a baseline."]
-    elif found.get("by_error") and found["by_error"] != chosen:
-        said = [_log_score_sentence(met[chosen], met[found["by_error"]], where, what)]
-    elif found["gave_way"]:
+        sentences = [f"The study returns the {called(baseline)}: every trial is the same filter as a baseline."]
+    elif validation.get("by_error") and validation["by_error"] != chosen:
+        sentences = [_log_score_sentence(met[chosen], met[validation["by_error"]], where, what)]
+    elif validation["gave_way"]:
         lost = met[candidate].get("worse_in")
         without, but = "", ""
         if lost:
@@ -60,36 +60,36 @@ def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
         none_is, its = f"{the} is not", f"its {what}"
         if _is_trial(candidate):
             none_is, its = "no trial is", f"{candidate}'s {what}"
-        said = [
+        sentences = [
             f"The study returns the {called(baseline)}{members}: on {where} {none_is} significantly better"
             f"{without} ({its} is {_over(over, likely)}{but})."
         ]
     elif _is_even(over, likely) and met[candidate].get("chance", 1.0) < LEVEL / 2:
-        said = [
+        sentences = [
             f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}, and it is "
             f"better in most of them (Wilcoxon's signed ranks, p = {met[candidate]['chance']:.2g})."
         ]
     elif _is_even(over, likely):
-        said = [
+        sentences = [
             f"The study returns {the}: on {where} it has the same {what} as {best}, whose mean NIS is "
             "outside its band."
         ]
     else:
-        said = [f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}."]
-    said += _sizes_sentence(met, chosen)
+        sentences = [f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}."]
+    sentences += _sizes_sentence(met, chosen)
     if candidate != chosen and chosen in FULL_NOISE:
-        said.append(
+        sentences.append(
             f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {the} are "
             f"{_own(met[candidate], plan)}."
         )
     channels = len(plan.scenarios[0].quantities.measurements)
-    if found.get("failures"):
-        said.append(_failures_sentence(found, plan.scenarios[0].seed_word, channels))
-    if found["price"] is not None and found["price"] > MOST_PRICE:
-        said.append(_price_sentence(found, met[candidate], what, channels))
-    if found.get("full"):
-        said.append(_full_sentence(found["full"], what, where, likely))
-    return said
+    if validation.get("failures"):
+        sentences.append(_failures_sentence(validation, plan.scenarios[0].seed_word, channels))
+    if validation["price"] is not None and validation["price"] > MOST_PRICE:
+        sentences.append(_price_sentence(validation, met[candidate], what, channels))
+    if validation.get("full"):
+        sentences.append(_full_sentence(validation["full"], what, where, likely))
+    return sentences
 
 
 def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool) -> str:
@@ -107,11 +107,11 @@ def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool)
     )
 
 
-def _log_score_sentence(taken: Mapping, by_error: Mapping, where: str, what: str) -> str:
+def _log_score_sentence(chosen: Mapping, by_error: Mapping, where: str, what: str) -> str:
     """The filter that the log score decided for, beside the one of the least error."""
-    names = [_the(one["name"]) for one in (taken, by_error)]
-    ratio, gained = taken["value"] / by_error["value"], taken["proper"] - by_error["proper"]
-    nees = [_nees_words(one) for one in (taken, by_error)]
+    names = [_the(contender["name"]) for contender in (chosen, by_error)]
+    ratio, gained = chosen["value"] / by_error["value"], chosen["proper"] - by_error["proper"]
+    nees = [_nees_words(contender) for contender in (chosen, by_error)]
     return (
         f"The study returns {names[0]} for its log score, the log density of the true state: on {where} that is "
         f"{gained:.3g} a step above that of {names[1]}, at {ratio:.3f} times the {what}. Its mean NEES is "
@@ -147,23 +147,29 @@ def _members(met: Mapping) -> str:
 def _sizes_sentence(met: Mapping[str, Mapping], chosen: str) -> list[str]:
     """The ensemble sizes of the filters of the chosen type that met, in a list; empty without an ensemble."""
     kind = met[chosen]["choice"]["name"]
-    same = {name: size for name, one in met.items() if one["choice"]["name"] == kind and (size := _size(one))}
-    trials, others = ({size for name, size in same.items() if _is_trial(name) == part} for part in (True, False))
-    if len(trials | others) == 1:
-        return [f"Trials and baselines have N = {min(trials | others)} members here."]
-    if len(trials) == len(others) == 1:
-        return [f"Trials have N = {min(trials)} members here, baselines {min(others)}."]
+    same = {
+        name: size
+        for name, contender in met.items()
+        if contender["choice"]["name"] == kind and (size := _size(contender))
+    }
+    trials, baselines = (
+        {size for name, size in same.items() if _is_trial(name) == part} for part in (True, False)
+    )
+    if len(trials | baselines) == 1:
+        return [f"Trials and baselines have N = {min(trials | baselines)} members here."]
+    if len(trials) == len(baselines) == 1:
+        return [f"Trials have N = {min(trials)} members here, baselines {min(baselines)}."]
     return []
 
 
-def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
+def _failures_sentence(validation: Mapping, word: str, channels: int) -> str:
     """Where what was given fails, and how the best trial does there."""
-    failed, runs = found["failed_runs"]
-    candidate, tested = found["candidate"], found["tested"]
+    failed, runs = validation["failed_runs"]
+    candidate, tested = validation["candidate"], validation["tested"]
     named = []
-    for one in found["failures"]:
-        other = "" if candidate == tested else f"; {_the(candidate)}: {rounded(channels * one['candidate'])}"
-        named.append(f"{one['run']} (mean NIS {rounded(channels * one['nis'])}{other})")
+    for failure in validation["failures"]:
+        other = "" if candidate == tested else f"; {_the(candidate)}: {rounded(channels * failure['candidate'])}"
+        named.append(f"{failure['run']} (mean NIS {rounded(channels * failure['nis'])}{other})")
     worst = "" if failed == len(named) else "worst "
     return (
         f"The {called(tested)} fails in {failed} of {runs} {word}, {worst}in {_listed(named)}; a mean NIS "
@@ -171,25 +177,29 @@ def _failures_sentence(found: Mapping, word: str, channels: int) -> str:
     )
 
 
-def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) -> str:
+def _price_sentence(validation: Mapping, chosen: Mapping, what: str, channels: int) -> str:
     """The price of the band, with both sides of the choice."""
-    inside = [one for one in found["met"] if one["consistent"] and one["name"].startswith("trial ")]
-    best = min(inside, key=lambda one: one["value"])
+    inside = [
+        contender
+        for contender in validation["met"]
+        if contender["consistent"] and contender["name"].startswith("trial ")
+    ]
+    best = min(inside, key=lambda trial: trial["value"])
     has = [
-        f"has a {what} of {rounded(one['value'])} and a mean NIS of {rounded(channels * one['nis'])}"
-        for one in (best, taken)
+        f"has a {what} of {rounded(contender['value'])} and a mean NIS of {rounded(channels * contender['nis'])}"
+        for contender in (best, chosen)
     ]
     return (
-        f"A mean NIS in its band would cost {100 * found['price']:.3g} % of the {what}, more than the "
+        f"A mean NIS in its band would cost {100 * validation['price']:.3g} % of the {what}, more than the "
         f"{100 * MOST_PRICE:g} % allowed: {best['name']}, the best in the band, {has[0]}. Of the trials within "
-        f"{100 * MOST_PRICE:g} % of the best, {taken['name']} has the best log score; it {has[1]}, where "
+        f"{100 * MOST_PRICE:g} % of the best, {chosen['name']} has the best log score; it {has[1]}, where "
         f"{channels} is right."
     )
 
 
-def _over(given: Sequence[float], likely: bool, other: str = "") -> str:
+def _over(interval: Sequence[float], likely: bool, other: str = "") -> str:
     """A ratio of errors, or a difference of log-likelihoods, in words: over those of `other` if that is named."""
-    value, low, high = given
+    value, low, high = interval
     if likely:
         value, low, high = sized(Interval(-value, -high, -low))
     known = isfinite(low + high)
@@ -198,19 +208,23 @@ def _over(given: Sequence[float], likely: bool, other: str = "") -> str:
         return f"{times} that of {other}" if other else f"{times} as large"
     ends = [rounded(part) for part in (value, low, high)]
     much = f"{ends[0]} [{ends[1]}, {ends[2]}]" if known and ends[1] != ends[2] else ends[0]
-    words = ("above", "higher") if -given[0] >= 0.0 else ("below", "lower")
+    words = ("above", "higher") if -interval[0] >= 0.0 else ("below", "lower")
     return f"{much} {words[0]} that of {other}" if other else f"{much} {words[1]}"
 
 
-def _own(found: Mapping[str, Any], plan: Any) -> str:
+def _own(validation: Mapping[str, Any], plan: Any) -> str:
     """The user's own parameters of a validated choice, in words."""
-    choice = choice_from(found["choice"])
-    values = [(one, one.get(choice)) for one in plan.scenarios[0].parameters]
-    return ", ".join(f"{one.name} = {value:.3g} {one.unit}".rstrip() for one, value in values if value is not None)
+    choice = choice_from(validation["choice"])
+    values = [(parameter, parameter.get(choice)) for parameter in plan.scenarios[0].parameters]
+    return ", ".join(
+        f"{parameter.name} = {value:.3g} {parameter.unit}".rstrip()
+        for parameter, value in values
+        if value is not None
+    )
 
 
-def _is_even(given: Sequence[float], likely: bool) -> bool:
-    return not given[2] < (0.0 if likely else 1.0)
+def _is_even(interval: Sequence[float], likely: bool) -> bool:
+    return not interval[2] < (0.0 if likely else 1.0)
 
 
 def _what(plan: Any) -> str:
@@ -245,13 +259,13 @@ def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str
         return _likelihood_gains(comparison, seed_word, name)
     ratios = comparison.ratios
     parts = [f"{span(ratio, 3)} times that of the {called(name)}" for name, ratio in ratios.items()]
-    first, place = next(iter(ratios)), f"{len(comparison.seeds)} held-out {seed_word}"
-    said = f"Score of the {_filter(name)} on {place}: {', '.join(parts)} (paired 95 % intervals)."
+    first, where = next(iter(ratios)), f"{len(comparison.seeds)} held-out {seed_word}"
+    sentence = f"Score of the {_filter(name)} on {where}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(comparison)
     if name == TUNED:
-        said += f" {_verdict(ratios[first], called(first), seed_word)}"
+        sentence += f" {_verdict(ratios[first], called(first), seed_word)}"
     same = [GIVEN_IS_ORACLE] if comparison.given_is_oracle else []
-    return [said, *([scaling] if scaling else []), *same]
+    return [sentence, *([scaling] if scaling else []), *same]
 
 
 def _filter(name: str) -> str:
@@ -261,16 +275,16 @@ def _filter(name: str) -> str:
 
 def _likelihood_gains(comparison: Comparison, seed_word: str, name: str) -> list[str]:
     """The gain of tuning without truth: the increase of the log-likelihood of a run."""
-    gained = {name: found for name, found in comparison.likelihood_gains.items() if not isnan(found.value)}
-    said, scaling = [without_truth("This problem")], scaling_sentence(comparison)
+    gained = {name: gain for name, gain in comparison.likelihood_gains.items() if not isnan(gain.value)}
+    sentences, scaling = [without_truth("This problem")], scaling_sentence(comparison)
     if gained:
         parts = [
-            f"{span(sized(found), 2)} {'above' if found.value >= 0 else 'below'} that of the {called(name)}"
-            for name, found in gained.items()
+            f"{span(sized(gain), 2)} {'above' if gain.value >= 0 else 'below'} that of the {called(name)}"
+            for name, gain in gained.items()
         ]
-        place = f"{len(comparison.seeds)} held-out {seed_word}"
-        said.append(f"Log-likelihood of a run of the {_filter(name)} on {place}: {', '.join(parts)}.")
-    return [*said, *([scaling] if scaling else [])]
+        where = f"{len(comparison.seeds)} held-out {seed_word}"
+        sentences.append(f"Log-likelihood of a run of the {_filter(name)} on {where}: {', '.join(parts)}.")
+    return [*sentences, *([scaling] if scaling else [])]
 
 
 def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
@@ -301,13 +315,13 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     Of the process noise w = x' - f(x, u) and the measurement noise v = z - h(x) of the training runs it gives the
     mean over the deviation and the correlation with the next step, where one of these is above 0.1.
     """
-    found = noise_estimation(problem, seed)
-    if found.process_cov is None or found.measurement_cov is None:
+    noise = noise_estimation(problem, seed)
+    if noise.process_cov is None or noise.measurement_cov is None:
         return []
     model = problem.quantities
-    w = _told(model.states, found.process_cov, found.process_mean, found.process_correlation)
-    v = _told(model.measurements, found.measurement_cov, found.measurement_mean, found.measurement_correlation)
-    parts = [f"{what} {', '.join(some)}" for what, some in (("w of", w), ("v of", v)) if some]
+    w = _told(model.states, noise.process_cov, noise.process_mean, noise.process_correlation)
+    v = _told(model.measurements, noise.measurement_cov, noise.measurement_mean, noise.measurement_correlation)
+    parts = [f"{what} {', '.join(remarks)}" for what, remarks in (("w of", w), ("v of", v)) if remarks]
     if not parts:
         return [
             "The residuals of the true states, w = x' - f(x, u) and v = z - h(x), look like white noise: each "
@@ -328,7 +342,7 @@ def _told(
         return []
     relative = np.divide(mean, deviations, out=np.zeros_like(mean), where=deviations > 0)
     rows = zip(quantities, relative.tolist(), correlation.tolist(), strict=True)
-    return [f"{one.symbol} ({a:+.2g}; {b:+.2g})" for one, a, b in rows if max(abs(a), abs(b)) > SMALL]
+    return [f"{quantity.symbol} ({a:+.2g}; {b:+.2g})" for quantity, a, b in rows if max(abs(a), abs(b)) > SMALL]
 
 
 def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> list[str]:
@@ -343,35 +357,36 @@ def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> lis
         comparison: of the tuned filter on it.
         seed: of the study, whose training runs have the residuals.
     """
-    given, over, reasons = comparison.given, comparison.over_regression, []
+    untuned, over, reasons = comparison.given, comparison.over_regression, []
     if comparison.tuned.has_truth:
         return _correlation_doubt(problem, seed)
-    if given is not None and given.nis.value > LARGE_NIS * given.expected_nis:
+    if untuned is not None and untuned.nis.value > LARGE_NIS * untuned.expected_nis:
         reasons.append(
-            f"with its own Q and R the mean NIS is {given.nis.value:.3g} where {given.expected_nis:.3g} is right"
+            f"with its own Q and R the mean NIS is {untuned.nis.value:.3g} where {untuned.expected_nis:.3g} is "
+            "right"
         )
     if is_far_below(over):
         gained = span(Interval(-over.value, -over.high, -over.low), 2)
         reasons.append(
             f"a linear regression on past rows predicts with a log-likelihood {gained} higher a measurement"
         )
-    said = "; ".join(reasons)
-    return [f"Is {_model_of(problem)}? {said[:1].upper()}{said[1:]}."] if said else []
+    reason = "; ".join(reasons)
+    return [f"Is {_model_of(problem)}? {reason[:1].upper()}{reason[1:]}."] if reason else []
 
 
 def _correlation_doubt(problem: Problem, seed: int) -> list[str]:
     """Residuals of the true states that strongly correlate with the next step, in a sentence in a list."""
-    found, model = noise_estimation(problem, seed), problem.quantities
-    if found.process_correlation is None or found.measurement_correlation is None:
+    noise, model = noise_estimation(problem, seed), problem.quantities
+    if noise.process_correlation is None or noise.measurement_correlation is None:
         return []
     parts = (
-        ("w of", model.states, found.process_correlation),
-        ("v of", model.measurements, found.measurement_correlation),
+        ("w of", model.states, noise.process_correlation),
+        ("v of", model.measurements, noise.measurement_correlation),
     )
     strong = [
-        f"{r:+.2g} ({what} {one.symbol})"
+        f"{r:+.2g} ({what} {quantity.symbol})"
         for what, quantities, correlation in parts
-        for one, r in zip(quantities, correlation.tolist(), strict=True)
+        for quantity, r in zip(quantities, correlation.tolist(), strict=True)
         if abs(r) > STRONG
     ]
     if not strong:
@@ -412,9 +427,9 @@ def consistency_of(comparison: Comparison) -> tuple[str, Interval, float, str]:
 def consistency_sentence(comparison: Comparison) -> str:
     """The same in a sentence; a filter that predicts far worse than a regression is never called consistent."""
     name, mean, right, word = consistency_of(comparison)
-    said = mean_sentence(name, mean, right)
+    sentence = mean_sentence(name, mean, right)
     if word in (MADE_UP, JOINTLY):
-        return f"{word[:1].upper()}{word[1:]}:{said.partition(':')[2]}"
-    if not comparison.tuned.has_truth or said.startswith("Consistent"):
-        return said
-    return f"{said} RMSE and NIS do not fully test the covariance."
+        return f"{word[:1].upper()}{word[1:]}:{sentence.partition(':')[2]}"
+    if not comparison.tuned.has_truth or sentence.startswith("Consistent"):
+        return sentence
+    return f"{sentence} RMSE and NIS do not fully test the covariance."

@@ -49,52 +49,52 @@ def draw_consistency(
         report: the checks of one filter.
         title: said above the picture.
         comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
-        scored: places of the states that count in the score, which come first where not all are drawn.
+        scored: indices of the states that count in the score, which come first where not all are drawn.
         filter_name: of the filter, whose colour is that of what was found.
 
     Raises:
         ValueError: if there is nothing to draw.
     """
-    places, left_out = plotted_states(report.states, scored)
+    indices, left_out = plotted_states(report.states, scored)
     colour = colour_of(filter_name)
-    checks = _panels(report, comparison, places, colour)
+    checks = _panels(report, comparison, indices, colour)
     if not checks:
         raise ValueError("a figure needs something to draw, but the filter gives no covariance")
     figure, axes = panels(len(checks), COLUMNS, PANEL, extra=0.4)
     for axis, draw in zip(axes, checks, strict=True):
         draw(axis)
         axis.title.set_fontsize(10)
-    _legend(figure, report, places, left_out, colour)
+    _legend(figure, report, indices, left_out, colour)
     figure.suptitle(verbatim(title, most=TITLE), fontsize=11)
     return figure
 
 
 def _panels(
-    report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int], colour: str
+    report: ConsistencyReport, comparison: Mapping | None, indices: Sequence[int], colour: str
 ) -> list[Callable]:
     """A function on axes for each check that has results."""
     squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
-    found: list[Callable] = [partial(_squares, check=check, report=report, colour=colour) for check in squares]
+    checks: list[Callable] = [partial(_squares, check=check, report=report, colour=colour) for check in squares]
     if report.whiteness.statistic > 0:
-        found.append(partial(_correlations, report=report, colour=colour))
-    found += [partial(_distribution, check=check, colour=colour) for check in squares]
+        checks.append(partial(_correlations, report=report, colour=colour))
+    checks += [partial(_distribution, check=check, colour=colour) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        shares: dict[str, Any] = {"found": report.coverage, "by_level": report.coverage_by_level}
-        found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
-        found.append(partial(_crps, report=report, places=places))
+        shares: dict[str, Any] = {"coverage": report.coverage, "by_level": report.coverage_by_level}
+        checks.append(partial(_coverage, what="truth", colours=_of_states(indices), **shares))
+        checks.append(partial(_crps, report=report, indices=indices))
     elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
-        shares = {"found": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
-        found.append(partial(_coverage, what="measurements", colours=_of_channels(report, colour), **shares))
+        shares = {"coverage": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
+        checks.append(partial(_coverage, what="measurements", colours=_of_channels(report, colour), **shares))
     if report.ensemble is not None:
-        found.append(partial(_ranks, report=report, places=places))
+        checks.append(partial(_ranks, report=report, indices=indices))
     if comparison:
-        found.append(partial(_comparison, comparison=comparison, places=places))
-    return found
+        checks.append(partial(_comparison, comparison=comparison, indices=indices))
+    return checks
 
 
-def _of_states(places: Sequence[int]) -> dict[int, str]:
+def _of_states(indices: Sequence[int]) -> dict[int, str]:
     """Colours of the states that are drawn."""
-    return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(places)}
+    return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(indices)}
 
 
 def _of_channels(report: ConsistencyReport, colour: str) -> dict[int, str]:
@@ -103,7 +103,7 @@ def _of_channels(report: ConsistencyReport, colour: str) -> dict[int, str]:
     return {j: colour if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
 
 
-def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str, colour: str) -> None:
+def _legend(figure, report: ConsistencyReport, indices: Sequence[int], left_out: str, colour: str) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -112,9 +112,9 @@ def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: 
         Patch(color=DARK, alpha=0.15, linewidth=0, label="95 % of chance"),
         Line2D([], [], color=colour, linewidth=1, label=f"found in {report.runs} runs"),
     ]
-    named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
+    named = {report.states[i]: colour for i, colour in _of_states(indices).items()} if report.has_truth else {}
     if len(report.channels) > 1:
-        named |= {report.channels[j]: one for j, one in _of_channels(report, colour).items()}
+        named |= {report.channels[j]: shade for j, shade in _of_channels(report, colour).items()}
     handles += [Line2D([], [], color=colour, marker="o", label=verbatim(name)) for name, colour in named.items()]
     title = left_out if report.has_truth and left_out else None
     options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
@@ -145,28 +145,28 @@ def _squares(axis, check: SquaresCheck, report: ConsistencyReport, colour: str) 
 
 
 def _correlations(axis, report: ConsistencyReport, colour: str) -> None:
-    found = report.whiteness
-    lags, channels = np.arange(1, len(found.correlations) + 1), found.correlations.shape[1]
+    whiteness = report.whiteness
+    lags, channels = np.arange(1, len(whiteness.correlations) + 1), whiteness.correlations.shape[1]
     for i, shade in _of_channels(report, colour).items():
-        places, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, found.correlations[:, i, i]
-        axis.vlines(places, 0, values, color=shade, linewidth=1.5)
-        axis.plot(places, values, "o", color=shade, markersize=3)
-    half = found.half_widths[:, 0, 0]
+        positions, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, whiteness.correlations[:, i, i]
+        axis.vlines(positions, 0, values, color=shade, linewidth=1.5)
+        axis.plot(positions, values, "o", color=shade, markersize=3)
+    half = whiteness.half_widths[:, 0, 0]
     axis.fill_between(lags, -half, half, color=DARK, alpha=0.15, linewidth=0)
     _right(axis, 0)
-    widest = 1.15 * max(np.abs(np.diagonal(found.correlations, axis1=1, axis2=2)).max(), 2 * half.max())
+    widest = 1.15 * max(np.abs(np.diagonal(whiteness.correlations, axis1=1, axis2=2)).max(), 2 * half.max())
     axis.set_ylim(-widest, widest)
-    axis.set_title(f"innovations: white? {probability_text(found.p_value)}")
+    axis.set_title(f"innovations: white? {probability_text(whiteness.p_value)}")
     axis.set_xlabel("lag [steps]")
     axis.set_ylabel("correlation [-]")
 
 
 def _distribution(axis, check: SquaresCheck, colour: str) -> None:
-    found = check.distribution
-    errors = np.abs(found.frequency_band - found.frequencies[:, None]).T
-    centres = (found.edges[:-1] + found.edges[1:]) / 2
-    axis.bar(centres, found.frequencies, 0.92 * np.diff(found.edges), color=colour, alpha=0.5)
-    axis.errorbar(centres, found.frequencies, errors, fmt="none", ecolor=colour, elinewidth=1)
+    distribution = check.distribution
+    errors = np.abs(distribution.frequency_band - distribution.frequencies[:, None]).T
+    centres = (distribution.edges[:-1] + distribution.edges[1:]) / 2
+    axis.bar(centres, distribution.frequencies, 0.92 * np.diff(distribution.edges), color=colour, alpha=0.5)
+    axis.errorbar(centres, distribution.frequencies, errors, fmt="none", ecolor=colour, elinewidth=1)
     _right(axis, 1)
     axis.set_title(f"{check.name}: {100 * check.beyond.value:.1f} % beyond the 95 % point")
     axis.set_xlabel("probability under chi-square [-]")
@@ -174,12 +174,12 @@ def _distribution(axis, check: SquaresCheck, colour: str) -> None:
 
 
 def _coverage(
-    axis, found: Sequence[Interval], by_level: np.ndarray, what: str, colours: Mapping[int, str]
+    axis, coverage: Sequence[Interval], by_level: np.ndarray, what: str, colours: Mapping[int, str]
 ) -> None:
     axis.plot([0, 100], [0, 100], color=DARK, linestyle="--", linewidth=1)
     for i, colour in colours.items():
         axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=colour)
-    axis.set_title(f"95 % intervals contain {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
+    axis.set_title(f"95 % intervals contain {_told([100 * part.value for part in coverage], '{:.1f} %'.format)}")
     axis.set_xlabel("level of the interval [%]")
     axis.set_ylabel(f"{what} found in it [%]")
 
@@ -191,8 +191,8 @@ def _told(values: Sequence[float], form: Callable[[float], str]) -> str:
     return f"{form(np.nanmin(values))} to {form(np.nanmax(values))}"
 
 
-def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
-    for i, colour in _of_states(places).items():
+def _crps(axis, report: ConsistencyReport, indices: Sequence[int]) -> None:
+    for i, colour in _of_states(indices).items():
         axis.plot(_steps(report), report.crps_ratio[:, i], color=colour, linewidth=0.8)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
@@ -202,12 +202,12 @@ def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     axis.margins(x=0.01)
 
 
-def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+def _ranks(axis, report: ConsistencyReport, indices: Sequence[int]) -> None:
     assert report.ensemble is not None  # this panel is drawn of ensembles alone
     size = report.ensemble.size
-    for i, colour in _of_states(places).items():
-        found = report.ensemble.ranks[i]
-        axis.stairs(found.frequencies, found.edges * (size + 1), color=colour, linewidth=1.4)
+    for i, colour in _of_states(indices).items():
+        ranks = report.ensemble.ranks[i]
+        axis.stairs(ranks.frequencies, ranks.edges * (size + 1), color=colour, linewidth=1.4)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"rank of the truth among {size} members")
@@ -215,11 +215,11 @@ def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     axis.set_ylabel("frequency over that expected [-]")
 
 
-def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Sequence[int]) -> None:
-    apart = min(0.2, 0.8 / len(places))
-    for place, ratios in enumerate(comparison.values()):
-        for row, (i, colour) in enumerate(_of_states(places).items()):
-            ratio, height = ratios[i], -place - apart * (row - (len(places) - 1) / 2)
+def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], indices: Sequence[int]) -> None:
+    apart = min(0.2, 0.8 / len(indices))
+    for number, ratios in enumerate(comparison.values()):
+        for row, (i, colour) in enumerate(_of_states(indices).items()):
+            ratio, height = ratios[i], -number - apart * (row - (len(indices) - 1) / 2)
             axis.plot([ratio.low, ratio.high], [height, height], "|-", color=colour)
             axis.plot(ratio.value, height, "o", color=colour)
     axis.axvline(1, color=DARK, linestyle="--", linewidth=1)

@@ -36,7 +36,9 @@ def comparison_table(
     first = next(iter(evaluations.values()))
     if not first.has_truth:
         return _innovations_table(evaluations, where)
-    outputs = {symbol: one for found in evaluations.values() for symbol, one in found.outputs.items()}
+    outputs = {
+        symbol: output for evaluation in evaluations.values() for symbol, output in evaluation.outputs.items()
+    }
     layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
     columns, rows = layout(evaluations, bound, outputs)
     has_bound = not np.isnan(bound).all()
@@ -47,8 +49,8 @@ def comparison_table(
         columns, rows = without(columns, rows, ABOVE)
     caption = f"{above}±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
     lines = 1 if layout is _across else len(first.states) + len(outputs)
-    place = lowest([found.score.value for found in evaluations.values()])
-    best = range(place * lines, (place + 1) * lines) if place is not None else ()
+    index = lowest([evaluation.score.value for evaluation in evaluations.values()])
+    best = range(index * lines, (index + 1) * lines) if index is not None else ()
     return table(f"RMSE on {where}", columns, rows, caption=caption, best=best)
 
 
@@ -60,22 +62,22 @@ def lowest(values: Sequence[float]) -> int | None:
 
 def without(columns: Sequence[str], rows: Sequence[Sequence[str]], head: str) -> tuple[list, list]:
     """Columns and rows less the columns of one head."""
-    kept = [place for place, column in enumerate(columns) if column != head]
-    return [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
+    indices = [i for i, column in enumerate(columns) if column != head]
+    return [columns[i] for i in indices], [[row[i] for i in indices] for row in rows]
 
 
 def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
     """Columns and rows with all states side by side."""
     first = next(iter(evaluations.values()))
     digits, rows = decimals(first), []
-    for name, found in evaluations.items():
-        above = [unless_blank(part, "+.0f") for part in above_bound(found, bound)]
-        pairs = zip(found.rmse, digits, above, strict=True)
-        states = [cell for rmse, places, over in pairs for cell in (about(rmse, places), over)]
-        rows.append([name, *states, *(_output(found, symbol) for symbol in outputs), *consistency_cells(found)])
-    limits = [
-        cell for limit, places in zip(bound, digits, strict=True) for cell in (limit_cell(limit, places), "")
-    ]
+    for name, evaluation in evaluations.items():
+        above = [unless_blank(part, "+.0f") for part in above_bound(evaluation, bound)]
+        pairs = zip(evaluation.rmse, digits, above, strict=True)
+        states = [cell for rmse, count, over in pairs for cell in (about(rmse, count), over)]
+        rows.append(
+            [name, *states, *(_output(evaluation, symbol) for symbol in outputs), *consistency_cells(evaluation)]
+        )
+    limits = [cell for limit, count in zip(bound, digits, strict=True) for cell in (limit_cell(limit, count), "")]
     rows.append([expected_word(bound), *limits, *("" for _ in outputs), str(len(bound)), right_nis(first)])
     heads = [head for state in first.states for head in (two_lines(state), ABOVE)]
     return ["filter", *heads, *map(two_lines, outputs.values()), "NEES", "NIS"], rows
@@ -85,12 +87,12 @@ def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Ma
     """Columns and rows with a filter's states and outputs one below the other."""
     first = next(iter(evaluations.values()))
     digits, rows = decimals(first), []
-    for name, found in evaluations.items():
-        above = [unless_blank(part, "+.0f") for part in above_bound(found, bound)]
-        columns = found.states, found.rmse, digits, above
+    for name, evaluation in evaluations.items():
+        above = [unless_blank(part, "+.0f") for part in above_bound(evaluation, bound)]
+        columns = evaluation.states, evaluation.rmse, digits, above
         block = [[s.short_label, about(rmse, d), over] for s, rmse, d, over in zip(*columns, strict=True)]
-        block += [[outputs[symbol].short_label, _output(found, symbol), ""] for symbol in outputs]
-        heads = [[name, *consistency_cells(found)]] + [["", "", ""]] * (len(block) - 1)
+        block += [[outputs[symbol].short_label, _output(evaluation, symbol), ""] for symbol in outputs]
+        heads = [[name, *consistency_cells(evaluation)]] + [["", "", ""]] * (len(block) - 1)
         rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, block, strict=True)]
     limits = [[s.short_label, limit_cell(b, d), ""] for s, b, d in zip(first.states, bound, digits, strict=True)]
     limits = limits if any(cells[1] for cells in limits) else [["", "", ""]]
@@ -103,32 +105,40 @@ def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Tab
     """Metrics of the innovations, a row per filter."""
     first = next(iter(evaluations.values()))
     rows = [
-        [name, unless_blank(found.log_likelihood, ".2f"), consistency_cells(found)[1], str(found.divergences)]
-        for name, found in evaluations.items()
+        [
+            name,
+            unless_blank(evaluation.log_likelihood, ".2f"),
+            consistency_cells(evaluation)[1],
+            str(evaluation.divergences),
+        ]
+        for name, evaluation in evaluations.items()
     ]
     caption = f"log L: of a run, higher is better. Ideal: NIS {right_nis(first)}. div.: restarts."
     return table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
 
 
-def above_bound(found: Evaluation, bound: np.ndarray) -> list[float]:
+def above_bound(evaluation: Evaluation, bound: np.ndarray) -> list[float]:
     """The excess of each state's RMSE over the bound in percent; NaN where there is none."""
-    return [100.0 * (rmse.value / limit - 1.0) for rmse, limit in zip(found.rmse, bound, strict=True)]
+    return [100.0 * (rmse.value / limit - 1.0) for rmse, limit in zip(evaluation.rmse, bound, strict=True)]
 
 
-def decimals(found: Evaluation) -> list[int]:
+def decimals(evaluation: Evaluation) -> list[int]:
     """Decimals of each state's RMSE: three where its scale, or without one its RMSE, is about one, four at 0.1."""
-    sizes = [min(s if isfinite(s) else inf, rmse.value) for s, rmse in zip(found.scale, found.rmse, strict=True)]
+    sizes = [
+        min(s if isfinite(s) else inf, rmse.value)
+        for s, rmse in zip(evaluation.scale, evaluation.rmse, strict=True)
+    ]
     return [max(0, 3 - round(log10(size))) if 0 < size < inf else 3 for size in sizes]
 
 
-def consistency_cells(found: Evaluation) -> list[str]:
+def consistency_cells(evaluation: Evaluation) -> list[str]:
     """Mean NEES and NIS; empty without a covariance or, of NEES, without truth."""
-    return [unless_blank(mean.value, ".3g") for mean in (found.nees, found.nis)]
+    return [unless_blank(mean.value, ".3g") for mean in (evaluation.nees, evaluation.nis)]
 
 
-def right_nis(found: Evaluation) -> str:
+def right_nis(evaluation: Evaluation) -> str:
     """The expected mean NIS: the mean number of channels present."""
-    return unless_blank(found.expected_nis, ".3g")
+    return unless_blank(evaluation.expected_nis, ".3g")
 
 
 def two_lines(quantity: Quantity) -> str:
@@ -146,9 +156,9 @@ def limit_cell(bound: float, digits: int) -> str:
     return unless_blank(bound, ".2e" if digits > MOST_DECIMALS else f".{digits}f")
 
 
-def _output(found: Evaluation, symbol: str) -> str:
+def _output(evaluation: Evaluation, symbol: str) -> str:
     """RMSE of a derived output; empty where the filter's model has none."""
-    rmse = found.output_rmse.get(symbol)
+    rmse = evaluation.output_rmse.get(symbol)
     return "" if rmse is None else about(rmse, 3) if rmse.value >= 0.01 else f"{rmse.value:.3g}"
 
 

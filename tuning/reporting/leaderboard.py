@@ -36,23 +36,28 @@ def report(board: Leaderboard) -> list[RenderableType]:
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
     seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
-        shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
-        said = [without_truth(scenario.name)]
+        tables = [_predictions(board, f"{title}\nInnovations on {seeds}")]
+        remarks = [without_truth(scenario.name)]
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
-        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
+        tables, remarks = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
     noise = noise_sentence(board.rows, "--knows")
     beliefs = belief_sentences(board.rows)
     hint = ["--augment NAME:STD:WALK changes these assumptions."] if beliefs else []
     restarts = restart_sentences({row.label: row.evaluation for row in board.rows})
     restarts.append(slowest_sentence({row.label: row.evaluation for row in board.rows}, scenario))
-    return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, *restarts, f"{winners(board)}\n"]
+    return [*tables, *([noise] if noise else []), *beliefs, *hint, *remarks, *restarts, f"{winners(board)}\n"]
 
 
 def winner(board: Leaderboard) -> int | None:
     """Index of the row with the lowest score, without truth the highest log-likelihood; None if there is none."""
-    found = [row.evaluation for row in board.rows]
-    return lowest([one.score.value if one.has_truth else -one.log_likelihood for one in found])
+    evaluations = [row.evaluation for row in board.rows]
+    return lowest(
+        [
+            evaluation.score.value if evaluation.has_truth else -evaluation.log_likelihood
+            for evaluation in evaluations
+        ]
+    )
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
@@ -61,11 +66,11 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     rows = []
     for row in board.rows:
         cells = []
-        for rmse, above, places in zip(row.evaluation.rmse, row.above_bound, digits, strict=True):
-            cells += [about(rmse, places), unless_blank(100.0 * above, "+.0f")]
+        for rmse, above, count in zip(row.evaluation.rmse, row.above_bound, digits, strict=True):
+            cells += [about(rmse, count), unless_blank(100.0 * above, "+.0f")]
         rows.append([row.label, *cells, *map(_start_up, row.evaluation.start_up_rmse)])
     limits = [
-        cell for bound, places in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, places), "")
+        cell for bound, count in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, count), "")
     ]
     if not np.isnan(board.bound).all():
         rows.append(["bound", *limits, *("" for _ in states)])
@@ -80,21 +85,21 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     states, digits, rows = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation), []
     for row in board.rows:
         first = row.label == board.rows[0].label
-        found = row.evaluation
-        columns = states, found.rmse, digits, row.above_bound, found.start_up_rmse, row.ratios
+        evaluation = row.evaluation
+        columns = states, evaluation.rmse, digits, row.above_bound, evaluation.start_up_rmse, row.ratios
         block = [
-            [state.short_label, about(rmse, places), unless_blank(100.0 * above, "+.0f"), _start_up(begun)]
+            [state.short_label, about(rmse, count), unless_blank(100.0 * above, "+.0f"), _start_up(begun)]
             + ["1" if first else about(ratio, 3)]
-            for state, rmse, places, above, begun, ratio in zip(*columns, strict=True)
+            for state, rmse, count, above, begun, ratio in zip(*columns, strict=True)
         ]
         rows += [[row.label if i == 0 else "", *cells] for i, cells in enumerate(block)]
     limits = zip(states, board.bound, digits, strict=True)
-    bounds = [[state.short_label, limit_cell(bound, places), "", "", ""] for state, bound, places in limits]
+    bounds = [[state.short_label, limit_cell(bound, count), "", "", ""] for state, bound, count in limits]
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", ABOVE, "start-up", f"over\n{board.rows[0].label}"]
-    place, lines = winner(board), len(states)
-    best = () if place is None else range(place * lines, (place + 1) * lines)
+    index, lines = winner(board), len(states)
+    best = () if index is None else range(index * lines, (index + 1) * lines)
     heads, rows, caption = _with_bound_or_not(board, heads, rows)
     return table(title, heads, rows, caption=caption, best=best)
 
@@ -114,10 +119,10 @@ def _start_up(rmse: float) -> str:
 def _against(board: Leaderboard) -> Table:
     """Errors over those of the first filter, consistency and cost; errors of few states only."""
     states, first, n = board.rows[0].evaluation.states, board.rows[0].label, len(board.bound)
-    shown = states if 2 * n < MOST_COLUMNS else ()
+    listed = states if 2 * n < MOST_COLUMNS else ()
     rows = []
     for row in board.rows:
-        ratios = [*row.ratios[: len(shown)], row.score_ratio]
+        ratios = [*row.ratios[: len(listed)], row.score_ratio]
         cells = ["1" if row.label == first else about(ratio, 4 if slightly(ratio) else 3) for ratio in ratios]
         nees, nis = consistency_cells(row.evaluation)
         if nees:
@@ -126,7 +131,7 @@ def _against(board: Leaderboard) -> Table:
         rows.append([row.label, *cells, nees, nis, *cost])
     medians = any(row.nees_is_median for row in board.rows)
     right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
-    heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
+    heads = ["filter", *(state.symbol for state in listed), "score", "NEES", "NIS", "div.", "us/step"]
     caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
     title = f"Over {first}, paired; consistency and cost"
     return table(title, heads, rows, caption=caption, best=[winner(board)])
@@ -143,12 +148,12 @@ def _predictions(board: Leaderboard, title: str) -> Table:
     """How well filters predict the measurements, and their cost."""
     first, rows = board.rows[0].label, []
     for row in board.rows:
-        found = row.evaluation
+        evaluation = row.evaluation
         gain = (
             "0" if row.label == first and not isnan(row.likelihood_gain.value) else about(row.likelihood_gain, 2)
         )
-        cells = [unless_blank(found.log_likelihood, ".2f"), gain, consistency_cells(found)[1]]
-        rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
+        cells = [unless_blank(evaluation.log_likelihood, ".2f"), gain, consistency_cells(evaluation)[1]]
+        rows.append([row.label, *cells, str(evaluation.divergences), f"{row.microseconds:.3g}"])
     right = right_nis(board.rows[0].evaluation)
     caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
     heads = ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"]
@@ -175,7 +180,9 @@ def as_json(boards: list[Leaderboard]) -> dict:
 
 def _own_states(board: Leaderboard, first: Leaderboard) -> dict:
     """The names of a scenario's states where they are not those of the first one."""
-    names, known = ([state.short_label for state in one.rows[0].evaluation.states] for one in (board, first))
+    names, known = (
+        [state.short_label for state in compared.rows[0].evaluation.states] for compared in (board, first)
+    )
     return {} if names == known else {"states": names}
 
 

@@ -156,27 +156,27 @@ def text(value: Any) -> str:
     return f"{number:.17g}" if number >= 0 else f"({number:.17g})"
 
 
-def applied(name: str, *given: Any) -> Symbol:
+def applied(name: str, *arguments: Any) -> Symbol:
     """A function of `ONE` or `TWO` on what are not all numbers."""
-    form, count = (ONE[name], 1) if name in ONE and len(given) == 1 else (TWO.get(name, ""), 2)
-    if not form or len(given) != count:
-        raise TypeError(f"calls {name} with {len(given)} values")
-    parts = [text(one) for one in given]
-    tape = next(one.tape for one in given if isinstance(one, Symbol))
+    form, count = (ONE[name], 1) if name in ONE and len(arguments) == 1 else (TWO.get(name, ""), 2)
+    if not form or len(arguments) != count:
+        raise TypeError(f"calls {name} with {len(arguments)} values")
+    parts = [text(argument) for argument in arguments]
+    tape = next(argument.tape for argument in arguments if isinstance(argument, Symbol))
     return tape.note(form.format(*parts), *parts)
 
 
 def _stands_in(name: str, function: Callable) -> Callable:
     """A function of numbers that also takes symbols."""
 
-    def call(*given: Any) -> Any:
-        if not any(isinstance(one, Symbol) for one in given):
-            return function(*given)
-        if name == "log" and len(given) == 2:
-            return applied("log", given[0]) / call(given[1])
+    def call(*arguments: Any) -> Any:
+        if not any(isinstance(argument, Symbol) for argument in arguments):
+            return function(*arguments)
+        if name == "log" and len(arguments) == 2:
+            return applied("log", arguments[0]) / call(arguments[1])
         if name == "clip":
-            return applied("minimum", applied("maximum", given[0], given[1]), given[2])
-        return applied(name, *given)
+            return applied("minimum", applied("maximum", arguments[0], arguments[1]), arguments[2])
+        return applied(name, *arguments)
 
     return call
 
@@ -184,11 +184,11 @@ def _stands_in(name: str, function: Callable) -> Callable:
 def _least(name: str, function: Callable) -> Callable:
     """`min` or `max` of any numbers, or of a sequence, also of symbols."""
 
-    def call(*given: Any) -> Any:
-        some = tuple(given[0]) if len(given) == 1 else given
-        if not any(isinstance(one, Symbol) for one in some):
-            return function(some)
-        return reduce(lambda a, b: _stands_in(name, function)(a, b), some)
+    def call(*arguments: Any) -> Any:
+        operands = tuple(arguments[0]) if len(arguments) == 1 else arguments
+        if not any(isinstance(operand, Symbol) for operand in operands):
+            return function(operands)
+        return reduce(lambda a, b: _stands_in(name, function)(a, b), operands)
 
     return call
 
@@ -241,55 +241,55 @@ def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: An
     tape = Tape()
     try:
         run = _rebound(function, {})
-        found = run(*(tuple(Symbol(tape, name) for name in names) for names in arguments), constants)
-        results = [text(one) for one in found]
+        outputs = run(*(tuple(Symbol(tape, name) for name in names) for names in arguments), constants)
+        results = [text(output) for output in outputs]
     except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError) as error:
         what = str(error) if isinstance(error, Branch) else f"cannot be run on symbols ({_first_line(error)})"
         raise ValueError(f"{rule} {_place(error, function)} {what}") from None
-    return [*(f"{name} = {told};" for name, told in tape.lines(results)), f"[{'; '.join(results)}]"]
+    return [*(f"{name} = {expression};" for name, expression in tape.lines(results)), f"[{'; '.join(results)}]"]
 
 
-def _rebound(value: Any, seen: dict[int, Any]) -> Any:
+def _rebound(value: Any, rebound: dict[int, Any]) -> Any:
     """A function with what it calls by name, and the functions in its closure, put on symbols; else the value."""
     if not isinstance(value, types.FunctionType):
         return on_symbols(value)
-    if id(value) in seen:
-        return seen[id(value)]
+    if id(value) in rebound:
+        return rebound[id(value)]
     code, names = value.__code__, dict(value.__globals__)
     cells = None if value.__closure__ is None else tuple(types.CellType() for _ in value.__closure__)
     other = types.FunctionType(code, names, value.__name__, value.__defaults__, cells)
     other.__kwdefaults__ = value.__kwdefaults__
-    seen[id(value)] = other
+    rebound[id(value)] = other
     for name in _names(code):
         if name in names:
-            names[name] = _rebound(names[name], seen)
+            names[name] = _rebound(names[name], rebound)
         elif hasattr(builtins, name):
             names[name] = on_symbols(getattr(builtins, name))
     for cell, before in zip(cells or (), value.__closure__ or (), strict=True):
         try:
-            cell.cell_contents = _rebound(before.cell_contents, seen)
+            cell.cell_contents = _rebound(before.cell_contents, rebound)
         except ValueError:  # an empty one
             continue
     return other
 
 
 def _names(code: types.CodeType) -> set[str]:
-    inner = [_names(one) for one in code.co_consts if isinstance(one, types.CodeType)]
+    inner = [_names(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*inner)
 
 
 def _place(error: BaseException, function: Callable) -> str:
     """The last line of the user's that an error came through."""
-    found, at = None, error.__traceback__
+    innermost, at = None, error.__traceback__
     while at is not None:
         if at.tb_frame.f_code.co_filename not in OWN:
-            found = at
+            innermost = at
         at = at.tb_next
-    if found is None:
+    if innermost is None:
         return getattr(function, "__name__", "a function")
-    file = found.tb_frame.f_code.co_filename
-    line = linecache.getline(file, found.tb_lineno).strip()
-    return f"{Path(file).name}, line {found.tb_lineno},{f' {line!r},' if line else ''}"
+    file = innermost.tb_frame.f_code.co_filename
+    line = linecache.getline(file, innermost.tb_lineno).strip()
+    return f"{Path(file).name}, line {innermost.tb_lineno},{f' {line!r},' if line else ''}"
 
 
 def _first_line(error: BaseException) -> str:
@@ -393,7 +393,7 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     if pieces:
         lines += ["m.f = @transition;", "m.h = @measurement;"]
     text += "\n".join(lines) + "\nif nargin == 0, x = m; return; end\n"
-    turns = [j + 1 for j, one in enumerate(model.measurements) if one.angle]
+    turns = [j + 1 for j, channel in enumerate(model.measurements) if channel.angle]
     wrap = f"\n    e({turns}) = mod(e({turns}) + pi, 2 * pi) - pi;  % the short way round" if turns else ""
     return (
         text
@@ -416,12 +416,12 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
     """Functions f and h, and more fields of the struct; ValueError if they cannot be written out."""
     if isinstance(model, AffineModel):
         a, b, offset, c, shift = model.matrices()
-        moved = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
-        moved += f" + {_matrix(b)} * u(:);" if model.inputs else ";"
+        transition = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
+        transition += f" + {_matrix(b)} * u(:);" if model.inputs else ";"
         read = f"z = {_matrix(c)} * x + {_matrix(shift[:, None])};"
         fields = [f"m.A = {_matrix(a)};", f"m.B = {_matrix(b)};", f"m.C = {_matrix(c)};"]
         return (
-            f"\nfunction y = transition(x, u)\n{moved}\nend\n\nfunction z = measurement(x)\n{read}\nend\n",
+            f"\nfunction y = transition(x, u)\n{transition}\nend\n\nfunction z = measurement(x)\n{read}\nend\n",
             fields,
         )
     x, u = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
@@ -429,10 +429,10 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
     h = traced(model.observe, (x,), model.given_constants)
     if max(len(f), len(h)) > LONGEST:
         raise ValueError(f"f and h must have at most {LONGEST} lines, but they have {len(f)} and {len(h)}")
-    whole = "\n".join(f"    {line}" for line in (*f[:-1], f"x = {f[-1]};"))
-    loop = f"for part = 1:{model.substeps}\n{whole}\nend\ny = x;"
-    seen = "\n".join((*h[:-1], f"z = {h[-1]};"))
-    return f"\nfunction y = transition(x, u)\n{loop}\nend\n\nfunction z = measurement(x)\n{seen}\nend\n", []
+    substep = "\n".join(f"    {line}" for line in (*f[:-1], f"x = {f[-1]};"))
+    loop = f"for part = 1:{model.substeps}\n{substep}\nend\ny = x;"
+    measurement = "\n".join((*h[:-1], f"z = {h[-1]};"))
+    return f"\nfunction y = transition(x, u)\n{loop}\nend\n\nfunction z = measurement(x)\n{measurement}\nend\n", []
 
 
 def _matrix(values: np.ndarray) -> str:
@@ -446,4 +446,4 @@ def _matrix(values: np.ndarray) -> str:
 
 
 def _listed(quantities) -> str:
-    return ", ".join(one.label for one in quantities) or "none"
+    return ", ".join(quantity.label for quantity in quantities) or "none"

@@ -43,23 +43,23 @@ def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
     """
     from matplotlib import rc_context
 
-    for place, axis in enumerate(figure.axes):
-        axis.set_gid(f"axes{place}")
+    for number, axis in enumerate(figure.axes):
+        axis.set_gid(f"axes{number}")
         for row, line in enumerate(axis.lines):
-            line.set_gid(f"line{place}-{row}")
+            line.set_gid(f"line{number}-{row}")
     stream = io.BytesIO()
     with rc_context(OPTIONS):
         figure.savefig(stream, format="svg", transparent=True, metadata=NO_METADATA)
     text = stream.getvalue().decode()
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(
-        r"<!--.*?-->\s*|\n\s*", lambda found: "" if found[0].startswith("<!") else "\n", text, flags=re.S
+        r"<!--.*?-->\s*|\n\s*", lambda match: "" if match[0].startswith("<!") else "\n", text, flags=re.S
     )
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)
     text = FONTS.sub("'DejaVu Sans', sans-serif", text.replace("xlink:href", "href"))
-    places = 1 if len(text) > LARGE else 2
-    text = PLACES.sub(lambda found: f'{found[1]}="{_short(found[2], places)}"', text)
-    text = COLOUR.sub(lambda found: f"var(--c-{found[1].lower()})", text)
+    digits = 1 if len(text) > LARGE else 2
+    text = PLACES.sub(lambda match: f'{match[1]}="{_short(match[2], digits)}"', text)
+    text = COLOUR.sub(lambda match: f"var(--c-{match[1].lower()})", text)
     head, _, body = text.partition(">")
     box = re.search(r'viewBox="([^"]*)"', head)
     assert box is not None  # matplotlib always writes it
@@ -69,8 +69,8 @@ def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
 def palette(page: str) -> str:
     """Style sheet of the colours that a page's pictures use, on white paper and on dark."""
     used = sorted(set(re.findall(r"var\(--c-([0-9a-f]{6})\)", page)))
-    light = "".join(f"--c-{one}:#{one};" for one in used)
-    dark = "".join(f"--c-{one}:{on_dark(f'#{one}')};" for one in used)
+    light = "".join(f"--c-{colour}:#{colour};" for colour in used)
+    dark = "".join(f"--c-{colour}:{on_dark(f'#{colour}')};" for colour in used)
     return (
         f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root:not(.light){{{dark}}}}}\n"
         f"@media screen{{:root.dark{{{dark}}}}}"
@@ -99,11 +99,11 @@ def on_dark(colour: str) -> str:
 def plain(label: str) -> str:
     """A label of a figure without its mathematics: of a Greek letter in TeX it is that letter."""
 
-    def letter(found: re.Match) -> str:
+    def letter(match: re.Match) -> str:
         try:
-            return unicodedata.lookup(f"GREEK SMALL LETTER {found[1].upper()}")
+            return unicodedata.lookup(f"GREEK SMALL LETTER {match[1].upper()}")
         except KeyError:
-            return found[1]
+            return match[1]
 
     return " ".join(re.sub(r"[${}]", "", re.sub(r"\\([a-zA-Z]+)", letter, label)).split())
 
@@ -111,20 +111,20 @@ def plain(label: str) -> str:
 def _readings(figure: Figure, name: str) -> str:
     """Positions and contents of axes, and their readable lines; empty if there is none."""
     width, height = figure.get_size_inches() * 72.0
-    found = [_axes(axis, place, name, width, height) for place, axis in enumerate(figure.axes)]
-    found = [one for one in found if one["lines"]]
-    return escape(json.dumps(found, separators=(",", ":")), quote=True) if found else ""
+    readings = [_axes(axis, number, name, width, height) for number, axis in enumerate(figure.axes)]
+    readings = [reading for reading in readings if reading["lines"]]
+    return escape(json.dumps(readings, separators=(",", ":")), quote=True) if readings else ""
 
 
-def _axes(axis: Axes, place: int, name: str, width: float, height: float) -> dict[str, Any]:
+def _axes(axis: Axes, number: int, name: str, width: float, height: float) -> dict[str, Any]:
     box = axis.get_position()
     lines = [
-        [f"{name}-line{place}-{row}", plain(label if not label.startswith("_") else axis.get_ylabel())]
+        [f"{name}-line{number}-{row}", plain(label if not label.startswith("_") else axis.get_ylabel())]
         for row, (line, label) in enumerate((line, str(line.get_label())) for line in axis.lines)
         if len(line.get_path()) >= READ_FROM and line.get_linestyle() != "None"
     ]
     return {
-        "id": f"{name}-axes{place}",
+        "id": f"{name}-axes{number}",
         "box": [round(part, 2) for part in (box.x0 * width, (1 - box.y1) * height, box.x1 * width)]
         + [round((1 - box.y0) * height, 2)],
         "x": [float(part) for part in axis.get_xlim()],
@@ -135,10 +135,12 @@ def _axes(axis: Axes, place: int, name: str, width: float, height: float) -> dic
     }
 
 
-def _short(places: str, digits: int) -> str:
+def _short(coordinates: str, digits: int) -> str:
     """Coordinates to so many digits of a point."""
-    places = places.replace("\n", " ")
-    return re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.{digits}f}".rstrip("0").rstrip("."), places)
+    coordinates = coordinates.replace("\n", " ")
+    return re.sub(
+        r"-?\d+\.\d+", lambda match: f"{float(match[0]):.{digits}f}".rstrip("0").rstrip("."), coordinates
+    )
 
 
 def _parts(colour: str) -> tuple[float, ...]:
@@ -201,10 +203,10 @@ class Picture(NamedTuple):
 
     def html(self) -> str:
         """The picture within the page itself."""
-        found = re.match(r'<svg viewBox="0 0 ([\d.]+) ([\d.]+)"', self.svg)
-        width, height = (float(part) for part in found.groups()) if found else (0.0, 0.0)
+        match = re.match(r'<svg viewBox="0 0 ([\d.]+) ([\d.]+)"', self.svg)
+        width, height = (float(part) for part in match.groups()) if match else (0.0, 0.0)
         size = f'width="{width * 4 / 3:.0f}" height="{height * 4 / 3:.0f}"'
-        kinds = [name for name, there in (("read", self.readings), ("wide", width > WIDE)) if there]
+        kinds = [name for name, applies in (("read", self.readings), ("wide", width > WIDE)) if applies]
         marks = f' class="{" ".join(kinds)}"' if kinds else ""
         read = f' data-read="{typeset(self.readings)}"' if self.readings else ""
         svg = typeset(self.svg).replace("<svg", f'<svg role="img" aria-label="{_text(self.alt)}" {size}', 1)
@@ -256,9 +258,9 @@ class Pair(NamedTuple):
             f'<div><p class="whose">{escape(name)}</p>{part.html() if part else ""}</div>'
             for name, part in zip(self.names, self.parts, strict=True)
         )
-        tables = [one for one in self.parts if isinstance(one, Table)]
+        tables = [part for part in self.parts if isinstance(part, Table)]
         kind = "pair close" if not tables else "pair"
-        kind += " deep" if any(len(one.columns) > NARROW for one in tables) else ""
+        kind += " deep" if any(len(table.columns) > NARROW for table in tables) else ""
         return f'<div class="{kind}">{cells}</div>'
 
 
@@ -288,9 +290,9 @@ def html_page(
         sections: what follows.
         two_columns: whether it is wide, for two studies.
     """
-    told = [advice] if isinstance(advice, str) else advice
-    said = "\n".join(f'<p class="advice">{escape(one)}</p>' for one in told)
-    contents = "".join(f'<li><a href="#{one.anchor}">{escape(one.title)}</a></li>' for one in sections)
+    sentences = [advice] if isinstance(advice, str) else advice
+    paragraphs = "\n".join(f'<p class="advice">{escape(sentence)}</p>' for sentence in sentences)
+    contents = "".join(f'<li><a href="#{section.anchor}">{escape(section.title)}</a></li>' for section in sections)
     body = "\n".join(
         f'<section id="{section.anchor}">\n<h2>{escape(section.title)}</h2>\n'
         + "\n".join(part.html() for part in section.parts)
@@ -303,7 +305,7 @@ def html_page(
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}{palette(body)}</style>\n</head>\n<body{kind}>\n<main>\n"
-        f"<h1>{escape(title)}</h1>\n{said}\n"
+        f"<h1>{escape(title)}</h1>\n{paragraphs}\n"
         f'<nav aria-label="contents"><strong>Contents</strong><ol>{contents}</ol></nav>\n'
         f"{body}\n</main>{script}\n</body>\n</html>\n"
     )
@@ -311,13 +313,13 @@ def html_page(
 
 def markdown_page(title: str, advice: str, tables: Sequence[Table]) -> str:
     """Title, advice and tables as Markdown."""
-    return "\n\n".join([f"# {_plain(title)}", _plain(advice), *(one.markdown() for one in tables)]) + "\n"
+    return "\n\n".join([f"# {_plain(title)}", _plain(advice), *(table.markdown() for table in tables)]) + "\n"
 
 
 def _cell(text: str, head: str = "") -> str:
     """A cell of a page; the interval of a value stands below it, and the head of its column is kept with it."""
-    found = INTERVAL.fullmatch(text)
-    value, below = (found[1], f"<small>{escape(found[2])}</small>") if found else (text, "")
+    match = INTERVAL.fullmatch(text)
+    value, below = (match[1], f"<small>{escape(match[2])}</small>") if match else (text, "")
     named = f' data-head="{_text(head)}"' if head else ""
     return f"<td{named}>{_text(value)}{below}</td>"
 

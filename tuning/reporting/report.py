@@ -82,19 +82,19 @@ def write_report(
     subject = find_subject(source, storage, problems)
     name = Path(source).stem if is_file(source) else subject.name
     page, tables = report_files(source, name, out)
-    found = pages_of(source, subject, file=file)
-    write_whole(page, html_page(found.title, found.advice, found.sections))
-    write_whole(tables, markdown_page(found.title, found.advice, found.tables))
-    return Report(page, tables, found.advice)
+    contents = pages_of(source, subject, file=file)
+    write_whole(page, html_page(contents.title, contents.advice, contents.sections))
+    write_whole(tables, markdown_page(contents.title, contents.advice, contents.tables))
+    return Report(page, tables, contents.advice)
 
 
 def report_files(source: str | Path, name: str, out: str | Path | None) -> tuple[Path, Path]:
     """Page and tables of a name, in `out` or beside the tuned file; ValueError if they cannot be written."""
     folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
-    found = folder / f"{name}.html", folder / f"{name}.md"
-    for target in found:
+    targets = folder / f"{name}.html", folder / f"{name}.md"
+    for target in targets:
         check_target(target)
-    return found
+    return targets
 
 
 def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str | None = None) -> Pages:
@@ -109,16 +109,16 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
-    kept = [stored_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
+    stored = [stored_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
     comparisons = [
         evaluate_held_out(choice, scenario, plan.seed, subject.seeds) if comparison is None else comparison
-        for comparison, scenario in zip(kept, plan.scenarios, strict=True)
+        for comparison, scenario in zip(stored, plan.scenarios, strict=True)
     ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     known = identify(choice, plan.scenarios, data, plan.space())
     identified = at_ends(choice, plan)
     identified += sentences(known) if known else too_many(choice, plan.space())
-    nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
+    nis = subject.nis or [nis_ratio(values) for values in measure(choice, plan, data)]
     numbers = [
         numbers_table(choice, plan.scenarios[0], plan.seed, comparisons[0].default),
         *([known_table(known)] if known else []),
@@ -152,8 +152,8 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
 
 def data_sections(problems: Sequence[Problem]) -> list[Section]:
     """A section with remarks on the data, if there are any."""
-    said = [one for problem in problems for one in problem.remarks]
-    return [Section("The data", [Words(said)])] if said else []
+    remarks = [remark for problem in problems for remark in problem.remarks]
+    return [Section("The data", [Words(remarks)])] if remarks else []
 
 
 def _short(name: str) -> str:
@@ -187,32 +187,32 @@ def write_two_studies(sources: Sequence[Source], out: str | Path | None = None) 
     """
     if len(sources) != 2:
         raise ValueError(f"a side-by-side report must be of two studies, but got {len(sources)}")
-    subjects = [find_subject(one.name, one.storage, one.problems) for one in sources]
+    subjects = [find_subject(source.name, source.storage, source.problems) for source in sources]
     names = [
-        Path(one.name).stem if is_file(one.name) else subject.name
-        for one, subject in zip(sources, subjects, strict=True)
+        Path(source.name).stem if is_file(source.name) else subject.name
+        for source, subject in zip(sources, subjects, strict=True)
     ]
     names = (
         names if names[0] != names[1] else [f"{name} ({which})" for name, which in zip(names, "12", strict=True)]
     )
     page, tables = report_files(sources[0].name, "-beside-".join(names), out)
-    found = [
-        pages_of(one.name, subject, prefix, one.file)
-        for one, subject, prefix in zip(sources, subjects, "ab", strict=True)
+    pages = [
+        pages_of(source.name, subject, prefix, source.file)
+        for source, subject, prefix in zip(sources, subjects, "ab", strict=True)
     ]
     title = " beside ".join(names)
-    told = [f"{name}: {one.advice}" for name, one in zip(names, found, strict=True)]
-    table, said = _summary(names, found)
-    sections = [Section("Side by side", [table, *([Words([said])] if said else [])]), *_paired(names, found)]
-    write_whole(page, html_page(title, told, sections, two_columns=True))
-    every = [table, *found[0].tables, *found[1].tables]
-    write_whole(tables, markdown_page(title, "\n".join(told), every))
-    return Report(page, tables, "\n".join(told))
+    advice = [f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True)]
+    table, remark = _summary(names, pages)
+    sections = [Section("Side by side", [table, *([Words([remark])] if remark else [])]), *_paired(names, pages)]
+    write_whole(page, html_page(title, advice, sections, two_columns=True))
+    every = [table, *pages[0].tables, *pages[1].tables]
+    write_whole(tables, markdown_page(title, "\n".join(advice), every))
+    return Report(page, tables, "\n".join(advice))
 
 
-def _paired(names: Sequence[str], found: Sequence[Pages]) -> list[Section]:
+def _paired(names: Sequence[str], pages: Sequence[Pages]) -> list[Section]:
     """Sections of both, those of the same title beside each other."""
-    first, second = ({section.title: section.parts for section in one.sections} for one in found)
+    first, second = ({section.title: section.parts for section in page.sections} for page in pages)
     sections = []
     for title in [*first, *(title for title in second if title not in first)]:
         rows: Iterable[Any] = zip_longest(first.get(title, []), second.get(title, []))
@@ -220,35 +220,38 @@ def _paired(names: Sequence[str], found: Sequence[Pages]) -> list[Section]:
     return sections
 
 
-def _summary(names: Sequence[str], found: Sequence[Pages]) -> tuple[Table, str]:
+def _summary(names: Sequence[str], pages: Sequence[Pages]) -> tuple[Table, str]:
     """Held-out metrics of both tuned filters, and the paired ratio if the problem is the same."""
-    choices = [one.subject.choice for one in found]
-    tuned = [one.comparisons[0].tuned for one in found]
+    choices = [page.subject.choice for page in pages]
+    tuned = [page.comparisons[0].tuned for page in pages]
     rows = [
         ["filter", *(choice.name for choice in choices)],
-        ["problem", *(one.subject.plan.scenarios[0].name for one in found)],
+        ["problem", *(page.subject.plan.scenarios[0].name for page in pages)],
     ]
     labels = dict.fromkeys(state.label for evaluation in tuned for state in evaluation.states)
-    by_state = [{state.label: rmse for state, rmse in zip(one.states, one.rmse, strict=True)} for one in tuned]
-    rows += [[f"RMSE {label}", *(_value(one.get(label)) for one in by_state)] for label in labels]
+    by_state = [
+        {state.label: rmse for state, rmse in zip(evaluation.states, evaluation.rmse, strict=True)}
+        for evaluation in tuned
+    ]
+    rows += [[f"RMSE {label}", *(_value(rmse.get(label)) for rmse in by_state)] for label in labels]
     rows += [
-        ["score", *(_value(one.score) for one in tuned)],
-        ["mean NEES", *(_value(one.nees) for one in tuned)],
-        ["mean NIS", *(_value(one.nis) for one in tuned)],
-        ["log-likelihood of a run", *(_value(Interval(*[one.log_likelihood] * 3)) for one in tuned)],
+        ["score", *(_value(evaluation.score) for evaluation in tuned)],
+        ["mean NEES", *(_value(evaluation.nees) for evaluation in tuned)],
+        ["mean NIS", *(_value(evaluation.nis) for evaluation in tuned)],
+        ["log-likelihood of a run", *(_value(Interval(*[evaluation.log_likelihood] * 3)) for evaluation in tuned)],
     ]
     rows = [row for row in rows if any(row[1:])]
-    return Table("On held-out data, with 95 % intervals", ["", *names], rows), _ratio(names, found)
+    return Table("On held-out data, with 95 % intervals", ["", *names], rows), _ratio(names, pages)
 
 
-def _ratio(names: Sequence[str], found: Sequence[Pages]) -> str:
+def _ratio(names: Sequence[str], pages: Sequence[Pages]) -> str:
     """The ratio of both scores, or the difference of likelihoods, paired; empty where problems differ."""
-    problems = [one.subject.plan.scenarios[0] for one in found]
-    seeds = [one.comparisons[0].seeds for one in found]
+    problems = [page.subject.plan.scenarios[0] for page in pages]
+    seeds = [page.comparisons[0].seeds for page in pages]
     if problems[0].digest != problems[1].digest or seeds[0] != seeds[1]:
         return "The two have different problems or held-out data, so their scores are not paired."
     data = problems[0].data(seeds[0])
-    a, b = (evaluate(one.subject.choice.filter(problems[0]), data, problems[0].scale) for one in found)
+    a, b = (evaluate(page.subject.choice.filter(problems[0]), data, problems[0].scale) for page in pages)
     if a.has_truth:
         ratio = score_ratio(a, b)
         return f"Score of {names[0]} over that of {names[1]}, paired by run: {_value(ratio)}."
@@ -256,10 +259,10 @@ def _ratio(names: Sequence[str], found: Sequence[Pages]) -> str:
     return f"Log-likelihood of a run of {names[0]} less that of {names[1]}, paired by run: {_value(gain)}."
 
 
-def _value(found: Interval | None) -> str:
+def _value(interval: Interval | None) -> str:
     """A value with its interval; empty where there is none."""
-    if found is None or not isfinite(found.value):
+    if interval is None or not isfinite(interval.value):
         return ""
-    if found.low == found.high:
-        return rounded(found.value)
-    return f"{rounded(found.value)} [{rounded(found.low)}, {rounded(found.high)}]"
+    if interval.low == interval.high:
+        return rounded(interval.value)
+    return f"{rounded(interval.value)} [{rounded(interval.low)}, {rounded(interval.high)}]"

@@ -69,14 +69,14 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str, objectiv
         x, y = [trial.number + 1 for trial, _ in early], [plotted(value) for _, value in early]
         axis.plot(x, y, "x", color=GREY, markersize=4, label="pruned: mean of its seeds")
     for inside, face, name in ((True, GREY, "trial"), (False, "none", "NIS outside its band")):
-        some = [trial for trial in done[1:] if is_consistent(trial) == inside]
-        if some:
-            x, y = [trial.number + 1 for trial in some], [plotted(trial.values[0]) for trial in some]
+        marked = [trial for trial in done[1:] if is_consistent(trial) == inside]
+        if marked:
+            x, y = [trial.number + 1 for trial in marked], [plotted(trial.values[0]) for trial in marked]
             axis.plot(x, y, "o", color=GREY, markerfacecolor=face, markersize=4, label=name)
     if done:
         axis.plot(done[0].number + 1, plotted(values[0]), "s", color=RUST, markersize=7, label="first trial")
-        kept = [is_consistent(trial) for trial in done]
-        counted = np.where(kept, values, np.inf) if any(kept) else values
+        consistent = [is_consistent(trial) for trial in done]
+        counted = np.where(consistent, values, np.inf) if any(consistent) else values
         best = np.minimum.accumulate(counted)
         best[np.isinf(best)] = np.nan
         axis.step(
@@ -124,15 +124,17 @@ def draw_comparison(comparison: Comparison, title: str, filter_name: str = "ekf"
         raise ValueError("a figure of errors needs the truth, but there is none")
     colours = {**COLOURS, TUNED: colour_of(filter_name)}
     names, states = comparison.evaluations, comparison.tuned.states
-    places, left_out = plotted_states(states, comparison.tuned.scored)
-    width = 4.0 if len(places) > 1 else 5.2
-    figure, axes = panels(len(places), COLUMNS, (width, 3.4), extra=0.6)
-    for axis, i in zip(axes, places, strict=True):
-        for place, (name, evaluation) in enumerate(names.items()):
+    indices, left_out = plotted_states(states, comparison.tuned.scored)
+    width = 4.0 if len(indices) > 1 else 5.2
+    figure, axes = panels(len(indices), COLUMNS, (width, 3.4), extra=0.6)
+    for axis, i in zip(axes, indices, strict=True):
+        for position, (name, evaluation) in enumerate(names.items()):
             rmse = evaluation.rmse[i]
             whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
-            axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=colours[name], capsize=4)
-            axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
+            axis.bar(position, rmse.value, 0.62, yerr=whiskers, color=colours[name], capsize=4)
+            axis.annotate(
+                f"{rmse.value:.3g}", (position, rmse.high), (0, 4), textcoords="offset points", ha="center"
+            )
         if np.isfinite(comparison.bound[i]):
             axis.axhline(comparison.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
         axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names], fontsize=8)
@@ -188,20 +190,20 @@ def _with_pruned(study: optuna.Study) -> optuna.Study:
     optuna.logging.set_verbosity(before)
     copied.add_trials(trials)
     for trial, value in early_trials(study.get_trials(deepcopy=False)):
-        made = optuna.trial.create_trial(params=trial.params, distributions=trial.distributions, value=value)
-        copied.add_trial(made)
+        early = optuna.trial.create_trial(params=trial.params, distributions=trial.distributions, value=value)
+        copied.add_trial(early)
     return copied
 
 
-def draw_importance(found: Mapping[str, float]) -> Figure:
+def draw_importance(importances: Mapping[str, float]) -> Figure:
     """Importance of each number, the largest above."""
-    figure = new_figure((6.4, 0.9 + 0.4 * len(found)))
+    figure = new_figure((6.4, 0.9 + 0.4 * len(importances)))
     axis = figure.subplots()
     tidy([axis])
-    names, values = list(found)[::-1], list(found.values())[::-1]
+    names, values = list(importances)[::-1], list(importances.values())[::-1]
     axis.barh([words(name) for name in names], values, 0.6, color=BLUE)
-    for place, value in enumerate(values):
-        axis.annotate(f"{value:.2f}", (value, place), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    for row, value in enumerate(values):
+        axis.annotate(f"{value:.2f}", (value, row), (4, 0), textcoords="offset points", va="center", fontsize=9)
     axis.margins(x=0.12)
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("importance, of a sum of 1 [-]")
@@ -220,10 +222,10 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCOR
     assert best is not None  # a report is of a study with a complete trial
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes, names, strict=True):
-        places = [trial.params[name] for trial in done]
+        tried = [trial.params[name] for trial in done]
         axis.scatter(
-            places,
-            [reported(objective, one) for one in values],
+            tried,
+            [reported(objective, value) for value in values],
             s=16,
             facecolors=faces,
             edgecolors=BLUE,
@@ -234,8 +236,8 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCOR
         axis.plot(*crosses, "x", **CROSS)
         axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
         if getattr(best.distributions[name], "log", False):
-            if len({*places, *(trial.params[name] for trial, _ in early)}) == 1:
-                axis.set_xlim(places[0] / 2.0, places[0] * 2.0)  # the few trials of a short study may be alike
+            if len({*tried, *(trial.params[name] for trial, _ in early)}) == 1:
+                axis.set_xlim(tried[0] / 2.0, tried[0] * 2.0)  # the few trials of a short study may be alike
             axis.set_xscale("log")
         if name == "N" or name.endswith(" N"):
             _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
@@ -270,9 +272,9 @@ def draw_front(
     for axis_name, column in (("x", 0), ("y", 1)):
         low, high = best[:, column].min(), best[:, column].max()
         room = 0.5 * (high - low) or 0.2 * abs(low) or 1.0
-        shown = done[done[:, column] <= high + room, column]
-        pad = 0.08 * (shown.max() - low) or room
-        ends = signs[column] * np.array([low - pad, shown.max() + pad])
+        near = done[done[:, column] <= high + room, column]
+        pad = 0.08 * (near.max() - low) or room
+        ends = signs[column] * np.array([low - pad, near.max() + pad])
         getattr(axis, f"set_{axis_name}lim")(*sorted(ends))
     axis.set_xlabel(verbatim(labels[0]))
     axis.set_ylabel(verbatim(labels[1]))
@@ -280,19 +282,19 @@ def draw_front(
     return figure
 
 
-def draw_sizes(sizes: Sequence[SizeRow], kept: int) -> Figure:
+def draw_sizes(sizes: Sequence[SizeRow], chosen: int) -> Figure:
     """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
     states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
-    places, left_out = plotted_states(states, sizes[0].evaluation.scored)
-    width = 4.0 if len(places) > 1 else 5.2
-    figure, axes = panels(len(places), COLUMNS, (width, 3.6))
-    for axis, i in zip(axes, places, strict=True):
-        found = np.array([row.evaluation.rmse[i] for row in sizes])
-        axis.fill_between(numbers, found[:, 1], found[:, 2], color=BLUE, alpha=0.2, linewidth=0)
-        axis.plot(numbers, found[:, 0], "o-", color=BLUE, markersize=4, linewidth=1)
-        axis.axvline(kept, color=RUST, linestyle="--", linewidth=1)
-        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-        axis.annotate(f"N = {kept}", (kept, 1), (4, -10), **place, color=RUST, fontsize=9)
+    indices, left_out = plotted_states(states, sizes[0].evaluation.scored)
+    width = 4.0 if len(indices) > 1 else 5.2
+    figure, axes = panels(len(indices), COLUMNS, (width, 3.6))
+    for axis, i in zip(axes, indices, strict=True):
+        rmse = np.array([row.evaluation.rmse[i] for row in sizes])
+        axis.fill_between(numbers, rmse[:, 1], rmse[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+        axis.plot(numbers, rmse[:, 0], "o-", color=BLUE, markersize=4, linewidth=1)
+        axis.axvline(chosen, color=RUST, linestyle="--", linewidth=1)
+        coordinates = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        axis.annotate(f"N = {chosen}", (chosen, 1), (4, -10), **coordinates, color=RUST, fontsize=9)
         _size_axis(axis, numbers)
         axis.set_xlabel("ensemble size N [-]")
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")

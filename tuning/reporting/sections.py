@@ -71,19 +71,21 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
 
     The covariance is checked by the mean NEES; without truth by the mean NIS.
     """
-    places = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
-    gains = [f"{tuning_effect(comparison)}{place}" for comparison, place in zip(comparisons, places, strict=True)]
+    suffixes = [f" on {scenario.name}" if len(comparisons) > 1 else "" for scenario in plan.scenarios]
+    gains = [
+        f"{tuning_effect(comparison)}{suffix}" for comparison, suffix in zip(comparisons, suffixes, strict=True)
+    ]
     subject = "On held-out runs the tuned filter" if chosen else "Tuning"
     parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
     squares = [consistency_of(comparison) for comparison in comparisons]
     if not any(isnan(mean.value) for _, mean, *_ in squares):
-        found = [
-            f"{word}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
-            for (name, mean, right, word), place in zip(squares, places, strict=True)
+        consistencies = [
+            f"{word}{suffix} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
+            for (name, mean, right, word), suffix in zip(squares, suffixes, strict=True)
         ]
-        parts.append(f"the covariance is {' and '.join(found)}")
+        parts.append(f"the covariance is {' and '.join(consistencies)}")
     warned = all_warnings(comparisons, plan.scenarios, plan.forget)
     warned += range_warning(choice, plan)
     doubts = [model_doubts(*pair, plan.seed) for pair in zip(plan.scenarios, comparisons, strict=True)]
@@ -101,12 +103,12 @@ def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[C
             continue
         where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
         bound = ", and the bound" if isfinite(comparison.bound).any() else ""
-        name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
+        name, title = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
         scaling = scaling_sentence(comparison)
-        said = [*([scaling] if scaling else []), *restarts]
-        parts += [errors_table(scenario, comparison), Words(said)]
+        remarks = [*([scaling] if scaling else []), *restarts]
+        parts += [errors_table(scenario, comparison), Words(remarks)]
         caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
-        parts.append(book.picture(draw_comparison(comparison, place, name), caption, of_comparison(comparison)))
+        parts.append(book.picture(draw_comparison(comparison, title, name), caption, of_comparison(comparison)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
 
 
@@ -114,8 +116,8 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     """The course of the study: convergence, importances, slices, and the front of two objectives."""
     study, title = subject.study, "The study"
     if study is None:
-        said = f"Study {subject.name!r} is not in the storage, so its course is not shown here."
-        return Section(title, [Words([said])])
+        remark = f"Study {subject.name!r} is not in the storage, so its course is not shown here."
+        return Section(title, [Words([remark])])
     trials = study.get_trials(deepcopy=False)
     objectives = subject.plan.objectives
     labels = [
@@ -148,8 +150,8 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
 
 def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Words:
     """Importances, and how they were computed; or how many trials they need."""
-    found = importances(study)
-    if not found:
+    shares = importances(study)
+    if not shares:
         return Words([f"Importances need {FEWEST_TRIALS} finished trials or more."])
     complete, early = counted_trials(study)
     rough = ", rough on so few" if complete + early < MANY_TRIALS else ""
@@ -158,7 +160,7 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
         "Importance of each parameter for a trial to be among the best tenth, from the difference between "
         f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
-    return book.picture(draw_importance(found), caption, of_importances(found))
+    return book.picture(draw_importance(shares), caption, of_importances(shares))
 
 
 def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
@@ -180,17 +182,17 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
     fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
     where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
     caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
-    kept = subject.choice.numbers["ensemble_size"]
+    size = subject.choice.numbers["ensemble_size"]
     ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
-    said = (
+    explanation = (
         f"Score relative to the best, paired on the same {first.seed_word}; the largest of several scenarios. "
         "The smallest N whose upper end is below 1.01 is sufficient"
     )
     columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
     if len({row.seeds for row in sizes}) == 1:
         columns, ratios = columns[:-1], [row[:-1] for row in ratios]
-    picture = book.picture(draw_sizes(sizes, kept), caption, of_sizes(sizes, kept))
-    return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
+    picture = book.picture(draw_sizes(sizes, size), caption, of_sizes(sizes, size))
+    return Section("Error against ensemble size", [picture, Table(explanation, columns, ratios)])
 
 
 # Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study.
@@ -201,10 +203,10 @@ MOST_ROWS = 40  # of a table of variances
 
 def score_section(subject: Subject) -> Section:
     """The definition of the score, in words and with its scales."""
-    said = []
+    paragraphs = []
     for scenario in subject.plan.scenarios:
         if scenario.scale is None:
-            said.append(
+            paragraphs.append(
                 f"{scenario.name} has no truth, so there is no score. The criterion is the log-likelihood of "
                 "the innovations, the probability that the filter assigns to the measurements; higher is "
                 "better."
@@ -216,16 +218,16 @@ def score_section(subject: Subject) -> Section:
             for state, scale in zip(states, scenario.scale, strict=False)
             if isfinite(scale)
         ]
-        said.append(
+        paragraphs.append(
             f"The score of a filter on {scenario.name} is the mean over {', '.join(_scored(scenario))} of its "
             f"RMSE over a fixed scale: {', '.join(scales)}. It has no unit, lower is better, and 1 means "
             f"errors as large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
         )
-    said.append(
+    paragraphs.append(
         f"The filter tuned on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
         "trial saw. Intervals contain 95 % of resampled sets of runs; ratios are paired, run by run."
     )
-    return Section("What the score is", [Words(said)])
+    return Section("What the score is", [Words(paragraphs)])
 
 
 def _no_bound(scenario: Problem) -> str:
@@ -254,67 +256,74 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
     model, kind = scenario.model(**choice.model), filter_type(choice.name).filter_class
     f = "f" if model.substeps == 1 else f"f (of {model.substeps} equal parts a step)"
     sample = f", one step each {scenario.dt:g} s" if scenario.dt else ""
-    said = [
+    paragraphs = [
         f"x[k+1] = f(x[k], u[k]) + w, z[k] = h(x[k]) + v: {f} moves {_listed(model.states)} under "
         f"{_listed(model.input_quantities) or 'no input'}; h gives {_listed(model.measurements)}{sample}.",
     ]
     if not kind.has_covariance:
-        said.append(f"The filter {choice.name} has neither Q nor R.")
-        return Section("Model, Q and R", [Words(said)])
-    said.append(
+        paragraphs.append(f"The filter {choice.name} has neither Q nor R.")
+        return Section("Model, Q and R", [Words(paragraphs)])
+    paragraphs.append(
         "The filter assumes that w and v are white Gaussian noise of covariance Q and R. Covariances are per "
         "step and do not scale with dt: another sample time needs another Q."
     )
-    said += [
-        f"In each step {one.text_symbol} moves by {_amount(variance, one)} (standard deviation) beyond the model."
-        for one, variance in zip(model.states, model.process_noise_cov.diagonal(), strict=True)
+    paragraphs += [
+        f"In each step {state.text_symbol} moves by {_amount(variance, state)} (standard deviation) beyond the "
+        "model."
+        for state, variance in zip(model.states, model.process_noise_cov.diagonal(), strict=True)
     ][:6]
-    said += [
-        f"A reading of {one.text_symbol} is off by {_amount(variance, one)} (standard deviation)."
-        for one, variance in zip(model.measurements, model.measurement_noise_cov.diagonal(), strict=True)
+    paragraphs += [
+        f"A reading of {channel.text_symbol} is off by {_amount(variance, channel)} (standard deviation)."
+        for channel, variance in zip(model.measurements, model.measurement_noise_cov.diagonal(), strict=True)
     ][:6]
     if "ensemble_size" in choice.numbers:
-        said.append(f"It carries {choice.numbers['ensemble_size']} members.")
+        paragraphs.append(f"It carries {choice.numbers['ensemble_size']} members.")
     rows = [*_rows("Q", model.process_noise_cov, model.states), *_rows("P0 ", model.prior_cov, model.states)]
     rows += _rows("R", model.measurement_noise_cov, model.measurements)
     columns = ["", "of", "variance", "standard deviation"]
     table = Table("Diagonals of Q, of P_0, the prior's covariance, and of R", columns, rows[:MOST_ROWS])
-    return Section("Model, Q and R", [Words(said), table])
+    return Section("Model, Q and R", [Words(paragraphs), table])
 
 
 def _rows(name: str, matrix, quantities: Sequence[Quantity]) -> list[list[str]]:
-    found = []
-    for i, one in enumerate(quantities):
-        unit = f" {one.unit}" if one.unit else ""
-        square = "" if not one.unit else f" ({one.unit})²" if set("/ ^") & set(one.unit) else f" {one.unit}²"
+    rows = []
+    for i, quantity in enumerate(quantities):
+        unit = f" {quantity.unit}" if quantity.unit else ""
+        square = f" ({quantity.unit})²" if set("/ ^") & set(quantity.unit) else f"{unit}²" if unit else ""
         deviation = sqrt(max(matrix[i, i], 0.0))
-        found.append(
+        rows.append(
             [
                 index_pairs(f"{name}{i + 1}{i + 1}"),
-                one.text_symbol,
+                quantity.text_symbol,
                 f"{matrix[i, i]:.4g}{square}",
                 f"{deviation:.4g}{unit}",
             ]
         )
-    return found
+    return rows
 
 
-def _amount(variance: float, one: Quantity) -> str:
-    return f"{sqrt(max(variance, 0.0)):.3g} {one.unit}".rstrip()
+def _amount(variance: float, quantity: Quantity) -> str:
+    return f"{sqrt(max(variance, 0.0)):.3g} {quantity.unit}".rstrip()
 
 
 def _listed(quantities: Sequence[Quantity]) -> str:
-    names = [one.name if one.symbol in one.name.split() else f"{one.name} {one.text_symbol}" for one in quantities]
+    names = [
+        quantity.name if quantity.symbol in quantity.name.split() else f"{quantity.name} {quantity.text_symbol}"
+        for quantity in quantities
+    ]
     return ", ".join(
-        f"{name}{f' [{one.unit}]' if one.unit else ''}" for name, one in zip(names, quantities, strict=True)
+        f"{name}{f' [{quantity.unit}]' if quantity.unit else ''}"
+        for name, quantity in zip(names, quantities, strict=True)
     )
 
 
 def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
     """What was tuned, on which data and how; `nis` is the choice's on training seeds, over the channels."""
     plan, word = subject.plan, _word(subject)
-    trained = dict.fromkeys(one.training_seeds(plan.seed, TRAINING_SEEDS) for one in plan.scenarios)
-    about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
+    trained = dict.fromkeys(scenario.training_seeds(plan.seed, TRAINING_SEEDS) for scenario in plan.scenarios)
+    about = [
+        f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name for scenario in plan.scenarios
+    ]
     rows = [
         ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],
         *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
@@ -326,7 +335,7 @@ def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
         ],
         ["sampler", plan.sampler],
         *([["ranges", range_words(plan)]] if range_words(plan) else []),
-        [f"training {word}", "; ".join(f"{some[0]} to {some[-1]}" for some in trained)],
+        [f"training {word}", "; ".join(f"{seeds[0]} to {seeds[-1]}" for seeds in trained)],
         ["study", subject.name],
     ]
     if subject.study is not None:
@@ -340,10 +349,10 @@ def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
 def _nis_words(nis: Sequence[float], plan: Plan) -> str:
     word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
     low, high = NIS_BAND
-    place = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
-    found, low, high = " and ".join(f"{channels * ratio:.3g}" for ratio in nis), channels * low, channels * high
+    side = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
+    means, low, high = " and ".join(f"{channels * ratio:.3g}" for ratio in nis), channels * low, channels * high
     return (
-        f"to lie between {low:g} and {high:g}, where {channels} is right; it is {found}, {place}, on the "
+        f"to lie between {low:g} and {high:g}, where {channels} is right; it is {means}, {side}, on the "
         f"training {word}"
     )
 
@@ -387,12 +396,12 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
     entry = {"name": choice.name, "numbers": dict(choice.numbers)}
     entry["model"] = {key: value.tolist() for key, value in noise.items()} | dict(choice.model)
     command = f"`study.save({UNSAVED!r})` or `thruster tune --out {UNSAVED}`"
-    said = [] if file else [Words([f"{command} writes the tuned file that these lines read."])]
+    remarks = [] if file else [Words([f"{command} writes the tuned file that these lines read."])]
     matlab = matlab_function(choice, model, problem.name, problem.dt)
     return Section(
         "Lines to copy",
         [
-            *said,
+            *remarks,
             Code("Python", python),
             Code("JSON: the filter, as in the tuned file", json.dumps(entry, indent=2, default=str)),
             Code("MATLAB or GNU Octave: a function that needs no toolbox", matlab, folded=True),
@@ -406,8 +415,8 @@ def _found_by(problem: Problem) -> str:
         return f"from tuning.problems.find import find_problem\n\nproblem = find_problem({problem.name!r})"
     module, colon, name = problem.name.partition(":")
     if colon and module.replace(".", "").isidentifier() and name.isidentifier():
-        found = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
-        return f"{found}  # if it is a function: problem = problem()\n"
+        statement = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
+        return f"{statement}  # if it is a function: problem = problem()\n"
     return "from your_module import problem  # the object that it was tuned on\n"
 
 
@@ -439,7 +448,7 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
     picture = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt)
     sections = [Section("One run over time", [picture, *remark])]
     model = tuned.model
-    named = [one.name for one in model.measurements], [one.unit for one in model.measurements]
+    named = [channel.name for channel in model.measurements], [channel.unit for channel in model.measurements]
     alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
     caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
     sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
@@ -455,13 +464,13 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
     if not is_array(model.n, model.m):
         sections.append(_gain_section(book, pair, data, dt, scored, where))
     report = check_consistency(tuned, data, dt)
-    said = sentences(report)
+    remarks = sentences(report)
     runs = f"{report.runs} held-out {scenario.seed_word} of {scenario.name}"
     drawn = draw_consistency(report, f"{choice.name}, tuned, on {runs}", scored=scored, filter_name=choice.name)
     parts: list[Part] = [
         Words([NEES_NIS]),
-        Words(said),
-        book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(said)),
+        Words(remarks),
+        book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(remarks)),
     ]
     return [*sections, Section("Is the covariance consistent?", parts)]
 
@@ -476,21 +485,23 @@ NEES_NIS = (
 
 def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Section:
     """The gain over time, before and after."""
-    told = []
+    described = []
     for title, filter_ in pair.items():
-        found, model = gains(filter_, data, 0), filter_.model
-        last = [matrix for matrix in found if np.isfinite(matrix).all()]
+        matrices, model = gains(filter_, data, 0), filter_.model
+        last = [matrix for matrix in matrices if np.isfinite(matrix).all()]
         if last:
             values = ", ".join(
                 f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
                 for i, state in enumerate(model.states)
                 for j, channel in enumerate(model.measurements)
             )
-            told.append(f"{title}: {values} at the end")
+            described.append(f"{title}: {values} at the end")
     caption = (
         f"Gain K on {where}: the change of each state per unit of innovation, before and after tuning. It "
         "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
         "panel has its own axis."
     )
-    picture = book.picture(draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(told)}.")
+    picture = book.picture(
+        draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(described)}."
+    )
     return Section("Gain over time", [picture])

@@ -74,18 +74,18 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
     except (KeyError, TypeError):
         raise ValueError(f"a tuned file must contain its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
-    kept = content if content.get("digest") == plan.scenarios[0].digest else {}
-    sizes, nis = content.get("ensemble_sizes"), _kept_nis(kept, plan)
+    stored = content if content.get("digest") == plan.scenarios[0].digest else {}
+    sizes, nis = content.get("ensemble_sizes"), _kept_nis(stored, plan)
     met = content.get("choice")
-    return Subject(name, plan, choice, study, count, True, consistent, kept, sizes, met, nis)
+    return Subject(name, plan, choice, study, count, True, consistent, stored, sizes, met, nis)
 
 
 def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
     """The mean NIS on the training seeds in a tuned file; nothing if it was made with other packages."""
-    found = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
-    if not isinstance(found, list) or len(found) != len(plan.scenarios):
+    ratios = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
+    if not isinstance(ratios, list) or len(ratios) != len(plan.scenarios):
         return ()
-    return tuple(found) if all(isinstance(one, float) for one in found) else ()
+    return tuple(ratios) if all(isinstance(ratio, float) for ratio in ratios) else ()
 
 
 def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
@@ -100,8 +100,8 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
     choice, met = plan.choice_of(best.params), chosen_of(study)
     if met is not None:
-        one = next(one for one in met["met"] if one["name"] == met["chosen"])
-        choice = choice_from(one["choice"])
+        contender = next(contender for contender in met["met"] if contender["name"] == met["chosen"])
+        choice = choice_from(contender["choice"])
     consistent = plan.is_constrained and is_consistent(best)
     chosen, sizes = len(plan.objectives) > 1 or met is not None, study.user_attrs.get(SIZES)
     return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes, validation=met)

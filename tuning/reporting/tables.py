@@ -38,9 +38,9 @@ def errors_table(scenario: Problem, comparison: Comparison) -> Table:
 def _errors_across(comparison: Comparison, where: str) -> Table:
     ratios, tuned, errors = comparison.ratios, comparison.tuned, _errors(comparison)
     rows = [
-        [name, _span(ratios.get(name, NOTHING)), _span(found.score)]
-        + [*(cells[place] for _, cells, _ in errors), *map(_span, (found.nees, found.nis))]
-        for place, (name, found) in enumerate(comparison.evaluations.items())
+        [name, _span(ratios.get(name, NOTHING)), _span(evaluation.score)]
+        + [*(cells[column] for _, cells, _ in errors), *map(_span, (evaluation.nees, evaluation.nis))]
+        for column, (name, evaluation) in enumerate(comparison.evaluations.items())
     ]
     right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
     rows.append([_expected(comparison), "", "", *(bound for *_, bound in errors), *right])
@@ -49,27 +49,27 @@ def _errors_across(comparison: Comparison, where: str) -> Table:
 
 
 def _errors_below(comparison: Comparison, where: str) -> Table:
-    ratios, found, tuned = comparison.ratios, comparison.evaluations, comparison.tuned
+    ratios, evaluations, tuned = comparison.ratios, comparison.evaluations, comparison.tuned
     right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
     rows = [
-        [RATIO, *(_span(ratios.get(name, NOTHING)) for name in found), ""],
-        ["score", *(_span(e.score) for e in found.values()), ""],
+        [RATIO, *(_span(ratios.get(name, NOTHING)) for name in evaluations), ""],
+        ["score", *(_span(e.score) for e in evaluations.values()), ""],
         *([label, *cells, bound] for label, cells, bound in _errors(comparison)),
-        ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
-        ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
+        ["mean NEES", *(_span(e.nees) for e in evaluations.values()), right[0]],
+        ["mean NIS", *(_span(e.nis) for e in evaluations.values()), right[1]],
     ]
-    return Table(where, ["", *found, _expected(comparison)], rows)
+    return Table(where, ["", *evaluations, _expected(comparison)], rows)
 
 
 def _errors(comparison: Comparison) -> list[tuple[str, list[str], str]]:
     """RMSE of each state and output: label, a cell per filter, and the bound, all with one power of ten."""
-    found, told = comparison.evaluations.values(), []
+    evaluations, rows = comparison.evaluations.values(), []
     parts = [
-        (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(comparison.bound[i]))
+        (state.text_symbol, state.unit, [e.rmse[i] for e in evaluations], float(comparison.bound[i]))
         for i, state in enumerate(comparison.tuned.states)
     ]
     parts += [
-        (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in found], float("nan"))
+        (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in evaluations], float("nan"))
         for symbol, output in comparison.tuned.outputs.items()
     ]
     for name, unit, values, bound in parts:
@@ -77,8 +77,8 @@ def _errors(comparison: Comparison) -> list[tuple[str, list[str], str]]:
         cells = [_span(Interval(*(part / 10.0**power for part in value))) for value in values]
         label = scaled_unit(unit, power)
         limit = "" if isnan(bound) else rounded(bound / 10.0**power)
-        told.append((f"RMSE {name} [{label}]" if label else f"RMSE {name}", cells, limit))
-    return told
+        rows.append((f"RMSE {name} [{label}]" if label else f"RMSE {name}", cells, limit))
+    return rows
 
 
 def _expected(comparison: Comparison) -> str:
@@ -101,10 +101,10 @@ def _innovations_table(comparison: Comparison, where: str) -> Table:
 
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
     """The parameters of a tuned filter and of its baselines; the scaled default is computed unless given."""
-    found = baselines(choice.name, scenario, seed, default, baseline_size(choice))
-    choices, usual = {TUNED: choice, **found}, next(iter(found.values())).numbers
-    whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
-    rows = number_rows(whole, choice.name, scenario, _number, "²")
+    reference = baselines(choice.name, scenario, seed, default, baseline_size(choice))
+    choices, usual = {TUNED: choice, **reference}, next(iter(reference.values())).numbers
+    complete = [each._replace(numbers={**usual, **each.numbers}) for each in choices.values()]
+    rows = number_rows(complete, choice.name, scenario, _number, "²")
     return Table(
         f"Parameters of the {choice.name} filter",
         ["", *choices],
@@ -117,9 +117,9 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
-def known_table(found: Identifiability) -> Table:
+def known_table(result: Identifiability) -> Table:
     """The parameters as the innovations determine them."""
-    columns = found.names, found.tuned, found.most_likely, found.factors, found.identified
+    columns = result.names, result.tuned, result.most_likely, result.factors, result.identified
     rows = [
         [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
         for name, tuned, best, factor, known in zip(*columns, strict=True)

@@ -46,19 +46,19 @@ def limit_errors(
     reaches = [_reach(*pair, start) for pair in zip(values, bands, strict=True)]
     known = [reach for reach in reaches if reach > 0]
     differ = len(known) > 1 and max(known) >= FAR * min(known)
-    for place, (axis, of_filter, reach) in enumerate(zip(axes, values, reaches, strict=True)):
+    for column, (axis, of_filter, reach) in enumerate(zip(axes, values, reaches, strict=True)):
         limit = (reach if differ else max(known, default=0.0)) * (1.0 + ROOM)
         if limit > 0:
             axis.set_ylim(-limit, limit)
         before, scored = of_filter[:start], of_filter[start:]
         scored = scored[np.isfinite(scored)]
         clipped = "; start-up is cut off" if limit > 0 and (np.abs(before) > limit).any() else ""
-        said = f"{word} {np.sqrt(np.mean(scored**2)):.3g}{clipped}" if scored.size else clipped.strip("; ")
+        note = f"{word} {np.sqrt(np.mean(scored**2)):.3g}{clipped}" if scored.size else clipped.strip("; ")
         box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
-        axis.annotate(said, (0.995, 0.97), ha="right", va="top", bbox=box, **NOTE)
+        axis.annotate(note, (0.995, 0.97), ha="right", va="top", bbox=box, **NOTE)
         if differ:
             axis.annotate("axes differ", (0.01, 0.97), ha="left", va="top", bbox=box, **NOTE)
-        elif place:
+        elif column:
             axis.tick_params(labelleft=False)
 
 
@@ -77,21 +77,21 @@ def limit_values(axes: Sequence, plotted: Sequence[np.ndarray], bands: Sequence[
     span = high - low or abs(high) or 1.0
     edge = _ends(bands) or ends
     low, high = max(min(low, edge[0]), low - span), min(max(high, edge[1]), high + span)
-    for place, axis in enumerate(axes):
+    for column, axis in enumerate(axes):
         axis.set_ylim(low - ROOM * span, high + ROOM * span)
-        if place:
+        if column:
             axis.tick_params(labelleft=False)
 
 
 def _ends(series: Sequence[np.ndarray]) -> tuple[float, float] | None:
     """The least and the largest of all finite values."""
-    found = np.concatenate([one[np.isfinite(one)] for one in series])
-    return (float(found.min()), float(found.max())) if found.size else None
+    finite = np.concatenate([values[np.isfinite(values)] for values in series])
+    return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
 def _reach(values: np.ndarray, band: np.ndarray, start: int) -> float:
     """The range of a panel: to the largest error, and to the end of a band not far beyond."""
-    (_, error), (_, width) = (_ends([np.abs(one[start:])]) or (0.0, 0.0) for one in (values, band))
+    (_, error), (_, width) = (_ends([np.abs(series[start:])]) or (0.0, 0.0) for series in (values, band))
     return max(error, min(width, WIDEST * error) if error > 0 else width)
 
 
@@ -185,18 +185,18 @@ def draw_estimates(
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
-    places, left_out = plotted_states(states, scored)
-    rows = _rows(states, places, model.measurements, data.states is not None)
+    indices, left_out = plotted_states(states, scored)
+    rows = _rows(states, indices, model.measurements, data.states is not None)
     heights = [row.height for row in rows]
-    unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
+    unit = UNIT if len(indices) <= 2 else UNIT_OF_MANY
     figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
     options = {"sharex": True, "height_ratios": heights, **options}
     axes = figure.subplots(len(rows), len(filters), squeeze=False, **options)
     tidy(axes.flat)
     runs = [one_run(filter_, data, run_index, dt) for filter_ in filters.values()]
-    for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
+    for column, filtered, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
         for axis, row in zip(column, rows, strict=True):
-            row.draw(axis, found, colour=colour_of(filter_.name))
+            row.draw(axis, filtered, colour=colour_of(filter_.name))
         column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel("step" if dt is None else "time [s]")
     for line, row in zip(axes, rows, strict=True):
@@ -213,11 +213,11 @@ def draw_estimates(
 
 
 def _rows(
-    states: tuple[Quantity, ...], places: list[int], channels: tuple[Quantity, ...], has_truth: bool
+    states: tuple[Quantity, ...], indices: list[int], channels: tuple[Quantity, ...], has_truth: bool
 ) -> list[Row]:
     """Each state above its error; without truth all states, then the innovations of the channels."""
     rows = []
-    for i in places:
+    for i in indices:
         rows.append(
             Row(
                 TALL,
@@ -230,35 +230,37 @@ def _rows(
             label = axis_label(Quantity("error", "error", states[i].unit))
             rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
     if not has_truth:
-        seen, _ = plotted_states(channels)
+        measured, _ = plotted_states(channels)
         rows += [
             Row(LOW, axis_label(channels[j]), partial(_innovation, j=j), partial(limit_innovations, j=j))
-            for j in seen
+            for j in measured
         ]
     return rows
 
 
 def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     """One run of a filter on some data, with errors where there is a truth; `dt` as in `draw_estimates`."""
-    one = data.one(index)
-    estimates = run(filter_, one.filter_keys, one.inputs, one.measurements)
-    time = (1.0 if dt is None else dt) * np.arange(one.steps + 1)
-    innovations = np.where(np.isnan(one.measurements[0]), np.nan, estimates.innovations[0])
-    if one.states is None:
+    single = data.one(index)
+    estimates = run(filter_, single.filter_keys, single.inputs, single.measurements)
+    time = (1.0 if dt is None else dt) * np.arange(single.steps + 1)
+    innovations = np.where(np.isnan(single.measurements[0]), np.nan, estimates.innovations[0])
+    if single.states is None:
         return Run(time, None, None, estimates, innovations)
-    errors = state_errors(filter_, estimates, one)[0]
-    truth = wrapped_where(one.known_states[0], filter_.model.shape.state_angles[: one.known_states.shape[-1]])
+    errors = state_errors(filter_, estimates, single)[0]
+    truth = wrapped_where(
+        single.known_states[0], filter_.model.shape.state_angles[: single.known_states.shape[-1]]
+    )
     return Run(time, truth, errors, estimates, innovations)
 
 
-def _values(axis, found: Run, i: int, angle: bool, colour: str) -> None:
-    mean, band = found.estimates.means[0, :, i], TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
-    lines = found.time, mean, mean - band, mean + band
+def _values(axis, filtered: Run, i: int, angle: bool, colour: str) -> None:
+    mean, band = filtered.estimates.means[0, :, i], TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i])
+    lines = filtered.time, mean, mean - band, mean + band
     time, _, low, high = with_breaks(*lines) if angle else lines
     draw_band(axis, time, low, high, colour)
-    if found.truth is not None:
-        axis.plot(*line_of(angle, found.time, found.truth[:, i]), label="truth", **TRUTH)
-    axis.plot(*line_of(angle, found.time, mean), color=colour, linewidth=1.0, label="estimate")
+    if filtered.truth is not None:
+        axis.plot(*line_of(angle, filtered.time, filtered.truth[:, i]), label="truth", **TRUTH)
+    axis.plot(*line_of(angle, filtered.time, mean), color=colour, linewidth=1.0, label="estimate")
 
 
 def line_of(angle: bool, time: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,41 +270,41 @@ def line_of(angle: bool, time: np.ndarray, line: np.ndarray) -> tuple[np.ndarray
     return thinned(time, line)
 
 
-def _error(axis, found: Run, i: int, colour: str) -> None:
-    assert found.errors is not None  # rows of errors are made where there is a truth
-    band = TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
-    draw_in_band(axis, found.time, found.errors[:, i], band, "error of the estimate", colour)
+def _error(axis, filtered: Run, i: int, colour: str) -> None:
+    assert filtered.errors is not None  # rows of errors are made where there is a truth
+    band = TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i])
+    draw_in_band(axis, filtered.time, filtered.errors[:, i], band, "error of the estimate", colour)
 
 
-def _innovation(axis, found: Run, j: int, colour: str) -> None:
-    band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
-    draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour)
+def _innovation(axis, filtered: Run, j: int, colour: str) -> None:
+    band = TWO_SIDED * np.sqrt(filtered.estimates.innovation_covs[0, :, j, j])
+    draw_in_band(axis, filtered.time, filtered.innovations[:, j], band, "innovation", colour)
 
 
 def _limit_values(axes, runs: Sequence[Run], start: int, i: int) -> None:
-    means, ends = [found.estimates.means[0, start:, i] for found in runs], []
-    for found, mean in zip(runs, means, strict=True):
-        band = TWO_SIDED * np.sqrt(found.estimates.covs[0, start:, i, i])
+    means, ends = [filtered.estimates.means[0, start:, i] for filtered in runs], []
+    for filtered, mean in zip(runs, means, strict=True):
+        band = TWO_SIDED * np.sqrt(filtered.estimates.covs[0, start:, i, i])
         ends += [mean - band, mean + band]
-    limit_values(axes, [*means, *(found.truth[:, i] for found in runs if found.truth is not None)], ends)
+    limit_values(axes, [*means, *(filtered.truth[:, i] for filtered in runs if filtered.truth is not None)], ends)
 
 
 def _limit_errors(axes, runs: Sequence[Run], start: int, i: int) -> None:
-    bands = [TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i]) for found in runs]
-    limit_errors(axes, [found.errors[:, i] for found in runs if found.errors is not None], bands, start)
+    bands = [TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i]) for filtered in runs]
+    limit_errors(axes, [filtered.errors[:, i] for filtered in runs if filtered.errors is not None], bands, start)
 
 
 def limit_innovations(axes, runs: Sequence[Run], start: int, j: int) -> None:
     """Limits of a row of innovations of channel j."""
-    bands = [TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j]) for found in runs]
-    limit_errors(axes, [found.innovations[:, j] for found in runs], bands, start, "RMS")
+    bands = [TWO_SIDED * np.sqrt(filtered.estimates.innovation_covs[0, :, j, j]) for filtered in runs]
+    limit_errors(axes, [filtered.innovations[:, j] for filtered in runs], bands, start, "RMS")
 
 
 def draw_in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str, colour: str) -> None:
     """An error over time in the filter's band."""
     draw_band(axis, time, -band, band, colour)
-    own = BLUE if colour == RUST else RUST  # an error never looks like the estimate
-    axis.plot(*thinned(time, values), color=own, linewidth=0.9, label=label)
+    contrast = BLUE if colour == RUST else RUST  # an error never looks like the estimate
+    axis.plot(*thinned(time, values), color=contrast, linewidth=0.9, label=label)
 
 
 def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str) -> None:
@@ -331,23 +333,23 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
     """
-    found, model, one = one_run(filter_, data, index, dt), filter_.model, data.one(index)
-    seen, left_out = plotted_states(model.measurements)
-    given, _ = plotted_states(model.input_quantities)
-    figure, axes = _signal_rows(len(seen) + len(given), 2 * WIDTH, dt)
-    measured = wrapped_where(one.measurements[0], model.shape.measurement_angles)
+    filtered, model, single = one_run(filter_, data, index, dt), filter_.model, data.one(index)
+    channels, left_out = plotted_states(model.measurements)
+    inputs, _ = plotted_states(model.input_quantities)
+    figure, axes = _signal_rows(len(channels) + len(inputs), 2 * WIDTH, dt)
+    measured = wrapped_where(single.measurements[0], model.shape.measurement_angles)
     colour = colour_of(filter_.name)
-    for axis, j in zip(axes, seen, strict=False):
+    for axis, j in zip(axes, channels, strict=False):
         angle = model.measurements[j].angle
-        line = line_of(angle, found.time, measured[:, j])
+        line = line_of(angle, filtered.time, measured[:, j])
         axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0}))
-        expected = measured[:, j] - found.innovations[:, j]
+        expected = measured[:, j] - filtered.innovations[:, j]
         expected = wrapped(expected) if angle else expected
-        line = line_of(angle, found.time, expected)
+        line = line_of(angle, filtered.time, expected)
         axis.plot(*line, color=colour, linewidth=0.8, label="predicted before the update")
         axis.set_ylabel(axis_label(model.measurements[j]))
-    for axis, i in zip(axes[len(seen) :], given, strict=True):
-        time, values = thinned(found.time[:-1], one.inputs[0][:, i])
+    for axis, i in zip(axes[len(channels) :], inputs, strict=True):
+        time, values = thinned(filtered.time[:-1], single.inputs[0][:, i])
         axis.plot(time, values, color=GREY, drawstyle="steps-post", linewidth=1.2, label="input")
         axis.set_ylabel(axis_label(model.input_quantities[i]))
     _legend(figure, axes, left_out.replace("states", "channels"))
@@ -357,18 +359,20 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
     """Innovations of every channel in the band that each filter expects; one column per filter."""
     channels = next(iter(filters.values())).model.measurements
-    seen, left_out = plotted_states(channels)
-    figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(seen) + 0.8))
-    axes = figure.subplots(len(seen), len(filters), squeeze=False, sharex=True)
+    indices, left_out = plotted_states(channels)
+    figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(indices) + 0.8))
+    axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)
     runs = [one_run(filter_, data, index, dt) for filter_ in filters.values()]
-    for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
-        for axis, j in zip(column, seen, strict=True):
-            band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
-            draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour_of(filter_.name))
+    for column, filtered, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
+        for axis, j in zip(column, indices, strict=True):
+            band = TWO_SIDED * np.sqrt(filtered.estimates.innovation_covs[0, :, j, j])
+            draw_in_band(
+                axis, filtered.time, filtered.innovations[:, j], band, "innovation", colour_of(filter_.name)
+            )
         column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
-    for line, j in zip(axes, seen, strict=True):
+    for line, j in zip(axes, indices, strict=True):
         line[0].set_ylabel(axis_label(channels[j]))
         limit_innovations(line, runs, data.first_scored, j)
     _legend(figure, axes[:, 0], left_out.replace("states", "channels"))
@@ -383,8 +387,8 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
 
     Source: Anderson, Moore (1979), "Optimal Filtering", section 6.3.
     """
-    found, model = one_run(filter_, data, index, None), filter_.model
-    means, covs = found.estimates.means[0], found.estimates.covs[0]
+    filtered, model = one_run(filter_, data, index, None), filter_.model
+    means, covs = filtered.estimates.means[0], filtered.estimates.covs[0]
     slopes = np.stack([_slopes(model, mean) for mean in means])  # (K + 1, m, n)
     products = slopes @ covs.transpose(0, 2, 1)  # H P', (K + 1, m, n)
     found_gains = np.linalg.solve(model.measurement_noise_cov, products).transpose(0, 2, 1)
@@ -395,21 +399,23 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
 def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None, scored=None) -> Figure:
     """The gain on every state, a line per channel and a column per filter, each panel with its own axis."""
     model = next(iter(filters.values())).model
-    places, left_out = plotted_states(model.states, scored)
+    indices, left_out = plotted_states(model.states, scored)
     channels, _ = plotted_states(model.measurements)
-    figure = new_figure((WIDTH * len(filters), HEIGHT * len(places) + 0.8))
-    axes = figure.subplots(len(places), len(filters), squeeze=False, sharex=True)
+    figure = new_figure((WIDTH * len(filters), HEIGHT * len(indices) + 0.8))
+    axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)
     for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
-        found = gains(filter_, data, index)
-        time = (1.0 if dt is None else dt) * np.arange(len(found))
-        for axis, i in zip(column, places, strict=True):
+        matrices = gains(filter_, data, index)
+        time = (1.0 if dt is None else dt) * np.arange(len(matrices))
+        for axis, i in zip(column, indices, strict=True):
             for row, j in enumerate(channels):
                 look = {"color": colour_of(filter_.name), "linestyle": DASHES[row % len(DASHES)], "linewidth": 1.0}
-                axis.plot(*thinned(time, found[:, i, j]), label=f"by {model.measurements[j].text_symbol}", **look)
+                axis.plot(
+                    *thinned(time, matrices[:, i, j]), label=f"by {model.measurements[j].text_symbol}", **look
+                )
         column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
-    for axis, i in zip(axes[:, 0], places, strict=True):
+    for axis, i in zip(axes[:, 0], indices, strict=True):
         units = {_over(model.states[i], model.measurements[j]) for j in channels}
         unit = units.pop() if len(units) == 1 else "state/channel"
         axis.set_ylabel(axis_label(model.states[i]._replace(name="gain on", unit=unit)))

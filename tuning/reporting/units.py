@@ -18,7 +18,7 @@ ALIKE = 4  # so many numbers of one kind and more, which are the same in every c
 
 def typeset(text: str) -> str:
     """Units in a text as pages have them: m^3/s is m³/s."""
-    return re.sub(r"(?<=[A-Za-z)])\^(-?\d+)", lambda found: found[1].translate(RAISED), text)
+    return re.sub(r"(?<=[A-Za-z)])\^(-?\d+)", lambda match: match[1].translate(RAISED), text)
 
 
 def power_of_ten(values: Iterable[float]) -> int:
@@ -44,9 +44,9 @@ def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2"
         square: what stands for "squared".
     """
     known = parameters(kind, problem, **everything_of(problem))
-    units = {one.name: one.unit.replace("^2", square) for one in known}
-    said = {name: index_pairs(name.replace("_", " ")) for name in names}
-    return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in said.items()}
+    units = {parameter.name: parameter.unit.replace("^2", square) for parameter in known}
+    wordings = {name: index_pairs(name.replace("_", " ")) for name in names}
+    return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in wordings.items()}
 
 
 def number_rows(
@@ -67,12 +67,14 @@ def number_rows(
     names = labels(dict.fromkeys(name for column in columns for name in column), kind, problem, square)
     rows = []
     for letter in ("", "R "):
-        some = [name for name in names if name.startswith(f"{letter}correlation ".replace(" ", "_"))]
-        if len(some) > MOST_CORRELATIONS:
-            values = [[_said(column, name) for name in some] for column in columns]
-            largest = [max((one for one in column if one is not None), key=abs, default=None) for column in values]
-            rows.append([f"largest of {len(some)} {letter or 'Q '}correlations", *map(word, largest)])
-            names = {name: label for name, label in names.items() if name not in some}
+        correlations = [name for name in names if name.startswith(f"{letter}correlation ".replace(" ", "_"))]
+        if len(correlations) > MOST_CORRELATIONS:
+            values = [[_said(column, name) for name in correlations] for column in columns]
+            largest = [
+                max((value for value in column if value is not None), key=abs, default=None) for column in values
+            ]
+            rows.append([f"largest of {len(correlations)} {letter or 'Q '}correlations", *map(word, largest)])
+            names = {name: label for name, label in names.items() if name not in correlations}
     rows = [[label, *(word(_said(column, name)) for column in columns)] for name, label in names.items()] + rows
     groups: list[list[list[str]]] = []
     for row in rows:
@@ -90,8 +92,8 @@ def _said(column: Mapping[str, float], name: str) -> float | None:
 
 def _letters(label: str) -> str | None:
     """What the label of a variance or a correlation begins with and ends with; the whole of all others."""
-    found = re.fullmatch(r"(Q|R|correlation |R correlation )\d+(?:[ ,]\d+)?( \[.*\])?", label)
-    return f"{found[1]}{found[2]}" if found else label
+    match = re.fullmatch(r"(Q|R|correlation |R correlation )\d+(?:[ ,]\d+)?( \[.*\])?", label)
+    return f"{match[1]}{match[2]}" if match else label
 
 
 def _shared(group: Sequence[Sequence[str]]) -> list[str]:
