@@ -184,13 +184,13 @@ def contender(
 
     unknown = unknown or {}
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(kind).untuned))] if kind.has_ensemble else []
-    options = [f"{key} {_said(value)}" for key, value in numbers.items() if key != "ensemble_size"]
+    options = [f"{key} {_in_words(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     label = " ".join([kind.label, *size, *options, *added])
     return Contender(label, chosen, unknown, known=knowing)
 
 
-def _said(value) -> str:
+def _in_words(value) -> str:
     """A parameter's value: a word, a number, or several."""
     if isinstance(value, str):
         return value

@@ -124,9 +124,11 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     }
     done: list[tuple[Choice, Evaluation]] = []
     for candidate in with_progress("filters on held-out seeds", list(choices.values())):
-        if candidate is not None and _found(candidate, done) is None:  # baselines may be the same filter
+        if candidate is not None and _evaluation_in(candidate, done) is None:  # baselines may be the same filter
             done.append((candidate, evaluate(candidate.filter(scenario), data, scenario.scale)))
-    evaluations = {role: None if choice is None else _found(choice, done) for role, choice in choices.items()}
+    evaluations = {
+        role: None if choice is None else _evaluation_in(choice, done) for role, choice in choices.items()
+    }
     untuned, tuned = evaluations.pop("untuned"), evaluations.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
     constants = time_constants_on(choice.filter(scenario), scenario, seed)
@@ -154,6 +156,6 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     )
 
 
-def _found(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
+def _evaluation_in(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
     """The evaluation of the same filter, if there is one."""
     return next((evaluation for before, evaluation in done if same_filter(choice, before)), None)

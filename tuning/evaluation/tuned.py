@@ -90,7 +90,9 @@ def write_tuned(
         "model": model_data(model, problem.dt),
         "plant": problem.plant_data,
         "problems": {
-            scenario.name: _kept(scenario) for scenario in plan.scenarios if scenario.name not in built_in()
+            scenario.name: _problem_as_data(scenario)
+            for scenario in plan.scenarios
+            if scenario.name not in built_in()
         },
         "study": {
             "name": study_name,
@@ -132,7 +134,7 @@ def _noise_of(model: StateSpaceModel) -> dict:
     return {name: getattr(model, name).tolist() for name in NOISE}
 
 
-def _kept(problem: Problem) -> dict:
+def _problem_as_data(problem: Problem) -> dict:
     """A problem as a tuned file stores it: its digest and, unless it is code, its full content."""
     return {"digest": problem.digest, "content": problem.as_mapping()}
 

@@ -199,7 +199,7 @@ def check_quantities(
         if (quantity.symbol, quantity.unit, quantity.angle) != (expected.symbol, expected.unit, expected.angle):
             raise ValueError(
                 f"{kind} of {owner} and {other} must have the same symbols and units, "
-                f"but got {_said(quantity)} and {_said(expected)}"
+                f"but got {_in_words(quantity)} and {_in_words(expected)}"
             )
 
 
@@ -207,7 +207,7 @@ def _listed(quantities: tuple[Quantity, ...]) -> str:
     return f"{len(quantities)} ({', '.join(quantity.symbol for quantity in quantities)})"
 
 
-def _said(quantity: Quantity) -> str:
+def _in_words(quantity: Quantity) -> str:
     return f"{quantity.symbol} [{quantity.unit}]" + (" (an angle)" if quantity.angle else "")
 
 

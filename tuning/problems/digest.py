@@ -465,7 +465,9 @@ def _attributes(env: gym.Env, envs: list[gym.Env]) -> list[dict[str, str]]:
                 env.reset(seed=seed)
         except Exception:  # it will say so when it makes the data
             return []
-        digests.append([{name: digest_of(value) for name, value in _held(layer).items()} for layer in chosen])
+        digests.append(
+            [{name: digest_of(value) for name, value in _attributes_of(layer).items()} for layer in chosen]
+        )
     return [
         {name: text for name, text in first.items() if other.get(name) == text}
         for first, other in zip(*digests, strict=True)
@@ -476,6 +478,6 @@ def _is_foreign_base(layer: gym.Env) -> bool:
     return not isinstance(layer, gym.Wrapper) and not hasattr(layer, "plant_data")
 
 
-def _held(layer: gym.Env) -> dict[str, Any]:
+def _attributes_of(layer: gym.Env) -> dict[str, Any]:
     hidden = {"env", "spec", "_np_random", "_np_random_seed", "_cached_spec", "_saved_kwargs"}
     return {name: value for name, value in held_by(layer).items() if name not in hidden}

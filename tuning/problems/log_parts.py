@@ -160,7 +160,7 @@ def _parts(
     measured = np.array([_measured(logs, block, lead) for block in cut])
     usual = np.median(measured[measured > 0]) if measured.any() else 0.0
     all_blocks = [block for block, share in zip(cut, measured, strict=True) if share and share * SHARE >= usual]
-    is_held_out = _held(logs, all_blocks, held_out)
+    is_held_out = _mask_of_held_out(logs, all_blocks, held_out)
     held_blocks = [block for block, out in zip(all_blocks, is_held_out, strict=True) if out]
     left = [block for block, out in zip(all_blocks, is_held_out, strict=True) if not out]
     choosing = left[EVERY_THIRD - 1 :: EVERY_THIRD] if sizes else []
@@ -242,7 +242,9 @@ def _check_names(logs: Sequence[Log], held_out: Collection[str] | None) -> None:
         )
 
 
-def _held(logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str] | None) -> list[bool]:
+def _mask_of_held_out(
+    logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str] | None
+) -> list[bool]:
     """Whether each block is held out."""
     if held_out is not None:
         return [logs[block.run].name in held_out for block in blocks]

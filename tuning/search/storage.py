@@ -38,7 +38,7 @@ from thruster_env.core.checks import short_repr
 HIDDEN = "***"
 DATABASES = ("postgresql", "postgres", "mysql", "mariadb", "sqlite", "oracle", "mssql", "redis", "grpc")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*")
-_PLACE = re.compile(r"(?P<host>[\w.-]*|\[[0-9A-Fa-f:.]+\])(?P<port>:\d+)?(?P<database>/[^:@]*)?", re.ASCII)
+_ADDRESS = re.compile(r"(?P<host>[\w.-]*|\[[0-9A-Fa-f:.]+\])(?P<port>:\d+)?(?P<database>/[^:@]*)?", re.ASCII)
 _MARKS = re.compile(r"[:/@?#&=;,\s]+")
 _MISSPELT = re.compile(rf"({'|'.join(DATABASES)})(\+\w+)?:(?!//)", re.IGNORECASE)
 
@@ -54,7 +54,7 @@ def public_url(storage: str) -> str:
         return storage if misspelt is None else f"{misspelt[0]}{HIDDEN}"
     if not _SCHEME.fullmatch(scheme):
         return HIDDEN
-    address = _place(rest)
+    address = _address(rest)
     return f"{scheme}://{HIDDEN if address is None else address}"
 
 
@@ -63,7 +63,7 @@ def is_misspelt(storage: str) -> bool:
     return bool(_MISSPELT.match(storage))
 
 
-def _place(rest: str) -> str | None:
+def _address(rest: str) -> str | None:
     """Host, port and database of what follows a scheme, None where it is not sure which part they are."""
     if rest.startswith("/"):  # no host, and so no user
         return re.split(r"[?#]", rest, maxsplit=1)[0]
@@ -71,7 +71,7 @@ def _place(rest: str) -> str | None:
     if at and re.search(r"[?#]", before):
         return None
     address = re.split(r"[?#]", after, maxsplit=1)[0]
-    return address if _PLACE.fullmatch(address) else None
+    return address if _ADDRESS.fullmatch(address) else None
 
 
 def without_secrets(text: str, storage: str) -> str:

@@ -82,7 +82,7 @@ class Validation(NamedTuple):
     """The meeting of the best trials and the baselines, and what came of it."""
 
     seeds: tuple[int, ...]  # of the first problem; of logs numbers of blocks
-    own: bool  # whether no trial saw them: a short log has no blocks to set aside
+    has_own_seeds: bool  # whether no trial saw them: a short log has no blocks to set aside
     met: tuple[Met, ...]  # the baselines first
     baseline: str  # name of the best baseline
     candidate: str  # name of the best trial; that of the baseline where no trial is another filter
@@ -285,7 +285,11 @@ def _with_failures(
 
     tested = validation.named(GIVEN if GIVEN in met else validation.baseline)
     pair, failures, count = (tested, validation.named(validation.candidate)), [], 0
-    sets = [(training, [measured(entry.choice, plan, training).runs for entry in pair])] if validation.own else []
+    sets = (
+        [(training, [measured(entry.choice, plan, training).runs for entry in pair])]
+        if validation.has_own_seeds
+        else []
+    )
     for datasets, (ours, theirs) in [*sets, (data, [met[entry.name].runs for entry in pair])]:
         for problem, part, a, b in zip(plan.scenarios, datasets, ours, theirs, strict=True):
             count += len(part.seeds)
@@ -479,7 +483,7 @@ def as_data(validation: Validation | None) -> dict | None:
         "baseline": validation.baseline,
         "gave_way": validation.gave_way,
         "seeds": [validation.seeds[0], validation.seeds[-1] + 1],
-        "own_seeds": validation.own,
+        "own_seeds": validation.has_own_seeds,
         "price": validation.price,
         "by_error": validation.by_error,
         "met": list(map(_met_as_data, validation.met)),
