@@ -378,10 +378,8 @@ def contenders_of(
     for filter_ in filters:
         if isinstance(filter_, Study):
             choice = sized(filter_.choice, size_of(filter_.choice.name))
-            label, suit = (
-                f"{label_of(choice.name)} tuned",
-                partial(suited, constants=constants_in(filter_.problem)),
-            )
+            label = f"{label_of(choice.name)} tuned"
+            suit = partial(suited, constants=constants_in(filter_.problem))
             out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
         elif is_own(filter_):
             label = f"{filter_.name if isinstance(filter_, Filter) else DEFAULT_FILTER} {OWN}"

@@ -35,39 +35,31 @@ def command(
     """
     announce_compilation()
     with working(f"recomputing the metrics of {file}"):
-        verification = verify(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
-    emit(_report(file, verification), _as_json(file, verification), json)
-    if not verification.holds:
+        result = verify(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
+    emit(_report(file, result), _as_json(file, result), json)
+    if not result.holds:
         sys.exit(1)
 
 
-def _report(file: Path, verification: Verification) -> list[RenderableType]:
+def _report(file: Path, result: Verification) -> list[RenderableType]:
     output: list[RenderableType] = []
-    if verification.holds:
-        output.append(
-            f"{file} holds: {verification.checked} numbers are the same within {TOLERANCE:g} of their size."
-        )
+    if result.holds:
+        output.append(f"{file} holds: {result.checked} numbers are the same within {TOLERANCE:g} of their size.")
     else:
-        rows = [
-            [d.place, str(d.stored), str(d.found), f"{d.relative:.1e}"] for d in verification.differences[:LISTED]
-        ]
-        output.append(
-            f"{file} does not hold: {len(verification.differences)} of {verification.checked} numbers differ."
-        )
+        rows = [[d.place, str(d.stored), str(d.found), f"{d.relative:.1e}"] for d in result.differences[:LISTED]]
+        output.append(f"{file} does not hold: {len(result.differences)} of {result.checked} numbers differ.")
         output.append(table("The largest differences", ["number", "stored", "found", "relative"], rows))
-    if verification.packages:
-        changes = ", ".join(
-            f"{name} {then} then, {now} now" for name, (then, now) in verification.packages.items()
-        )
+    if result.packages:
+        changes = ", ".join(f"{name} {then} then, {now} now" for name, (then, now) in result.packages.items())
         output.append(f"Packages whose versions have changed since the file was made: {changes}.")
     return output
 
 
-def _as_json(file: Path, verification: Verification) -> dict:
+def _as_json(file: Path, result: Verification) -> dict:
     return {
         "file": str(file),
-        "holds": verification.holds,
-        "checked": verification.checked,
-        "differences": [{**d._asdict(), "relative": d.relative} for d in verification.differences],
-        "packages": {name: {"stored": then, "here": now} for name, (then, now) in verification.packages.items()},
+        "holds": result.holds,
+        "checked": result.checked,
+        "differences": [{**d._asdict(), "relative": d.relative} for d in result.differences],
+        "packages": {name: {"stored": then, "here": now} for name, (then, now) in result.packages.items()},
     }

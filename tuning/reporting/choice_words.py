@@ -147,11 +147,8 @@ def _members(met: Mapping) -> str:
 def _sizes_sentence(met: Mapping[str, Mapping], chosen: str) -> list[str]:
     """The ensemble sizes of the filters of the chosen type that met, in a list; empty without an ensemble."""
     kind = met[chosen]["choice"]["name"]
-    same = {
-        name: size
-        for name, contender in met.items()
-        if contender["choice"]["name"] == kind and (size := _size(contender))
-    }
+    sizes = {name: _size(contender) for name, contender in met.items() if contender["choice"]["name"] == kind}
+    same = {name: size for name, size in sizes.items() if size}
     trials, baselines = (
         {size for name, size in same.items() if _is_trial(name) == part} for part in (True, False)
     )
@@ -179,11 +176,8 @@ def _failures_sentence(validation: Mapping, word: str, channels: int) -> str:
 
 def _price_sentence(validation: Mapping, chosen: Mapping, what: str, channels: int) -> str:
     """The price of the band, with both sides of the choice."""
-    inside = [
-        contender
-        for contender in validation["met"]
-        if contender["consistent"] and contender["name"].startswith("trial ")
-    ]
+    trials = [contender for contender in validation["met"] if contender["name"].startswith("trial ")]
+    inside = [trial for trial in trials if trial["consistent"]]
     best = min(inside, key=lambda trial: trial["value"])
     has = [
         f"has a {what} of {rounded(contender['value'])} and a mean NIS of {rounded(channels * contender['nis'])}"

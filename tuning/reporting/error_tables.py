@@ -36,9 +36,7 @@ def comparison_table(
     first = next(iter(evaluations.values()))
     if not first.has_truth:
         return _innovations_table(evaluations, where)
-    outputs = {
-        symbol: output for evaluation in evaluations.values() for symbol, output in evaluation.outputs.items()
-    }
+    outputs = {symbol: output for e in evaluations.values() for symbol, output in e.outputs.items()}
     layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
     columns, rows = layout(evaluations, bound, outputs)
     has_bound = not np.isnan(bound).all()

@@ -52,12 +52,7 @@ def report(board: Leaderboard) -> list[RenderableType]:
 def winner(board: Leaderboard) -> int | None:
     """Index of the row with the lowest score, without truth the highest log-likelihood; None if there is none."""
     evaluations = [row.evaluation for row in board.rows]
-    return lowest(
-        [
-            evaluation.score.value if evaluation.has_truth else -evaluation.log_likelihood
-            for evaluation in evaluations
-        ]
-    )
+    return lowest([e.score.value if e.has_truth else -e.log_likelihood for e in evaluations])
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
