@@ -18,8 +18,8 @@ from filters import EstimateState
 from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tuning.cli.tune import as_json as tuning_as_json
-from tuning.cli.tune import report
+from tuning.cli.tuning_report import as_json as tuning_as_json
+from tuning.cli.tuning_report import report
 from tuning.problems.find import find_problem
 from tuning.reporting.sections import lines_section
 

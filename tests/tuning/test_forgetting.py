@@ -10,7 +10,7 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.cli.tune import as_json, report, way_out
+from tuning.cli.tuning_report import as_json, report, way_out
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned

@@ -6,7 +6,8 @@ import pytest
 from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.cli.tune import as_json, report, tune
+from tuning.cli.tune import tune
+from tuning.cli.tuning_report import as_json, report
 from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (

@@ -8,7 +8,7 @@ from scipy.stats import chi2, multivariate_normal
 from filters import run
 from pages.tuning_objectives import pair
 from tests.linear_problem import LinearProblem
-from tuning.cli.tune import _band_sentence
+from tuning.cli.tuning_report import _band_sentence
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.runs import RunMetrics, variance_ratios
 from tuning.reporting.alternatives import of_front, of_history

@@ -18,7 +18,8 @@ from thruster_env.core.text_tables import table
 from tuning.api.run import Tuning
 from tuning.cli.options import JsonOption, SeedOption
 from tuning.cli.output import emit, working
-from tuning.cli.tune import as_json, tune
+from tuning.cli.tune import tune
+from tuning.cli.tuning_report import as_json
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label

@@ -25,7 +25,7 @@ from tuning.api.run import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
 from tuning.cli.benchmark import fitted
-from tuning.cli.tune import way_out
+from tuning.cli.tuning_report import way_out
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem
 from tuning.reporting.search_figures import draw_history

@@ -1,0 +1,374 @@
+"""What `thruster tune` reports on a study: tables and sentences, or plain data."""
+
+from __future__ import annotations
+
+from math import isfinite
+from shlex import quote
+
+from rich.console import RenderableType
+
+from filters.consistency.intervals import slightly, span
+from thruster_env.core.modules import is_code
+from tuning.api.run import Tuning
+from tuning.cli.tables import choice_table, front_table, gradient_table, kinds_table
+from tuning.evaluation.baselines import (
+    GIVEN,
+    NOISE,
+    ORACLE,
+    RULE,
+    SCALED,
+    TUNED,
+    baseline_size,
+    baselines,
+    called,
+    same_filter,
+)
+from tuning.evaluation.blow_up import blow_up_on
+from tuning.evaluation.evaluate import likelihood_gain, score_ratio
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
+from tuning.evaluation.summary import numbers
+from tuning.evaluation.tuned import consistency, metrics
+from tuning.evaluation.worth import memory_numbers, memory_sentence
+from tuning.likelihood.family import has_gradient
+from tuning.likelihood.gradient import GradientResult
+from tuning.likelihood.identifiability import as_data, sentences, too_many
+from tuning.logs.problem import model_named_in
+from tuning.problems.augmented import within
+from tuning.problems.plant_packages import built_in
+from tuning.reporting.choice_words import consistency_sentence, gains, model_doubts, residual_sentences
+from tuning.reporting.error_tables import comparison_table
+from tuning.reporting.units import apart
+from tuning.search.among_types import filter_types_tried
+from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
+from tuning.search.parameters import index_pairs, size_ladder
+from tuning.search.plan import Plan
+from tuning.search.ranges import at_ends, range_words
+from tuning.search.space import parameters_of
+from tuning.search.study import StudyResult
+from tuning.search.trials import is_over_budget
+from tuning.search.validation import as_data as as_data_of_choice
+
+MOST_VALUES = 8  # of a baseline, in a sentence
+
+
+def report(tuning: Tuning) -> list[RenderableType]:
+    """The gain of a tuning, the path of its filter and the next command; then tables and sentences."""
+    result, plan = tuning.result, tuning.plan
+    output: list[RenderableType] = [*tuning.chosen]
+    for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
+        where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
+        gained, doubts = gains(comparison, scenario.seed_word), model_doubts(scenario, comparison, plan.seed)
+        headline = 1 if comparison.tuned.has_truth else len(gained)
+        output += [f"{where}{gained[0]}", *gained[1:headline], *doubts, *gained[headline:]]
+    if result.consistent is False:
+        output.append(_none_consistent(result, plan))
+    output += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
+    output += [remark for scenario in plan.scenarios for remark in scenario.remarks]
+    for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
+        choice, size = result.choice, baseline_size(result.choice)
+        known = {TUNED: choice, **baselines(choice.name, scenario, plan.seed, comparison.default, size)}
+        evaluations = comparison.evaluations
+        choices = {name: known[name] for name in evaluations}
+        span_of_seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
+        where = f"held-out {span_of_seeds}, scenario {scenario.name}"
+        output += [
+            choice_table(choices, scenario),
+            comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
+        ]
+        output += [consistency_sentence(comparison), memory_sentence(comparison.tuned, scenario)]
+        output += residual_sentences(scenario, plan.seed)
+    output += at_ends(result.choice, plan)
+    output += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
+    output += _search_sentences(tuning)
+    trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
+    over = sum(map(is_over_budget, result.trials))
+    trained += f"; {over} stopped at the budget" if over else ""
+    return [*output, f"Study {tuning.study!r}: {trained}."]
+
+
+def blown_up(tuning: Tuning) -> list[str]:
+    """Advice on a model that diverges between samples, where no Q and R help; empty if it does not."""
+    advice = []
+    for scenario, comparison in zip(tuning.plan.scenarios, tuning.comparisons, strict=True):
+        data = scenario.data(comparison.seeds)
+        advice.append(blow_up_on(tuning.result.choice.filter(scenario), data, scenario.dt))
+    return [sentence for sentence in dict.fromkeys(advice) if sentence]
+
+
+def way_out(tuning: Tuning) -> list[str]:
+    """Advice if the tuned filter is significantly worse than a baseline but the oracle; empty otherwise."""
+    better = [name for comparison in tuning.comparisons if (name := _best_instead(comparison))]
+    if not better:
+        return []
+    if tuning.plan.forget is not None:
+        return [
+            f"That is the price of forgetting within {tuning.plan.forget:g} s (--forget): the baselines in the "
+            "table may remember longer."
+        ]
+    if tuning.gradient is not None or tuning.way is not None:
+        option = "--way" if tuning.way is not None else "--method gradient"
+        return [
+            f"What to take: the {called(better[0])}{_noise_words(tuning, better[0])}. The same command without "
+            f"{option} runs a study, which ends with the best baseline if no trial is better."
+        ]
+    pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
+    pruning += ", or maximum likelihood (--method gradient)" if has_gradient(tuning.plan.filter) else ""
+    return [
+        f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below still "
+        f"contains the tuned filter; Q and R of the {called(better[0])} are in the table."
+    ]
+
+
+def _best_instead(comparison: Comparison) -> str:
+    """The best baseline but the oracle that is significantly better than the tuned filter; empty without one."""
+    if comparison.tuned.has_truth:
+        margins = {
+            name: ratio.value for name, ratio in comparison.ratios.items() if ratio.low > 1 and not slightly(ratio)
+        }
+    else:
+        margins = {name: -gain.value for name, gain in comparison.likelihood_gains.items() if gain.high < 0}
+    margins.pop(ORACLE, None)
+    return max(margins, key=lambda name: margins[name], default="")
+
+
+def _noise_words(tuning: Tuning, name: str) -> str:
+    """The values of a baseline, after its name; of many where they are."""
+    choice, plan = tuning.result.choice, tuning.plan
+    choices = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
+    values = parameters_of(choices[name]) if name in choices else {}
+    if not 0 < len(values) <= MOST_VALUES:
+        return ", whose Q and R are in the table"
+    return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
+
+
+def next_steps(tuning: Tuning) -> list[str]:
+    """The path of the tuned filter, and the next command; for an interrupted study how to continue it."""
+    output = [f"Tuned filter: {tuning.file}"]
+    problems = tuning.plan.scenarios
+    plain = [*map(within, problems)]
+    options = [
+        f"--problem {problem.name}"
+        for problem in plain
+        if is_code(problem.name) and problem.name not in built_in()
+    ]
+    options += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, plain)) if name is not None]
+    output.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *options]))
+    if tuning.result.interrupted:
+        output.append("Interrupted: this is the result of the finished trials; the same command continues.")
+    return output
+
+
+def _search_sentences(tuning: Tuning) -> list[RenderableType]:
+    """Results of the search: sizes, the price of consistency, optimism, a front, a maximum."""
+    result, plan, word = tuning.result, tuning.plan, tuning.scenario.seed_word
+    if tuning.gradient is not None and tuning.rival is not None:  # which come together
+        text = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
+        return [gradient_table(tuning.gradient, word), *text]
+    output: list[RenderableType] = []
+    kinds = filter_types_tried(result.trials)
+    if kinds:
+        output.append(kinds_table(kinds, plan))
+    if plan.budget is not None:
+        output.append(
+            f"A step of the tuned {result.choice.name} takes {result.microseconds:.3g} microseconds of one core; "
+            f"the budget is {plan.budget:g}."
+        )
+    if result.sizes:
+        size, ladder = result.choice.numbers["ensemble_size"], size_ladder(result.choice.name)
+        ratios = ", ".join(
+            f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
+        )
+        output.append(
+            f"Score relative to the best, by ensemble size{_sized_trial(result)}, on separate {word}, with the "
+            f"upper end of its 95 % interval: {ratios}. "
+            f"{_size_sentence(size, result)}{_seeds_sentence(result, word)}"
+        )
+    met = result.validation
+    in_band = met is None or (not met.gave_way and met.named(met.chosen).consistent)
+    if result.consistent is not False and result.free_value is not None and in_band:
+        output.append(_band_sentence(plan.objectives[0], result.free_value, result.best_value, word))
+    if plan.objectives == ("score",):  # which needs truth
+        score = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
+        trained, proved = apart(result.best_value, score)
+        output.append(
+            f"Optimism: the score of the tuned filter is {trained} on the training {word}, which chose it, and "
+            f"{proved} on the held-out {word}."
+        )
+    if result.front:
+        output.append(front_table(plan, result.front))
+    return output
+
+
+def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
+    """What a mean NIS in its band costs on the training runs: a part of an error, a difference of a logarithm."""
+    name, levels = reported_name(objective), [reported(objective, value) for value in (free, best)]
+    price = (
+        f"{levels[0] - levels[1]:.3g} of {name}"
+        if objective in PROPER
+        else f"{100 * (best / free - 1):.1f} % of {name}"
+    )
+    with_any, within = apart(*levels)
+    return (
+        f"A mean NIS (normalised innovation squared) in its band costs {price} on the training {word}: the best "
+        f"trial of all has {with_any}, the best in the band {within}."
+    )
+
+
+def _none_consistent(result: StudyResult, plan: Plan) -> str:
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
+    means = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
+    low, high = (channels * end for end in NIS_BAND)
+    end = "largest" if plan.objectives[0] in PROPER else "smallest"
+    best = f"the trial with the {end} {reported_name(plan.objectives[0])}"
+    which = "the baseline above" if gave_way(result) else best
+    return (
+        f"No trial was consistent: a mean NIS must lie between {low:g} and {high:g}, where {channels} is right, "
+        f"but the tuned filter's is {' and '.join(means)} on the training {word}. It is {which}; do not rely on "
+        "its covariance."
+    )
+
+
+def gave_way(result: StudyResult) -> bool:
+    """Whether the trials gave way to a baseline."""
+    return result.validation is not None and result.validation.gave_way
+
+
+def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Comparison) -> list[str]:
+    ours, theirs = tuning.comparison.tuned, rival.tuned
+    loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
+    words = []
+    optimum, optima = ("maximum", "maxima") if gradient.objective in PROPER else ("minimum", "minima")
+    if loose:
+        words.append(
+            f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten (or half of "
+            f"a range that is not logarithmic), or the {optimum} lies at the end of the range."
+        )
+    agree = (
+        f"All starts reach the same {optimum}."
+        if gradient.agree
+        else f"Starts reach different {optima}: the best is kept."
+    )
+    over = (
+        f"Score of the tuned filter over Optuna's on the held-out {tuning.scenario.seed_word}: "
+        f"{span(score_ratio(ours, theirs), 3)}."
+    )
+    if not ours.has_truth:
+        gained = span(likelihood_gain(ours, theirs), 2)
+        over = f"Log-likelihood of a held-out run of the tuned filter above Optuna's: {gained}."
+    words.append(
+        f"{agree} It took {gradient.seconds:.1f} s; {tuning.result.finished} trials of Optuna took "
+        f"{tuning.result.seconds:.1f} s in this run. {over}"
+    )
+    return words
+
+
+def as_json(tuning: Tuning) -> dict:
+    """The result of a tuning as plain data."""
+    result, plan = tuning.result, tuning.plan
+    held_out = {
+        scenario.name: {
+            **metrics(comparison),
+            **ratios_as_json(comparison),
+            "likelihood_over_regression": numbers(comparison.over_regression),
+            "doubts": model_doubts(scenario, comparison, plan.seed),
+        }
+        for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
+    }
+    data = {
+        "study": tuning.study,
+        "plan": plan.identity,
+        "filter": result.choice._asdict(),
+        "trials": result.finished,
+        "pruned": result.pruned,
+        "microseconds_a_step": result.microseconds,
+        "kinds": [kind._asdict() for kind in filter_types_tried(result.trials)],
+        "at_ends": at_ends(result.choice, plan),
+        "ranges": range_words(plan),
+        "choice": as_data_of_choice(result.validation),
+        "best_training_value": result.best_value,
+        "best_training_value_without_consistency": result.free_value,
+        **consistency(result),
+        "warnings": list(tuning.warnings),
+        "memory": {
+            scenario.name: memory_numbers(comparison, scenario, plan.forget)
+            for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
+        },
+        "blows_up": blown_up(tuning),
+        "interrupted": result.interrupted,
+        "sizes": [
+            {
+                "N": r.size,
+                "ratio": r.ratio.value,
+                "upper_end": r.ratio.high,
+                "score": r.evaluation.score.value,
+                "seeds": r.seeds,
+            }
+            for r in result.sizes
+        ],
+        "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],
+        "held_out": held_out,
+        "file": str(tuning.file),
+    }
+    if tuning.way is not None:
+        data["way"] = {"name": tuning.way.name, "runs": tuning.way.runs, "seconds": tuning.way.seconds}
+    if tuning.known is not None:
+        data["innovations_alone"] = as_data(tuning.known)
+    if tuning.gradient is not None and tuning.rival is not None:
+        gradient = tuning.gradient
+        data["gradient"] = {
+            "log_likelihood" if gradient.objective == LIKELIHOOD else gradient.objective: gradient.best.level,
+            "standard_errors_of_logarithms": _errors(gradient, log=True),
+            "standard_errors": _errors(gradient, log=False),
+            "identified": dict(zip(gradient.names, gradient.identified.tolist(), strict=True)),
+            "agree": gradient.agree,
+            "seconds": gradient.seconds,
+            "score_over_optuna": score_ratio(tuning.comparison.tuned, tuning.rival.tuned),
+        }
+    return data
+
+
+def _errors(gradient: GradientResult, log: bool) -> dict[str, float]:
+    """Standard errors of the parameters on logarithmic scales, or of the others, by name."""
+    pairs = zip(gradient.free, gradient.standard_errors.tolist(), strict=True)
+    return {parameter.name: error for parameter, error in pairs if parameter.log == log}
+
+
+def ratios_as_json(comparison: Comparison) -> dict:
+    """Score of the tuned filter over that of each baseline; None where there is no such baseline."""
+    ratios, rule = comparison.ratios, RULE if comparison.rule == RULE else GIVEN
+    names = {"given": GIVEN, "scaled": SCALED, "untuned": rule, "noise": NOISE, "true": ORACLE}
+    return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
+
+
+def _size_sentence(chosen: int, result: StudyResult) -> str:
+    ends, without = {row.size: row.ratio.high for row in result.sizes}, left_out(result.sizes, chosen)
+    among = ""
+    if without:
+        among = f", where N = {', '.join(map(str, without))} is left out: the mean NIS is outside its band"
+    if gave_way(result):
+        return (
+            f"N = {chosen} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}, but at least that of "
+            f"the rule of thumb{among}."
+        )
+    if ends[chosen] < 1 + SIZE_TOLERANCE:
+        return f"N = {chosen} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
+    return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {chosen} is a compromise."
+
+
+def _sized_trial(result: StudyResult) -> str:
+    """Which filter the sizes are of, if it is not the tuned one with another N."""
+    same = result.sized is None or same_filter(result.sized, result.choice)
+    return "" if same else " of the best trial"
+
+
+def _seeds_sentence(result: StudyResult, word: str) -> str:
+    """Which sizes were excluded after few runs; empty if all were run on all of them."""
+    counts = {row.seeds for row in result.sizes}
+    if len(counts) < 2:
+        return ""
+    sizes = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
+    return (
+        f" The others were excluded on the first {min(counts)} {word} before N = {sizes} were run on "
+        f"{max(counts)}."
+    )
