@@ -20,7 +20,7 @@ from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS
 from tuning.experiments.vehicle.experiment import PathResult, Scores, position_ratio, run_tasks, tasks_of
 from tuning.experiments.vehicle.figure import path_runs, paths_figure
-from tuning.experiments.vehicle.printed import POSE, PrintedRow
+from tuning.experiments.vehicle.models import POSE, PrintedRow
 from tuning.experiments.vehicle.statements import ENKF, FKF, digits, findings, statements, with_interval
 
 RUNS = {"ngatini2019": 50, "ngatini2017": 10}

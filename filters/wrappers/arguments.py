@@ -33,7 +33,7 @@ from filters.tuned_file import (
     read_tuned_file,
 )
 from thruster_env.core.checks import short_repr
-from thruster_env.model.split import Split
+from thruster_env.env.model_env import Split
 from thruster_env.model.state_space import StateSpaceModel
 
 # Where a wrapper's model comes from: the env, a factory that the caller names, or the caller.

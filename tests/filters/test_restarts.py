@@ -16,9 +16,8 @@ from filters import EstimateState, RestartWarning, StateSpaceModel, make_filter,
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.wrappers.vector import EstimateStates
-from thruster_env.env.model_env import ModelEnv
+from thruster_env.env.model_env import ModelEnv, Split
 from thruster_env.logs.log import Log
-from thruster_env.model.split import Split
 from tuning.evaluation.evaluate import evaluate, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.summary import summarised, summary

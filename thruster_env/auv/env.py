@@ -16,9 +16,8 @@ from thruster_env.auv.task import make_depth_task, make_task
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
 from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
-from thruster_env.env.model_env import ModelledEnv
+from thruster_env.env.model_env import ModelledEnv, Split, split
 from thruster_env.env.vector_env import PlantVectorEnv
-from thruster_env.model.split import Split, split
 from thruster_env.render.renderer import MODES
 
 # What every env and vector env of the vehicle offers to filters.

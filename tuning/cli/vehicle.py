@@ -27,7 +27,7 @@ from tuning.experiments.vehicle.experiment import (
     tasks_of,
 )
 from tuning.experiments.vehicle.figure import path_runs, paths_figure
-from tuning.experiments.vehicle.printed import POSE, RUNS, PrintedRow
+from tuning.experiments.vehicle.models import POSE, RUNS, PrintedRow
 from tuning.experiments.vehicle.statements import ENKF, FKF, Finding, digits, findings, statements, with_interval
 
 # Tables of the papers on the underwater vehicle.

@@ -8,6 +8,7 @@ They are stored with a digest of their inputs (the choice, the problems and the 
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -22,11 +23,27 @@ from tuning.evaluation.baselines import Scaled, baseline_size, rule_label, rule_
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import Choice
+
+# Versions of the packages that numerical results depend on.
+
+
+PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
+
+
+def versions() -> dict[str, str]:
+    """Installed versions of the packages that a tuned file depends on."""
+    return {name: _version(name) for name in PACKAGES}
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def summary(evaluation: Evaluation) -> dict:

@@ -35,8 +35,7 @@ from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.summary import ROLES, comparison_as_data, sizes_as_data, summary
-from tuning.evaluation.versions import versions
+from tuning.evaluation.summary import ROLES, comparison_as_data, sizes_as_data, summary, versions
 from tuning.problems.augmented import augmented, name_and_unknown, suited
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_given, find_problem

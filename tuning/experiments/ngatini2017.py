@@ -6,7 +6,7 @@ The numbers are those of Ngatini's slides on the same comparison; the article it
 50 members, the fuzzy filter 64 rules.
 """
 
-from tuning.experiments.vehicle.printed import Paper, PrintedPath, PrintedRow
+from tuning.experiments.vehicle.models import Paper, PrintedPath, PrintedRow
 
 MEMBERS, RULES = 50, 64
 

@@ -4,7 +4,7 @@ Source: Ngatini, H. Nurhadi (2019), "Estimasi Lintasan AUV 3 Dimensi (3D) Dengan
 Inovtek Polbeng Seri Informatika 4(1), 12-21, ISSN 2527-9866.
 """
 
-from tuning.experiments.vehicle.printed import Paper, PrintedRow
+from tuning.experiments.vehicle.models import Paper, PrintedRow
 
 PARTICULARS = {
     "mass": (15.0, "kg"),

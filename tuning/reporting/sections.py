@@ -21,7 +21,7 @@ from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.versions import versions
+from tuning.evaluation.summary import versions
 from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
 from tuning.problems.augmented import within
 from tuning.problems.log_problem import LogProblem

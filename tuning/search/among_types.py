@@ -17,13 +17,12 @@ from optuna.trial import FrozenTrial, TrialState
 from tuning.evaluation.baselines import noise_estimated
 from tuning.search.cost import COST
 from tuning.search.gradient_noise import noise_by_gradient
-from tuning.search.new_trials import enqueue_new, is_near
 from tuning.search.objectives import reported
 from tuning.search.parameters import R
 from tuning.search.plan import Plan
 from tuning.search.samplers import near
 from tuning.search.space import FILTER_TYPE, ends_of, trial_parameters, untuned_choice, within_ranges
-from tuning.search.trials import best_trial, is_consistent, is_over_budget
+from tuning.search.trials import best_trial, enqueue_new, is_consistent, is_near, is_over_budget
 
 # Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
 UNTUNED = "untuned"  # the filter whose parameters before any tuning these are

@@ -28,13 +28,12 @@ from tuning.search.among_types import (
     is_race,
 )
 from tuning.search.gradient_noise import BY_GRADIENT, MAXIMUM_LIKELIHOOD, MOST_FOR_STARTS, noise_by_gradient
-from tuning.search.new_trials import enqueue_new
 from tuning.search.objectives import SCORE
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
 from tuning.search.samplers import is_local, near
 from tuning.search.space import FILTER_TYPE, Choice, trial_parameters, untuned_choice, within_ranges
-from tuning.search.trials import NIS, best_trial, is_consistent
+from tuning.search.trials import NIS, best_trial, enqueue_new, is_consistent
 
 # Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
 RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled

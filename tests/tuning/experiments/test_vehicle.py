@@ -31,8 +31,7 @@ from tuning.experiments.vehicle.experiment import (
     scores_of,
     true_runs,
 )
-from tuning.experiments.vehicle.models import papers_model
-from tuning.experiments.vehicle.printed import DT, NOISE, PrintedRow
+from tuning.experiments.vehicle.models import DT, NOISE, PrintedRow, papers_model
 from tuning.experiments.vehicle.statements import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code

@@ -36,8 +36,7 @@ from tuning.experiments.vehicle.estimators import (
     planar_pose,
     pose_errors,
 )
-from tuning.experiments.vehicle.models import papers_model
-from tuning.experiments.vehicle.printed import DT, MEASURED, RUNS, Paper
+from tuning.experiments.vehicle.models import DT, MEASURED, RUNS, Paper, papers_model
 
 # The vehicle's inputs over time on each of the papers' five paths.
 

@@ -15,7 +15,7 @@ from thruster_env.core.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_fig
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import Estimator, ensembles, full_pose, fuzzy, planar_pose
 from tuning.experiments.vehicle.experiment import PATHS, estimate, keys_of, true_runs
-from tuning.experiments.vehicle.printed import DT
+from tuning.experiments.vehicle.models import DT
 
 TRUTH = "truth"
 STYLES = {

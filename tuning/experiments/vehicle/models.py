@@ -1,14 +1,58 @@
-"""The vehicle at the papers' noise, as truth and as filters assume it, and the worlds that it moves in."""
+"""The vehicle at the papers' noise: their settings and tables, truth, and what filters assume of it."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from thruster_env.auv.model import auv_model
 from thruster_env.auv.presets import SEGOROGENI
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.experiments.vehicle.printed import DT, MEASURED, NOISE
+
+# The runs of the papers on the vehicle: the form of a table, and the settings of both papers.
+
+
+DT = 0.001  # [s]
+NOISE = 1e-6  # Q = R = 1e-6 I, in the units of the velocities squared
+MEASURED = ("u", "v", "w", "r")  # H picks these
+POSE = ("x", "y", "z", "psi")  # [m], [m], [m], [rad]
+FUZZY_LOW, FUZZY_HIGH = (0.0,) * 6, (1.0,) * 6  # bounds of the velocities; the rules are the corners
+RUNS = 10  # "mean of 10 runs"
+NOT_PRINTED = (
+    "number of steps",
+    "thrust, propeller torque and stern plane",
+    "P_0",
+    "the vehicle's coefficients and restoring moments",
+    "what the reference paths are",
+    "how measurements were made",
+    "what RMSE and percent are taken over",
+)
+
+
+class PrintedRow(NamedTuple):
+    """One filter on one path."""
+
+    rmse: Mapping[str, float]  # by component of the pose: x, y, z [m], psi [rad]; not every table has all
+    seconds: float
+    final_percent: Mapping[str, float] = {}  # error at the end over the path's end, it seems
+
+
+class PrintedPath(NamedTuple):
+    """Ensemble and fuzzy Kalman filter on one path."""
+
+    enkf: PrintedRow
+    fkf: PrintedRow
+    remark: str = ""  # misprint, or how it was interpreted
+
+
+class Paper(NamedTuple):
+    """A source with remarks for its readers."""
+
+    name: str
+    source: str
+    remarks: tuple[str, ...]
+
 
 ANGLE_NOISE = 1e-6  # of roll and pitch, standard deviation per step [rad]: so Q of eight states is not singular
 START = (1e-3,) * 6 + (1e-4,) * 2 + (0.0,) * 4  # standard deviations about rest at the origin; P_0 is not printed

@@ -17,7 +17,7 @@ from thruster_env.auv.presets import SEGOROGENI
 from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
 from tuning.experiments.vehicle.experiment import MEASURED_PLACES, PathResult, Scores, position_ratio
-from tuning.experiments.vehicle.printed import DT, FUZZY_HIGH, FUZZY_LOW, NOISE, POSE, PrintedRow
+from tuning.experiments.vehicle.models import DT, FUZZY_HIGH, FUZZY_LOW, NOISE, POSE, PrintedRow
 
 # Printed values beside ours, and why they differ.
 
