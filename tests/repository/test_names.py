@@ -45,3 +45,27 @@ def test_no_definition_has_a_word_of_the_list():
     found = {(path.relative_to(ROOT).as_posix(), name) for path in paths for name in defined_in(path)}
     found = [one for one in sorted(found) if any(word in as_words(one[1]) for word in avoided)]
     assert not found, found
+
+
+def variables_to_avoid():
+    """The words that no variable is called."""
+    sentence = (ROOT / "CONTRIBUTING.md").read_text().partition("No variable is called")[2].partition(":")[0]
+    return set(re.findall(r"`(\w+)`", sentence))
+
+
+def variables_in(path):
+    """Variables that a file assigns, but for fields of classes."""
+    tree = ast.parse(path.read_text())
+    lines = [line for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for line in node.body]
+    fields = {id(line.target) for line in lines if isinstance(line, ast.AnnAssign)}
+    fields |= {id(target) for line in lines if isinstance(line, ast.Assign) for target in line.targets}
+    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+    return {name.id for name in names if id(name) not in fields}
+
+
+def test_a_variable_says_what_it_holds():
+    avoided = variables_to_avoid()
+    assert len(avoided) > 15 and "one" in avoided
+    paths = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    wrong = {path.relative_to(ROOT).as_posix(): variables_in(path) & avoided for path in paths}
+    assert not {name: words for name, words in wrong.items() if words}

@@ -271,7 +271,7 @@ WRONG = [
         lambda: tuning.tune(SHORT, trials=1).plot_sizes(),
         "a figure of ensemble sizes needs an ensemble and true states",
     ),
-    (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "place must be at most 1, but got 2"),
+    (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "run must be at most 1, but got 2"),
 ]
 
 

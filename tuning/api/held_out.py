@@ -152,15 +152,15 @@ class HeldOut:
         name = self.choice.name
         return drawn(draw_comparison(self.comparison, f"{label_of(name)} on {self.problem.name}", name))
 
-    def plot_run(self, place: int = 0) -> Figure:
+    def plot_run(self, run: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
 
         Args:
-            place: of the run among the held-out seeds.
+            run: its number among the held-out seeds, from 0.
         """
         from tuning.reporting.time_figures import draw_estimates
 
-        place = at_least("place", place, 0, len(self.seeds) - 1)
+        run = at_least("run", run, 0, len(self.seeds) - 1)
         pair = {RULE: self.choice}
         if self.is_tuned:
             choices = {name: choice for name, choice in self.choices.items() if name != self.name}
@@ -168,7 +168,7 @@ class HeldOut:
             pair = {first: choices[first], self.name: self.choice}
         filters = {name: choice.filter(self.problem) for name, choice in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
-        return drawn(draw_estimates(filters, data, place, self.problem.dt, scored))
+        return drawn(draw_estimates(filters, data, run, self.problem.dt, scored))
 
     def plot_consistency(self) -> Figure:
         """The checks of `check_consistency`, a panel each.

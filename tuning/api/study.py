@@ -170,9 +170,9 @@ class Study:
         """
         return self.held_out.plot_errors()
 
-    def plot_run(self, place: int = 0) -> Figure:
+    def plot_run(self, run: int = 0) -> Figure:
         """One held-out run over time, before and after."""
-        return self.held_out.plot_run(place)
+        return self.held_out.plot_run(run)
 
     def plot_consistency(self) -> Figure:
         """Whether the tuned filter's covariance is consistent on the held-out seeds, a panel per check."""
