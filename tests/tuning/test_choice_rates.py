@@ -18,6 +18,7 @@ from pages.tuning_choice import (
 )
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
+from tuning.evaluation.baselines import RULE
 from tuning.search.measures import Measured, Runs, logs_with_loss, over, signed_rank
 from tuning.search.plan import HELD_OUT_SEEDS, VALIDATION_SEEDS, Plan
 from tuning.search.space import untuned_choice
@@ -193,3 +194,18 @@ def test_a_filter_that_fails_in_one_place_is_replaced_and_one_that_is_right_stay
     for case, truth in ((CASES[10], False), (TRUTH_CASES[2], True)):
         _, new = case_rates(case, truth, 40)
         assert new.changed <= 100.0 / 40 * binom.isf(LEVEL, 40, 0.04)
+
+
+@pytest.mark.parametrize(("gain", "least", "most"), [(0.0, 0.0, 0.06), (1.5, 0.95, 1.0), (-1.5, 0.0, 0.001)])
+def test_few_validation_blocks_are_helped_by_training_where_a_baseline_was_not_fitted(gain, least, most):
+    generator, studies, taken = np.random.default_rng(11), 200, 0
+    for _ in range(studies):
+        rule, given = {}, {}
+        for part, blocks in (("training", 20), ("validation", 6)):
+            rule[part], given[part] = _blocks(generator.standard_normal(blocks) * 3.0 - 3.0 * gain)
+        fitted = Choosing(plan_of(False), {GIVEN: given["validation"], RULE: rule["validation"]}, {}, {})
+        pair = {GIVEN: given["training"], RULE: rule["training"]}
+        choosing = Choosing(plan_of(False), {GIVEN: given["validation"], RULE: rule["validation"]}, {}, pair)
+        assert choosing.baseline == RULE or fitted.baseline == GIVEN
+        taken += choosing.baseline == RULE
+    assert binom.ppf(LEVEL, studies, least) <= taken <= binom.isf(LEVEL, studies, most)

@@ -20,6 +20,8 @@ from tuning.evaluation.baselines import (
     FULL_Q,
     FULL_QR,
     GIVEN,
+    RULE,
+    SCALED,
     baseline_size,
     competing_baselines,
     full_noise,
@@ -122,7 +124,9 @@ def validate(
     """Let the best trials and the baselines meet, and choose.
 
     The best baseline is the one with the least objective; numbers that the user gave remain it until another one
-    passes the test of trials below. The best trial is the one with the best log score of the true states among
+    passes the test of trials below. The rule of thumb and the scaled default, which are not fitted to the training
+    runs, may pass it there if they are better on the validation runs, too: few of these hardly tell two filters
+    apart. The best trial is the one with the best log score of the true states among
     those within 5 % of the least error; without truth it is the one with the least objective among the consistent
     ones, if these cost at most 5 % more than the best of all. A trial can be taken if
 
@@ -164,14 +168,18 @@ def validate(
         finalists |= _rescaled(finalists, plan, training)
     everyone, data = {**before, **finalists}, plan.validation_data()
     results = {name: measured(choice, plan, data) for name, choice in everyone.items()}
+    has_own_seeds = not set(data[0].seeds) & set(training[0].seeds)
+    unfitted = {name: choice for name, choice in before.items() if name in (GIVEN, RULE, SCALED)}
+    on_training = {}
+    if GIVEN in unfitted and len(unfitted) > 1 and has_own_seeds:
+        on_training = {name: measured(choice, plan, training) for name, choice in unfitted.items()}
     choosing = Choosing(
-        plan, {name: results[name] for name in before}, {name: results[name] for name in finalists}
+        plan, {name: results[name] for name in before}, {name: results[name] for name in finalists}, on_training
     )
     candidate = next(filter(choosing.wins, choosing.order()), choosing.best)
     wins = bool(candidate) and choosing.wins(candidate)
     met = tuple(choosing.met(name, choice) for name, choice in everyone.items())
     seeds, baseline = data[0].seeds, choosing.baseline
-    has_own_seeds = not set(seeds) & set(training[0].seeds)
     validation = Validation(
         seeds, has_own_seeds, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
     )
@@ -223,9 +231,22 @@ def _full_noise(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, C
 class Choosing:
     """The choice between baselines and trials that were measured on the same runs."""
 
-    def __init__(self, plan: Plan, baselines: Mapping[str, Measured], trials: Mapping[str, Measured]):
-        """Find the best baseline and the best trial; see `validate`."""
-        self.plan, self.ratio = plan, plan.objectives[0] not in PROPER
+    def __init__(
+        self,
+        plan: Plan,
+        baselines: Mapping[str, Measured],
+        trials: Mapping[str, Measured],
+        training: Mapping[str, Measured] | None = None,
+    ):
+        """Find the best baseline and the best trial; see `validate`.
+
+        Args:
+            plan: of the study.
+            baselines: on the validation runs, by name.
+            trials: likewise.
+            training: what was given and the baselines that were not fitted to the training runs, on these.
+        """
+        self.plan, self.ratio, self.training = plan, plan.objectives[0] not in PROPER, training or {}
         self.baselines, self.trials = dict(baselines), dict(trials)
         self.baseline = self._best_baseline()
         best, self.price = _best_of(plan, self.trials, self.ratio, self.baselines[self.baseline])
@@ -237,7 +258,15 @@ class Choosing:
         if GIVEN not in self.baselines:
             return by_value[0]
         self.baseline = GIVEN
-        return next((name for name in by_value[: by_value.index(GIVEN)] if self.wins(name)), GIVEN)
+        better = by_value[: by_value.index(GIVEN)]
+        return next((name for name in better if self.wins(name) or self._wins_training(name)), GIVEN)
+
+    def _wins_training(self, name: str) -> bool:
+        """Whether a baseline that was not fitted to the training runs is better than the given filter there."""
+        if name not in self.training:
+            return False
+        pair = self.training[name], self.training[GIVEN]
+        return is_better(*pair, ratio=self.ratio) and not logs_with_loss(*pair, ratio=self.ratio)
 
     def order(self) -> Iterator[str]:
         """The best trial, then of the others those that can be taken, the best first."""
