@@ -45,7 +45,8 @@ CHOICE = untuned_choice("kf", PROBLEM)
 def test_reports_have_log_l_and_not_its_negative(objective, name, said):
     assert reported_name(objective) == name and "negative" not in reported_about(objective)
     assert reported(objective, 59.0) == (59.0 if objective == "score" else -59.0)
-    assert said in _band_sentence(objective, 56.0, 59.0, "blocks")  # 59 = -log L is worse than 56
+    (cost,) = _band_sentence(objective, 56.0, 59.0, "blocks")  # 59 = -log L is worse than 56
+    assert said in cost and _band_sentence(objective, 56.0, 56.0, "blocks") == []
     trials = [create_trial(value=value) for value in (70.0, 56.0)]
     assert f"{name} of 2 trials" in of_history(trials, objective)
     axis = draw_history(trials, "a study", name, objective).axes[0]

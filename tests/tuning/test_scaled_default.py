@@ -1,5 +1,7 @@
 """The baselines of a tuned filter: the factor on Q that makes the mean NIS right, and where there is none."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -80,12 +82,13 @@ def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
     import tuning.evaluation.baselines as module
 
     def jumps(filter_, data, scale, evaluate=module.values_of):
-        nis = 0.5 if filter_.model.process_noise_cov[0, 0] > 1.0 else 2.0
+        nis = 2.0 if filter_.model.process_noise_cov[0, 0] > 1.0 else 8.0
         found = evaluate(filter_, data, scale)
-        return found._replace(nis=found.nis._replace(value=nis))
+        return found._replace(nis=found.nis._replace(value=nis), expected_nis=4.0)  # as of four channels
 
     monkeypatch.setattr(module, "values_of", jumps)
-    assert "it jumps to" in scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
+    reason = scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
+    assert re.match(r"no factor on Q brings the mean NIS of ekf to 4: it jumps to [28] with", reason)
 
 
 def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_counts_first():

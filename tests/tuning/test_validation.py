@@ -342,6 +342,12 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
         in said[0]
     )
     assert said[0].endswith("of a run is 610 [-523, 1740] higher, but it is worse in run1.csv).")
+    lost = lost._replace(over=Interval(8.9, -51.6, 69.4))
+    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    assert said[0].endswith(
+        "no trial is significantly better (trial 3's log-likelihood of a run is 8.9 [-51.6, 69.4] lower, and it "
+        "is worse in run1.csv)."
+    )
 
 
 def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():

@@ -176,6 +176,7 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
         "sizes": [],
         "sized": None,
         "free_value": None,
+        "band_value": None,
     }
     return (
         result._replace(choice=choice, best_value=value, **nothing),

@@ -186,8 +186,8 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
         )
     met = result.validation
     in_band = met is None or (not met.gave_way and met.named(met.chosen).consistent)
-    if result.consistent is not False and result.free_value is not None and in_band:
-        output.append(_band_sentence(plan.objectives[0], result.free_value, result.best_value, word))
+    if in_band and result.free_value is not None and result.band_value is not None:
+        output += _band_sentence(plan.objectives[0], result.free_value, result.band_value, word)
     if plan.objectives == ("score",):  # which needs truth
         score = sum(comparison.tuned.score.value for comparison in tuning.comparisons) / len(tuning.comparisons)
         trained, proved = apart(result.best_value, score)
@@ -200,8 +200,13 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
     return output
 
 
-def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
-    """What a mean NIS in its band costs on the training runs: a part of an error, a difference of a logarithm."""
+def _band_sentence(objective: str, free: float, best: float, word: str) -> list[str]:
+    """The cost of a mean NIS in its band on the training runs, in a list; empty if the best trial of all has one.
+
+    It is a part of an error or a difference of logarithms, with the ensemble sizes at which the trials were run.
+    """
+    if best <= free:
+        return []
     name, levels = reported_name(objective), [reported(objective, value) for value in (free, best)]
     price = (
         f"{levels[0] - levels[1]:.3g} of {name}"
@@ -209,10 +214,10 @@ def _band_sentence(objective: str, free: float, best: float, word: str) -> str:
         else f"{100 * (best / free - 1):.1f} % of {name}"
     )
     with_any, within = apart(*levels)
-    return (
+    return [
         f"A mean NIS (normalised innovation squared) in its band costs {price} on the training {word}: the best "
         f"trial of all has {with_any}, the best in the band {within}."
-    )
+    ]
 
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:

@@ -194,36 +194,39 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0, ensemble_size: i
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
     data = data_of(scenario, scenario.training_seeds(seed, TRAINING_SEEDS))
-    rule = _with_size(rule_of_thumb(name, scenario), ensemble_size)
+    rule, right = _with_size(rule_of_thumb(name, scenario), ensemble_size), 1.0
 
     def nis_at(factor: float) -> float:
-        ratio = nis_ratio(values_of(scaled_rule(rule, scenario, factor).filter(scenario), data, scenario.scale))
+        nonlocal right
+        evaluation = values_of(scaled_rule(rule, scenario, factor).filter(scenario), data, scenario.scale)
+        ratio, right = nis_ratio(evaluation), evaluation.expected_nis
         return ratio if 0.0 < ratio < LARGEST else LARGEST
+
+    def fails(factors: str, ends: str) -> Scaled:
+        return Scaled(None, None, None, f"{factors} brings the mean NIS of {name} to {right:.3g}: it {ends}")
 
     def excess(exponent: float) -> float:
         return math.log(nis_at(10.0**exponent))
 
     first, exponent = excess(0.0), 0
     if not np.any(scenario.model(**rule.model).process_noise_cov):
-        reason = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
-        return Scaled(None, None, None, reason)
+        return fails("no factor on a Q of zero", f"is {right * math.exp(first):.3g}")
     step = 1 if first > 0 else -1  # a larger Q lowers the NIS
     last = first
     while last * first > 0 and abs(exponent) < DECADES:
         exponent += step
         last = excess(exponent)
     if last * first > 0:
-        ends = f"{math.exp(first):.3g} with a factor of 1 and {math.exp(last):.3g} with {10.0**exponent:g}"
+        nis = [f"{right * math.exp(end):.3g}" for end in (first, last)]
         factors = f"no factor on Q from {10.0**-DECADES:g} to {10.0**DECADES:g}"
-        return Scaled(None, None, None, f"{factors} brings the mean NIS of {name} to 1: it is {ends}")
+        return fails(factors, f"is {nis[0]} with a factor of 1 and {nis[1]} with {10.0**exponent:g}")
     from scipy.optimize import brentq  # loads half of SciPy, for this line
 
     root = brentq(excess, *sorted((exponent - step, exponent)), xtol=1e-3, rtol=1e-3) if exponent else 0.0
     factor = float(f"{10.0**root:.{DIGITS}g}")
     nis = nis_at(factor)
     if abs(nis - 1.0) > CLOSE:
-        reason = f"no factor on Q brings the mean NIS of {name} to 1: it jumps to {nis:.3g} with {factor:g}"
-        return Scaled(None, None, None, reason)
+        return fails("no factor on Q", f"jumps to {right * nis:.3g} with {factor:g}")
     return Scaled(scaled_rule(rule, scenario, factor), factor, nis)
 
 

@@ -25,7 +25,7 @@ from tuning.problems.augmented import within
 from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Problem
 from tuning.search.measures import LEVEL
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, PROPER
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, NIS_BAND, PROPER, nis_ratio
 from tuning.search.validation import choice_from
 
 FULL_NOISE = {FULL_Q: "--full-q", FULL_QR: "--full-q --full-r"}  # by the option that lets it compete with trials
@@ -56,7 +56,9 @@ def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[st
         lost = met[candidate].get("worse_in")
         without, but = "", ""
         if lost:
-            without, but = " without being worse in a log", f", but it is worse in {_listed(lost)}"
+            is_better = over[0] < (0.0 if likely else 1.0)
+            without = " without being worse in a log" if is_better else ""
+            but = f", {'but' if is_better else 'and'} it is worse in {_listed(lost)}"
         none_is, its = f"{the} is not", f"its {what}"
         if _is_trial(candidate):
             none_is, its = "no trial is", f"{candidate}'s {what}"
@@ -344,7 +346,8 @@ def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> lis
 
     With truth, residuals of the training runs correlate by more than 0.5 with the next step. Without truth it is a
     question: the given Q and R have a mean NIS above three times the expected one, or the tuned filter predicts
-    held-out measurements far worse than a linear regression, `tuning.evaluation.regression`.
+    held-out measurements far worse than a linear regression, `tuning.evaluation.regression`. Where the mean NIS of
+    the tuned filter is in its band, the given Q and R were wrong, and not the model.
 
     Args:
         problem: has the model.
@@ -354,7 +357,8 @@ def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> lis
     untuned, over, reasons = comparison.given, comparison.over_regression, []
     if comparison.tuned.has_truth:
         return _correlation_doubt(problem, seed)
-    if untuned is not None and untuned.nis.value > LARGE_NIS * untuned.expected_nis:
+    in_band = NIS_BAND[0] <= nis_ratio(comparison.tuned) <= NIS_BAND[1]
+    if untuned is not None and nis_ratio(untuned) > LARGE_NIS and not in_band:
         reasons.append(
             f"with its own Q and R the mean NIS is {untuned.nis.value:.3g} where {untuned.expected_nis:.3g} is "
             "right"

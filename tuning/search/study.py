@@ -50,6 +50,7 @@ class StudyResult(NamedTuple):
     free_value: float | None = (
         None  # first objective of the best trial, consistent or not; None without a constraint
     )
+    band_value: float | None = None  # the same of the best trial with a mean NIS in its band; None if none has
     front: tuple[FrozenTrial, ...] = ()  # Pareto front: trials that no other trial dominates in two objectives
     microseconds: float | None = None  # us/step of the choice, where the plan asks for it
     consistent: bool | None = None  # whether any trial's mean NIS is within its band; None without a constraint
@@ -224,6 +225,7 @@ def run_study(
         time.perf_counter() - started,
         interrupted,
         min(complete) if plan.is_constrained else None,
+        best.values[0] if plan.is_constrained and is_consistent(best) else None,
         tuple(study.best_trials) if len(plan.objectives) > 1 else (),
         # A smaller ensemble takes no longer than the trial's.
         min(cost_of(choice, plan, data), best.user_attrs[COST]) if plan.asks_for_cost else None,
@@ -248,6 +250,7 @@ def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> S
         best_value=measured(choice, plan, data).value,
         validation=validation,
         free_value=None,
+        band_value=None,
         consistent=None,
         nis=(),
         sizes=[],
