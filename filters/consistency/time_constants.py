@@ -46,9 +46,18 @@ class Path(NamedTuple):
     innovation_covs: np.ndarray
     q_factors: np.ndarray
 
+    def of_states(self, indices: np.ndarray) -> Path:
+        """The path of some states where all others are known."""
+        block = np.ix_(range(len(self.covs)), indices, indices)
+        return self._replace(
+            transitions=self.transitions[block],
+            observations=self.observations[..., indices],
+            covs=self.covs[block],
+        )
+
 
 class TimeConstants(NamedTuple):
-    """Time constants of a filter's gain in steps, of the observable part of its state.
+    """Time constants of a filter's gain in steps, of the observable part of its state without constants.
 
     Attributes:
         steps: the longest first; infinite where an error never fades.
@@ -93,7 +102,7 @@ class RaisedNoise(NamedTuple):
     steps: float
 
 
-def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None:
+def time_constants(filter_: Filter, runs: Sequence[Run], constants: Sequence[int] = ()) -> TimeConstants | None:
     """How long an error of a filter's estimate lasts on some runs.
 
         A = (I - K H) F,   K = (F P F' + Q) H' S^-1,   tau = -1 / log|lambda(A)| steps
@@ -106,6 +115,8 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
     Args:
         filter_: the filter.
         runs: arguments of `filters.run`, with one run each.
+        constants: indices of states that are meant to be remembered; time constants are those of the other states,
+            with these known.
 
     Returns:
         None for a filter without a covariance, and where no estimate is finite.
@@ -132,10 +143,14 @@ def time_constants(filter_: Filter, runs: Sequence[Run]) -> TimeConstants | None
     if not (np.abs(closed) < LARGEST).all():
         return None
     observable, blind = observable_part(path, scales, model.measurement_noise_cov)
+    rest = _others(n, constants)
+    if len(constants):
+        closed, scales = closed[np.ix_(range(len(closed)), rest, rest)], scales[rest]
+        observable, _ = observable_part(path.of_states(rest), scales, model.measurement_noise_cov)
     closed = observable.T @ (closed / scales[:, None] * scales) @ observable
     growth, direction = _growth(closed)
     kappa = min(float(np.linalg.eigvals(removed).real.max(initial=0.0)), 1.0)
-    slowest = int(np.abs(observable @ direction).argmax()) if len(growth) else 0
+    slowest = int(rest[np.abs(observable @ direction).argmax()]) if len(growth) else 0
     length = min(inputs.shape[1] for _, inputs, _ in runs)
     return TimeConstants(tuple(map(_steps_of, growth)), slowest, _steps_of(1.0 - kappa), blind, length)
 
@@ -196,7 +211,11 @@ def observable_part(path: Path, scales: np.ndarray, r: np.ndarray) -> tuple[np.n
 
 
 def forgetting_noise(
-    path: Path, model: StateSpaceModel, steps: float, slowest: Callable[[np.ndarray], float] | None = None
+    path: Path,
+    model: StateSpaceModel,
+    steps: float,
+    slowest: Callable[[np.ndarray], float] | None = None,
+    constants: Sequence[int] = (),
 ) -> RaisedNoise:
     """Q of a model plus the least multiple of a floor for which no time constant exceeds `steps`.
 
@@ -213,13 +232,15 @@ def forgetting_noise(
         steps: the longest time constant that is allowed.
         slowest: the longest time constant with a Q (n, n); by default that of the steady gain along the path,
             repeated endlessly, of the observable part of the state.
+        constants: indices of states that are meant to be remembered; their variances stay.
 
     Raises:
         ValueError: if nothing is observable.
 
     Source: Anderson, Moore (1979), Optimal Filtering, section 6.2 (exponential data weighting).
     """
-    scales, r = _scales(model, path), model.measurement_noise_cov
+    rest, r = _others(model.n, constants), model.measurement_noise_cov
+    block, scales, path = np.ix_(rest, rest), _scales(model, path)[rest], path.of_states(rest)
     basis, _ = observable_part(path, scales, r)
     if not basis.shape[1]:
         raise ValueError(
@@ -228,7 +249,7 @@ def forgetting_noise(
     root = np.linalg.cholesky(r)
     f = basis.T @ (path.transitions / scales[:, None] * scales) @ basis
     h = np.linalg.solve(root, path.observations * scales) @ basis
-    q = basis.T @ (model.process_noise_cov / scales[:, None] / scales) @ basis
+    q = basis.T @ (model.process_noise_cov[block] / scales[:, None] / scales) @ basis
 
     def steady(lift: np.ndarray) -> float:
         a, p, j = _steady(f, h, q + lift, path.q_factors)
@@ -236,7 +257,8 @@ def forgetting_noise(
         return _steps_of(growth ** (1.0 / len(f)))
 
     def cov(lift: np.ndarray) -> np.ndarray:
-        raised = model.process_noise_cov + basis @ lift @ basis.T * scales[:, None] * scales
+        raised = model.process_noise_cov.copy()
+        raised[block] += basis @ lift @ basis.T * scales[:, None] * scales
         return 0.5 * (raised + raised.T)
 
     reached = steady if slowest is None else lambda lift: slowest(cov(lift))
@@ -339,6 +361,11 @@ def _steps_of(growth: float) -> float:
     if growth <= 0.0:
         return 0.0
     return -1.0 / math.log(growth) if growth < 1.0 - SETTLED else math.inf
+
+
+def _others(n: int, constants: Sequence[int]) -> np.ndarray:
+    """Indices of the states that are not constants."""
+    return np.delete(np.arange(n), np.asarray(constants, dtype=int))
 
 
 def _scales(model: StateSpaceModel, path: Path) -> np.ndarray:

@@ -164,3 +164,23 @@ def test_along_slopes_that_change_it_is_the_mean_growth_of_errors():
         product = (np.eye(2) - gain @ [[1.0, 0.0]]) @ f @ product
     slowest = -(300 - n) / math.log(np.abs(np.linalg.eigvals(product)).max())
     assert found.slowest == 1 and not found.unobservable and found.steps[0] == pytest.approx(slowest, rel=0.2)
+
+
+def test_a_constant_is_remembered_while_the_other_states_forget():
+    drifting = affine_model(  # a random walk whose drift is a constant
+        a=[[1.0, 1.0], [0.0, 1.0]],
+        b=np.zeros((2, 1)),
+        c=[[1.0, 0.0]],
+        process_noise_cov=[0.01, 0.0],
+        measurement_noise_cov=1.0,
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1e-9],
+    )
+    filter_ = make_filter("kf", drifting)
+    assert time_constants(filter_, runs(300)).steps[0] > 300
+    (steps,) = time_constants(make_filter("kf", walk(0.01)), runs(300)).steps
+    assert time_constants(filter_, runs(300), [1]).steps == pytest.approx([steps], rel=1e-3)
+    path = slopes_along(filter_, runs(300))
+    cov, reached = forgetting_noise(path, drifting, 0.5 * steps, constants=[1])
+    assert reached == pytest.approx(0.5 * steps, rel=2e-3)
+    assert cov[0, 0] > 0.02 and (cov[1] == 0.0).all() and (cov[:, 1] == 0.0).all()

@@ -1,10 +1,13 @@
 """A filter that sleeps: results say how long it remembers, warn, and `forget` makes it listen."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 import tuning
 from filters import affine_model, make_filter, run
+from filters.augmented import Unknown
 from filters.consistency.intervals import Interval
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
@@ -15,6 +18,7 @@ from tuning.evaluation.baselines import rule_of_thumb
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence, warnings_of
+from tuning.problems.augmented import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.runs_problem import log_of
@@ -22,10 +26,16 @@ from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
 from tuning.search.forgetting import forgetting, time_constants_on, with_oracle_and_advice
 from tuning.search.plan import Plan
-from tuning.search.space import Choice
+from tuning.search.space import Choice, untuned_choice
 from tuning.search.validation import choice_from
 
 DT, STEPS, FORGET = 0.05, 200, 0.5
+
+
+class Drag(NamedTuple):
+    """The constant of a boat."""
+
+    drag: float = 0.5
 
 
 def cart(q=0.0):
@@ -87,6 +97,28 @@ def test_a_filter_that_sleeps_as_the_oracle_does_is_a_fact_and_one_that_must_for
     numbers = as_json(awake.tuning)["memory"]["cart"]
     assert 0.99 * FORGET < numbers["longest"] <= numbers["allowed"] == FORGET and not numbers["warns"]
     assert "Time constants of the gain: 0.5" in memory_sentence(awake.held_out.evaluation, awake.problem)
+
+
+def test_a_constant_without_a_random_walk_is_not_asked_to_forget():
+    model = StateSpaceModel(
+        transition=lambda x, u, c: (x[0] + DT * (u[0] - c.drag * x[0]),),
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[1e-5],
+        measurement_noise_cov=[1e-4],
+        prior_mean=[0.0],
+        prior_cov=[0.1],
+        constants=Drag(),
+        states=["speed"],
+    )
+    push = np.sin(np.arange(STEPS) / 7.0)[:, None]
+    with interpreted():
+        inner = ModelProblem(model, inputs=push, scale=[0.01], dt=DT, name="drag")
+        for walk, sleeps in ((0.0, False), (1e-5, True)):
+            constant = augmented(inner, {"drag": Unknown(std=0.1, walk_std=walk)})
+            choice = untuned_choice("ekf", constant)
+            assert time_constants_on(choice.filter(constant), constant).is_slow == sleeps
+            cov = np.array(forgetting(choice, [constant], 0, 1.0).model["process_noise_cov"])
+            assert (cov.T[-1] > walk**2).any() == sleeps
 
 
 def test_a_filter_that_sleeps_more_than_the_oracle_is_warned_of_with_an_advice_that_holds(studies, problem):

@@ -54,10 +54,15 @@ def test_the_last_of_three_is_the_correlation_once_the_first_state_is_known():
     assert known[0, 1] / np.sqrt(known[0, 0] * known[1, 1]) == pytest.approx(0.7)
 
 
+def test_a_state_without_noise_has_neither_variance_nor_covariances():
+    cov = full_covariance((1.0, 0.0, 4.0), [0.3, 0.5, -0.2])
+    assert (cov[1] == 0.0).all() and cov[0, 2] == pytest.approx(0.5 * 2.0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [
-        (((1.0, 0.0), [0.1]), "variances must be positive, but got"),
+        (((1.0, -1.0), [0.1]), "variances must be at least zero, but got"),
         (((1.0, 1.0), [1.01]), "correlations must be 1 numbers from -1 to 1"),
         (((1.0, 1.0), []), "correlations must be 1 numbers from -1 to 1"),
     ],

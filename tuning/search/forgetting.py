@@ -23,6 +23,7 @@ from filters.filter import Filter
 from filters.registry import make_filter
 from filters.tuned_file import NOISE, PRIOR
 from tuning.problems.assumed import rows_argument
+from tuning.problems.augmented import constants_in
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice, oracle_choice, untuned_choice
 
@@ -34,6 +35,8 @@ ATTEMPTS = 8  # to find one that a larger Q reaches
 def time_constants_on(filter_: Filter, problem: Problem, seed: int = 0) -> TimeConstants | None:
     """Time constants of a filter's gain along two training runs of a problem, of logs along whole logs.
 
+    Constants of the model that are estimated without a random walk are not among them: these are to be remembered.
+
     Args:
         filter_: the filter; one of another package has none, as it need not compute with its model.
         problem: whose runs they are.
@@ -41,7 +44,8 @@ def time_constants_on(filter_: Filter, problem: Problem, seed: int = 0) -> TimeC
     """
     if isinstance(filter_, ForeignFilter):
         return None
-    constants = time_constants(filter_, _runs(problem, seed))
+    fixed = _fixed(problem, filter_.kernel_model.process_noise_cov)
+    constants = time_constants(filter_, _runs(problem, seed), fixed)
     return constants and constants._replace(length=problem.shortest_log or constants.length)
 
 
@@ -84,7 +88,8 @@ def raised_noise(
         return inf if constants is None else max(constants.steps, default=0.0)
 
     model = problem.model(**choice.model)
-    return forgetting_noise(path, model, seconds / problem.dt, stated if exact else None)
+    fixed = _fixed(problem, model.process_noise_cov)
+    return forgetting_noise(path, model, seconds / problem.dt, stated if exact else None, fixed)
 
 
 def with_oracle_and_advice(constants: TimeConstants, choice: Choice, problem: Problem, seed: int) -> TimeConstants:
@@ -138,6 +143,12 @@ def _two_digits(value: float, rounding: Callable[[float], int]) -> float:
     """A positive number with two digits."""
     exponent = floor(log10(value)) - 1
     return float(f"{rounding(float(f'{value / 10.0**exponent:.9g}'))}e{exponent}")
+
+
+def _fixed(problem: Problem, cov: np.ndarray) -> tuple[int, ...]:
+    """Indices of a model's constants (`--augment`), its last states, that have no random walk in Q (n, n)."""
+    n = len(cov)
+    return tuple(i for i in range(n - len(constants_in(problem)), n) if cov[i, i] == 0.0)
 
 
 def _with_noise(choice: Choice, cov: np.ndarray) -> Choice:

@@ -132,19 +132,19 @@ def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -
     states before j are known, L_ij = r_ij sqrt(1 - sum_{k<j} L_ik^2) for j < i, and L_ii the root that remains.
 
     Args:
-        variances: n positive numbers.
+        variances: n numbers of at least zero.
         correlations: r_21, r_31, r_32, ..., n (n - 1) / 2 numbers from -1 to 1. For two states the one is the
             correlation itself.
 
     Raises:
-        ValueError: if a variance is not positive, a correlation is not from -1 to 1, or there are too few.
+        ValueError: if a variance is negative, a correlation is not from -1 to 1, or there are too few.
 
     Source: Lewandowski, Kurowicka, Joe (2009), "Generating random correlation matrices based on vines and extended
     onion method", J. Multivariate Analysis 100(9).
     """
     diagonal, count = np.asarray(variances, dtype=np.float64), len(variances) * (len(variances) - 1) // 2
-    if not (diagonal > 0).all():
-        raise ValueError(f"variances must be positive, but got {diagonal.tolist()}")
+    if not (diagonal >= 0).all():
+        raise ValueError(f"variances must be at least zero, but got {diagonal.tolist()}")
     if len(correlations) != count or not all(abs(r) <= 1 for r in correlations):
         raise ValueError(f"correlations must be {count} numbers from -1 to 1, but got {list(correlations)}")
     factor = np.sqrt(diagonal)[:, None] * _lower(len(diagonal), correlations)
