@@ -255,8 +255,10 @@ def remedy_sentence(report: ConsistencyReport) -> str:
         what = ""
     remedies = symptoms(report)
     if lasting and not remedies:
-        first, second = what or "raise Q", _augment(report.constants)
-        what = f"{first}; or {second}" if over or under or slow else f"{second}; or {first}"
+        second = _augment(report.constants) if estimable(report.constants) else "repair the model"
+        first = what or "raise Q"
+        if second not in first:
+            what = f"{first}; or {second}" if over or under or slow else f"{second}; or {first}"
     tried = "; ".join([*remedies, *([what] if what else [])])
     return f"To try: {tried}." if tried else ""
 
@@ -266,14 +268,18 @@ def is_white(whiteness: Whiteness) -> bool:
     return whiteness.statistic == 0 or bool(whiteness.p_value >= SIGNIFICANT)
 
 
+def estimable(constants: Sequence[str]) -> list[str]:
+    """The constants of a model that may be estimated as states: all but the sample time."""
+    return [name for name in constants if name not in NEVER]
+
+
 def _augment(constants: Sequence[str]) -> str:
     """Advice for a model whose errors last: make a constant that may be off a state."""
-    constants = [name for name in constants if name not in NEVER]
+    constants = estimable(constants)
     names = ", ".join(constants[:MOST_CONSTANTS])
     more = f" and {len(constants) - MOST_CONSTANTS} more" if len(constants) > MOST_CONSTANTS else ""
-    of_it = f" (it has {names}{more})" if constants else ""
     return (
-        f"estimate a constant of the model that may be off{of_it} as a further state, with "
+        f"estimate a constant of the model that may be off (it has {names}{more}) as a further state, with "
         "`thruster compare --augment NAME` or `filters.augmented_model`"
     )
 

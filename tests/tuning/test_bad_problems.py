@@ -116,6 +116,10 @@ BAD = {
         lambda: pendulum_problem.problem(measure=two_of_three, measurement_noise_cov=None).data([1]),
         r"measurements of problem an env must have the shape \(1, 81, 3\) of its model, but got \(1, 81, 2\)",
     ),
+    "discrete": (
+        lambda: EnvProblem("CartPole-v1", "random", line()),
+        r"must have a Box as its action space, but that of problem 'an env' is Discrete\(2\): wrap it in ",
+    ),
     "actions": (
         lambda: EnvProblem("Pendulum-v1", "random", line()),
         "the action space of problem an env must have the model's 0 entries, but got Box",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from filters.augmented import Unknown
+from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
@@ -134,6 +135,10 @@ def test_a_size_is_for_filters_that_have_an_ensemble():
         (
             lambda: contender("ekf", unknown={"ambient_velocity": None}).filter(find_scenario("published_tunnel")),
             "a constant to estimate must be one of ",
+        ),
+        (
+            lambda: contender("kf", unknown={"k": None}).filter(LinearProblem()),
+            "one of the model's, but it has none, and got 'k': give the StateSpaceModel a NamedTuple as constants",
         ),
     ],
 )

@@ -205,6 +205,10 @@ def test_a_problem_that_has_changed_is_not_what_a_file_was_tuned_on(tuned, tmp_p
         ValueError, match="a problem that is code must be given, but .*t.json only names 'os:getcwd'"
     ):
         read_tuned(copy)
+    with pytest.raises(
+        ValueError, match="must be the one it was tuned on, os:getcwd, but got nominal: use --prob"
+    ):
+        read_tuned(copy, [find_scenario("nominal")])
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ OFTENER times as often as the value next to it.
 Outliers. A sample above both of its neighbours, or below both, by more than SPIKE standard deviations of the noise
 (estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours from
 each other and from those beyond: a jump or a peak of the signal is not an outlier. A normal one is one in 10^8.
+Outliers side by side hide each other, so their number is a lower bound.
 """
 
 from __future__ import annotations
@@ -191,8 +192,8 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
     spikes = _spikes(rows, values, quantity.angle)
     if len(spikes):
         first, last = int(rows[spikes[0]]), int(rows[spikes[-1]])
-        spikes_text = "an outlier" if len(spikes) == 1 else f"{len(spikes)} outliers"
-        text = f"{_name(channel)} has {spikes_text}{_where(log, first, last)}"
+        count = "1 outlier" if len(spikes) == 1 else f"{len(spikes)} outliers"
+        text = f"{_name(channel)} has at least {count}{_where(log, first, last)} (those side by side do not count)"
         findings.append(Finding(OUTLIER, channel, first, last, len(spikes), text))
     return findings
 

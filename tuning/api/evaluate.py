@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tuning.api.held_out import HeldOut, on_held_out
 from tuning.api.problems import given_for, is_filter, problem_of
@@ -16,9 +16,6 @@ from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
-if TYPE_CHECKING:
-    from thruster_env.model.state_space import StateSpaceModel
-
 NOMINAL = "nominal"  # the problem of a filter that is not tuned, where none is named
 
 
@@ -29,7 +26,7 @@ def evaluate(
     seeds: int = HELD_OUT_SEEDS,
     seed: int = 0,
     preset: str | Path | None = None,
-    model: str | StateSpaceModel | None = None,
+    model: str | None = None,
     progress: bool | None = None,
 ) -> HeldOut:
     """Run a filter and its baselines on held-out seeds of a problem.

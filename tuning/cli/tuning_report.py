@@ -138,7 +138,9 @@ def _noise_words(tuning: Tuning, name: str) -> str:
     choices = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
     values = parameters_of(choices[name]) if name in choices else {}
     if not 0 < len(values) <= MOST_VALUES:
-        return ", whose Q and R are in the table"
+        return (
+            ", whose Q and R --way noise-estimation saves" if name == NOISE else ", whose Q and R are in the table"
+        )
     return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
 
 

@@ -32,6 +32,7 @@ from filters.tuned_file import (
 )
 from thruster_env.core.checks import at_least, covariance, positive, short_repr
 from thruster_env.core.files import write_whole
+from thruster_env.core.modules import is_code
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
@@ -179,6 +180,12 @@ def problem_in(content: Mapping, name, path: str | Path, problems: Sequence[Prob
             "verify and report read them again"
         )
     if mapping is None:
+        if problems and isinstance(name, str) and is_code(name):
+            names = ", ".join(problem.name for problem in problems)
+            raise ValueError(
+                f"the problem of a tuned file must be the one it was tuned on, {name}, but got {names}: "
+                f"use --problem {name} for {path}, if you trust it"
+            )
         return find_given(name, (), path)
     return scenario_of(mapping, name, path)
 

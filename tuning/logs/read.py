@@ -141,8 +141,8 @@ def check_model(named, trusted: str | None, file: str | Path) -> None:
             f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(trusted)}"
         )
     if named != trusted:
+        value = trusted if trusted is None or isinstance(trusted, str) else type(trusted)
         raise ValueError(
-            f"the model of logs must be given if it is code, "
-            f"but {file} only names {short_repr(named)}: use --model "
-            f"{named}, if you trust it"
+            f"the model of logs must be given by its name if it is code, but {file} names {short_repr(named)} and "
+            f"got {short_repr(value)}: use --model {named} (model={named!r} in Python), if you trust it"
         )

@@ -13,6 +13,7 @@ import numpy as np
 
 from filters.augmented import Unknown, augmented_model
 from filters.consistency.time_constants import Run
+from filters.consistency.verdicts import estimable
 from filters.tuned_file import AUGMENTED, PRIOR
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.model.state_space import StateSpaceModel
@@ -50,8 +51,14 @@ def beliefs_of(constants: Any, unknown: Unknowns) -> dict[str | int, Unknown]:
         ValueError: for a name that is not a constant, or a constant without a default.
     """
     beliefs: dict[str | int, Unknown] = {}
+    names = getattr(constants, "_fields", ())
     for name, belief in unknown.items():
-        one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
+        if not names:
+            raise ValueError(
+                f"a constant to estimate must be one of the model's, but it has none, and got {short_repr(name)}: "
+                "give the StateSpaceModel a NamedTuple as constants, which transition and observe read"
+            )
+        one_of("a constant to estimate", name, names)
         value = getattr(constants, name)
         prior = default_belief(name, value) if belief is None else Unknown(*belief)
         beliefs[name] = prior if prior.mean is not None else prior._replace(mean=value)
@@ -112,6 +119,12 @@ def suited(problem: Problem, constants: Mapping[str, Sequence[float]]) -> Proble
 def constants_in(problem: Problem) -> dict[str, list[float]]:
     """[std, walk, mean] of each constant that is a state of a problem's model."""
     return dict(problem.held.get(AUGMENTED, {}))
+
+
+def may_estimate_constants(problem: Problem) -> bool:
+    """Whether a problem's model has constants that `--augment` can make states."""
+    plain = within(problem)
+    return plain.parameters is None and bool(estimable(getattr(plain.model().constants, "_fields", ())))
 
 
 def within(problem: Problem) -> Problem:

@@ -437,5 +437,8 @@ def _box(env: gym.Env, name: str) -> gym.spaces.Box:
     """The action space of an env; ValueError unless it is a Box."""
     space = env.action_space
     if not isinstance(space, gym.spaces.Box):
-        raise ValueError(f"the action space of problem {name} must be a Box, but got {space}")
+        raise ValueError(
+            f"an env must have a Box as its action space, but that of problem {name!r} is {space}: wrap it in "
+            "gymnasium.wrappers.TransformAction or a gymnasium.ActionWrapper that maps numbers to its actions"
+        )
     return space

@@ -13,7 +13,7 @@ from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.findings import remarks_on
+from thruster_env.logs.findings import has_outliers, remarks_on
 from thruster_env.logs.log import Log
 from thruster_env.logs.steps import as_rows, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
@@ -31,6 +31,11 @@ AT_GAPS = (
 
 ON_STAMPS = (
     "Logs are on their own stamps: Q of a step is in proportion to its length, and true states are not used."
+)
+
+OUTLIERS = (
+    "Outliers raise R for all samples: --filter ekf-robust gives them less weight; otherwise delete these samples "
+    "from the log (an empty cell is a missing one)."
 )
 
 MEASURED = (
@@ -157,6 +162,8 @@ class LogProblem(AssumedProblem):
     def remarks(self) -> tuple[str, ...]:
         """Findings in the logs, and their rows that are in no block."""
         remarks = remarks_on(self.recorded)
+        if has_outliers(self.recorded):
+            remarks.append(OUTLIERS)
         if self._in_steps:
             remarks.append(ON_STAMPS)
         if any(len(log.pieces) > 1 for log in self.logs):

@@ -21,7 +21,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation
 from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
-from tuning.problems.augmented import within
+from tuning.problems.augmented import may_estimate_constants, within
 from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Problem
 from tuning.search.measures import LEVEL
@@ -391,8 +391,8 @@ def _correlation_doubt(problem: Problem, seed: int) -> list[str]:
         return []
     return [
         f"The residuals of the true states correlate with the next step: {', '.join(strong)}, where 0 is right. "
-        "The model is wrong there or lacks a state, and no Q and R make up for it: correct it, or estimate a "
-        "constant (--augment NAME)."
+        "The model is wrong there or lacks a state, and no Q and R make up for it: correct it"
+        f"{', or estimate a constant (--augment NAME)' if may_estimate_constants(problem) else ''}."
     ]
 
 

@@ -7,6 +7,7 @@ from math import log
 from typing import NamedTuple
 
 from filters.tuned_file import NOISE
+from tuning.problems.augmented import may_estimate_constants
 from tuning.problems.parameter import Argument, Parameter
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, index_pairs
 from tuning.search.plan import Plan
@@ -54,7 +55,7 @@ def at_ends(choice: Choice, plan: Plan) -> list[str]:
         parameter, end = reached.parameter, "lower" if reached.low else "upper"
         ends = f"{parameter.low:.3g} to {parameter.high:.3g} {parameter.unit}".rstrip()
         ended = f"{index_pairs(reached.name)} = {reached.value:.3g} ended at the {end} end of its range, {ends}"
-        sentences.append(f"{ended}: {_advice(reached)}.")
+        sentences.append(f"{ended}: {_advice(reached, plan)}.")
     return sentences
 
 
@@ -121,7 +122,7 @@ def _part(value: float, parameter: Parameter) -> float:
     return (value - parameter.low) / (parameter.high - parameter.low)
 
 
-def _advice(reached: Ended) -> str:
+def _advice(reached: Ended, plan: Plan) -> str:
     """What to do about a parameter at an end of its range."""
     location, low = reached.parameter.place, reached.low
     if isinstance(location, Argument):
@@ -129,7 +130,9 @@ def _advice(reached: Ended) -> str:
     if isinstance(location, ProcessVariance):
         if low:
             return "the data do not require this noise, and it may be zero"
-        cause = "the model lacks something there: repair it, or estimate a constant (--augment NAME)"
+        cause = "the model lacks something there: repair it"
+        if may_estimate_constants(plan.scenarios[0]):
+            cause += ", or estimate a constant (--augment NAME)"
     elif low:
         cause = "the sensor is better than its data sheet, or its readings are smoothed: keep R with --hold-r"
     else:
