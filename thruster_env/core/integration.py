@@ -17,11 +17,17 @@ def runge_kutta(rates: Callable, count: int) -> Callable:
 
     `rates(x, u, c)` takes and returns tuples of `count` components; u is held over the step. The same arguments
     give the same function, so that a model made anew for each candidate needs no compilation.
+
+    Raises:
+        ValueError: from the step, if x has another number of components.
     """
     add = scaled_sum(count)
+    rule = f"count of runge_kutta(rates, count) must be the number of states, but got {count}"
 
     @inlined
     def step(x, u, c):
+        if len(x) != count:
+            raise ValueError(rule)
         h = c.substep
         k1 = rates(x, u, c)
         k2 = rates(add(x, 0.5 * h, k1), u, c)

@@ -43,6 +43,11 @@ def test_the_same_rates_give_the_same_step_so_that_a_model_made_anew_is_not_comp
     assert euler(oscillators, 2) is euler(oscillators, 2)
 
 
+def test_a_state_of_another_size_than_count_is_refused():
+    with pytest.raises(ValueError, match=r"count of runge_kutta.* must be the number of states, but got 2"):
+        runge_kutta(oscillators, 2)((1.0, 0.0, 1.0, 0.0), (0.0,), Step)
+
+
 def test_euler_is_the_first_order_of_runge_kutta():
     assert euler(oscillators, 2)((1.0, 0.5), (0.0,), Step) == (1.05, 0.5 + 0.1 * (-1.0 - 0.25))
 
