@@ -48,11 +48,11 @@ class Path(NamedTuple):
 
     def of_states(self, indices: np.ndarray) -> Path:
         """The path of some states where all others are known."""
-        block = np.ix_(range(len(self.covs)), indices, indices)
+        rows = indices[:, None]
         return self._replace(
-            transitions=self.transitions[block],
+            transitions=self.transitions[:, rows, indices],
             observations=self.observations[..., indices],
-            covs=self.covs[block],
+            covs=self.covs[:, rows, indices],
         )
 
 
@@ -145,7 +145,7 @@ def time_constants(filter_: Filter, runs: Sequence[Run], constants: Sequence[int
     observable, blind = observable_part(path, scales, model.measurement_noise_cov)
     rest = _others(n, constants)
     if len(constants):
-        closed, scales = closed[np.ix_(range(len(closed)), rest, rest)], scales[rest]
+        closed, scales = closed[:, rest[:, None], rest], scales[rest]
         observable, _ = observable_part(path.of_states(rest), scales, model.measurement_noise_cov)
     closed = observable.T @ (closed / scales[:, None] * scales) @ observable
     growth, direction = _growth(closed)

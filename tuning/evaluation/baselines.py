@@ -217,9 +217,9 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0, ensemble_size: i
         exponent += step
         last = excess(exponent)
     if last * first > 0:
-        nis = [f"{right * math.exp(end):.3g}" for end in (first, last)]
+        ends = [f"{right * math.exp(end):.3g}" for end in (first, last)]
         factors = f"no factor on Q from {10.0**-DECADES:g} to {10.0**DECADES:g}"
-        return fails(factors, f"is {nis[0]} with a factor of 1 and {nis[1]} with {10.0**exponent:g}")
+        return fails(factors, f"is {ends[0]} with a factor of 1 and {ends[1]} with {10.0**exponent:g}")
     from scipy.optimize import brentq  # loads half of SciPy, for this line
 
     root = brentq(excess, *sorted((exponent - step, exponent)), xtol=1e-3, rtol=1e-3) if exponent else 0.0
