@@ -1,5 +1,7 @@
 """What a user may give for a problem: names, problems, and pairs of a model and recorded runs in any form."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pandas
@@ -17,6 +19,7 @@ from thruster_env.logs.write import write_log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.api.problems import problem_of, problems_of
+from tuning.problems.augmented import may_estimate_constants
 from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
@@ -225,3 +228,17 @@ def test_envs_of_other_problems(logs):
         recorded.make_env(run=2)
     with pytest.raises(ValueError, match="must come with run alone, but got low"):
         recorded.make_env(low=1.0)
+
+
+def test_outliers_in_logs_name_the_filter_that_bears_them(logs):
+    assert not any("ekf-robust" in sentence for sentence in LogProblem(logs, cart()).remarks)
+    values = logs[0].measurements.copy()
+    values[100] += 9.0
+    wild = dataclasses.replace(logs[0], measurements=values)
+    sentences = LogProblem([wild, logs[1]], cart()).remarks
+    assert "at least 1 outlier in row 100" in sentences[0] and "--filter ekf-robust" in sentences[1]
+
+
+def test_only_constants_with_names_of_a_problem_that_tunes_q_and_r_may_be_estimated(logs):
+    assert may_estimate_constants(find_problem("nominal"))
+    assert not may_estimate_constants(LogProblem(logs, cart()))
