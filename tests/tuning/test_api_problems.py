@@ -236,7 +236,7 @@ def test_outliers_in_logs_name_the_filter_that_bears_them(logs):
     values[100] += 9.0
     wild = dataclasses.replace(logs[0], measurements=values)
     sentences = LogProblem([wild, logs[1]], cart()).remarks
-    assert "at least 1 outlier in row 100" in sentences[0] and "--filter ekf-robust" in sentences[1]
+    assert "1 isolated outlier in row 100" in sentences[0] and "--filter ekf-robust" in sentences[1]
 
 
 def test_only_constants_with_names_of_a_problem_that_tunes_q_and_r_may_be_estimated(logs):

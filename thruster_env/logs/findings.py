@@ -192,8 +192,8 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
     spikes = _spikes(rows, values, quantity.angle)
     if len(spikes):
         first, last = int(rows[spikes[0]]), int(rows[spikes[-1]])
-        spike_count = "1 outlier" if len(spikes) == 1 else f"{len(spikes)} outliers"
-        text = f"{_name(channel)} has at least {spike_count}{_where(log, first, last)} (those side by side do not count)"
+        spike_count = "1 isolated outlier" if len(spikes) == 1 else f"{len(spikes)} isolated outliers"
+        text = f"{_name(channel)} has {spike_count}{_where(log, first, last)}"
         findings.append(Finding(OUTLIER, channel, first, last, len(spikes), text))
     return findings
 

@@ -108,7 +108,7 @@ def test_outliers_are_found_and_jumps_are_not():
     kinds, log = found(table)
     assert kinds.pop("outlier").count == 3 and not kinds and has_outliers([log])
     np.testing.assert_array_equal(outliers(log, "measurement:tach"), [100, 555, 800])
-    assert "tach has at least 3 outliers in rows 100 to 800" in sentences(log.findings)[-1]
+    assert "tach has 3 isolated outliers in rows 100 to 800" in sentences(log.findings)[-1]
     jump = recorded()
     jump["tach"][500:] += 30.0
     assert not found(jump)[0]

@@ -91,7 +91,7 @@ def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json): 
 def test_identify_names_the_gate_and_cuts_at_gaps(folder, thruster, as_json):  # noqa: F811
     options = ("--free", "gain", "--hold-noise", "--starts", 1, "--use-all", *MODEL)
     wild = as_json("identify", "wild.csv", *options)
-    assert "--gate 5" in wild["sentences"][-1] and "has at least 3 outliers" in " ".join(wild["sentences"])
+    assert "--gate 5" in wild["sentences"][-1] and "has 3 isolated outliers" in " ".join(wild["sentences"])
     gated = as_json("identify", "wild.csv", *options, "--gate", 5)
     assert "--gate" not in " ".join(gated["sentences"]) and gated["samples_left_out"] == 3
     cut = as_json("identify", "gap.csv", *options)
