@@ -182,7 +182,9 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
     told = as_json("estimate", "run.csv", *model, "--tuned", "tuned.json", "--smoother")
     assert told["smoothed"] and told["dt"] == 0.05
     done = thruster("verify", "tuned.json")
-    assert done.returncode == 2 and "use --model pendulum_of_a_user:model, if you trust it" in done.stderr
+    assert done.returncode == 2 and done.stderr.rstrip().endswith(
+        "use --model pendulum_of_a_user:model (model='pendulum_of_a_user:model' in Python), if you trust it"
+    )
     assert as_json("verify", "tuned.json", *model)["holds"]
 
 
