@@ -194,9 +194,10 @@ def test_the_factor_grows_of_the_state_whose_q_is_too_small():
 
 
 @pytest.mark.slow
-def test_compiled_code_and_python_are_one():
-    own = {"adaptive_inflation": 0.2, "rotations": 1, "inflation_by_state": 1}
-    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, **own)
+@pytest.mark.parametrize("by_state", (0, 1))
+def test_compiled_code_and_python_are_one(by_state):
+    parameters = {"adaptive_inflation": 0.2, "rotations": 1 - by_state, "inflation_by_state": by_state}
+    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, **parameters)
     inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
     with interpreted():
         expected = run(filter_, None, inputs, z)

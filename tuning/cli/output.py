@@ -17,9 +17,7 @@ from rich.text import Text
 from thruster_env.core.compiled import tell_when_compiling
 from thruster_env.core.files import check_not_read, check_target, write_whole
 from thruster_env.core.progress import listening
-from thruster_env.core.text_tables import BEST as BEST
 from thruster_env.core.text_tables import console
-from thruster_env.core.text_tables import table as table
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES
 from thruster_env.logs.write import check_not_among, check_suffix
