@@ -1,4 +1,8 @@
-"""Tuned files: a filter's parameters with the model that they were tuned for."""
+"""Tuned files: a filter's parameters with the model that they were tuned for.
+
+One reader serves all callers. Its values become arguments of filters, so it accepts known keys only, with
+finite numbers or lists of these.
+"""
 
 from __future__ import annotations
 

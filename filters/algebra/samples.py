@@ -1,5 +1,8 @@
 """Operations on weighted samples, and log densities of innovations.
 
+A particle's x is a vector for each member, its weight or the logarithm of it a number for each member; in NumPy
+these are arrays (n, N) and (N,).
+
     d log N(v; 0, S) = -w' dv + 1/2 tr((w w' - S^-1) dS),  w = S^-1 v
 
 Missing channels have v = 0 and no correlations in S, so they do not contribute.

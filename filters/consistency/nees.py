@@ -1,4 +1,7 @@
-"""Is a filter's covariance consistent? NEES, NIS, the whiteness of innovations, and models that blow up."""
+"""Is a filter's covariance consistent? NEES, NIS, the whiteness of innovations, and models that blow up.
+
+NEES is the normalised estimation error squared, e' P^-1 e; NIS is the normalised innovation squared, v' S^-1 v.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Analyses in parts: each state with the channels near it, or one channel after the other.
 
+The page of such a filter propagates the members and predicts their measurements; its own update moves no member.
+
 The table has a row for each state, then one for each channel with independent noise of variance 1.
 """
 

@@ -1,5 +1,17 @@
 """The square-root and the UD form of the extended Kalman filter, which keep twice the digits of P.
 
+An orthogonal Theta from the right makes a matrix lower triangular:
+
+    predict: [F L, Q^(1/2)] Theta = [L, 0]
+    update:  [[R^(1/2), H L], [0, L]] Theta = [[S^(1/2), 0], [K S^(1/2), L]],
+             x += (K S^(1/2)) S^(-1/2) v
+
+No covariance is ever formed from another: P = L L' is for the reader only. L keeps twice the digits that P would,
+of states known a million times better than others.
+
+Source: Kaminski, Bryson, Schmidt (1971), "Discrete square root filtering: a survey of current techniques", IEEE
+Trans. Automatic Control 16(6).
+
 The UD form is
 
     predict: U D U' = [F U, Q^(1/2)] diag(D, I) [F U, Q^(1/2)]',  by Gram and Schmidt's method with these weights

@@ -1,4 +1,10 @@
-"""Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter."""
+"""Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter.
+
+The moments of a mixture, and its weights:
+
+    mean = sum of w_k x_k,  P = sum of w_k (P_k + (x_k - mean)(x_k - mean)')
+    after a measurement:  w_k becomes w_k N(v_k; 0, S_k)/L,  L = sum of w_k N(v_k; 0, S_k)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,20 @@
-"""Particle filters in compiled code: stages of a page, and systematic resampling."""
+"""Particle filters in compiled code: stages of a page, and systematic resampling.
+
+    x, extras = initial(model, w),  w ~ N(0, I)
+    if the ESS is below its threshold: particles are resampled,
+    x, extras = rejuvenate(model, x, mean, P, e)
+    x, extras = add_process_noise(model, propagate(model, x, u), w),  propagate once for each substep
+    x, log_w, v, S, extras = update(model, x, log_w, z, e),  log_w the logarithms of the weights,  e ~ N(0, I)
+
+`extras` is a dictionary of all that a particle carries besides x and log_w, left out if there is nothing; its
+`P` is the covariance of a particle. The sum of e^log_w after an update is the likelihood, by which weights are
+then divided.
+A page with a `lookahead` has particles resampled in the update, by the weights log_w + level:
+
+    mu, level, v, S = lookahead(model, x, log_w, z),  mu is rejuvenated with its own mean and P,
+    x, log_w, extras = update(model, mu, log_w, z, e),  log_w the logarithm of the sum of those weights, less that
+                                                        of N and less the level
+"""
 
 from __future__ import annotations
 

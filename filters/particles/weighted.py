@@ -1,5 +1,7 @@
 """Weighted samples as a belief: moments, effective size, and the regularised kernel of resampled particles.
 
+`filters.particles.kernels` defines the page of a particle filter.
+
 Sources: Musso, Oudjane, Le Gland (2001), "Improving regularised particle filters"; Kotecha, Djuric (2003),
 "Gaussian particle filtering"; Liu, West (2001), "Combined parameter and state estimation in simulation-based
 filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d))^2 of `smooth`.

@@ -1,4 +1,13 @@
-"""Sigma-point smoothers, and which smoother belongs to which filter."""
+"""Sigma-point smoothers, and which smoother belongs to which filter.
+
+    points X = x 1' + g L U,  L L' = P;  predicted x and P as the filter predicts,
+    G = cov(x, f(X)) (predicted P)^-1,  bracket = cov(X - G f(X)) + G Q G'
+
+The bracket equals P - G (predicted P) G' and is a sum of squares.
+
+Source: Sarkka (2008), "Unscented Rauch-Tung-Striebel smoother", algorithm 1, with additive noise; for cubature
+points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,13 @@
 """The vehicle's equations of motion: kinematics, dynamics and operating points.
 
+Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, on which weight and buoyancy
+depend, they are the smallest closed system; yaw and position, to the north, to the east and down, complete the
+state.
+
+    nu' = M^-1 F(nu, phi, theta, u)
+    (phi, theta, psi)' = T(phi, theta) (p, q, r)
+    (x, y, z)' = R(phi, theta, psi) (u, v, w)
+
 Roll phi, pitch theta, yaw psi [rad]; the earth's axes are north, east, down, the body's ahead, starboard, down. An
 attitude is (cos phi, sin phi, cos theta, sin theta). Euler angles end at theta = +-90 deg, where the rates of phi
 and psi are infinite. Source: Fossen (2011), "Handbook of Marine Craft Hydrodynamics and Motion Control", 2.2.

@@ -1,5 +1,10 @@
 """Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
 
+The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads,
+because a draw depends on its index only and never on what was drawn before. Every expression works on
+scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random
+numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
+
 Source: Johnson, Kotz, Balakrishnan (1994), Continuous Univariate Distributions, volume 1, section 13.10.1.
 """
 

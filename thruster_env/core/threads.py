@@ -1,5 +1,9 @@
 """Threads: calls in parts on all cores, worker threads and their flags, and how they wait.
 
+A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for
+the next call spinning, during half a millisecond, in compiled code that holds no lock, before they go to sleep;
+unless the wait policy is "passive" (`wait_policy`).
+
 The words are those of OpenMP's OMP_WAIT_POLICY. The environment variable THRUSTER_WAIT_POLICY sets the policy of
 a process and of all that it starts, `waiting` that of a part of a program.
 
