@@ -133,7 +133,7 @@ def drawn(made, width, terminal=False, **environment):
 @pytest.mark.parametrize("framed", [False, True])
 def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
     monkeypatch.setattr(output.console, "width", width)
-    made = output.table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
+    made = table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
     said = drawn(fitted(made, ROWS) if framed else made, width)
     assert max(map(len, said.splitlines())) <= width and "…" not in said
     lines = said.splitlines()
@@ -144,7 +144,7 @@ def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
 
 
 def test_a_winner_stands_out_on_terminals_only():
-    made = output.table("", HEADS, ROWS, best=[1])
+    made = table("", HEADS, ROWS, best=[1])
     assert drawn(made, 80, terminal=True).count("\x1b[1;32m") > 3
     assert "\x1b" not in drawn(made, 80)
     assert "\x1b[1;32m" not in drawn(made, 80, terminal=True, NO_COLOR="1")
