@@ -18,7 +18,7 @@ from thruster_env.core.text_tables import table
 from thruster_env.core.threads import cores
 from tuning.cli.options import JsonOption, SeedOption
 from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
-from tuning.policies.extras import check_installed
+from tuning.policies.algorithms import check_installed
 
 CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "

@@ -21,7 +21,7 @@ from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import Choice, oracle_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 EVALUATE_GOAL, RUN_GOAL = 2.1, 1.8  # of the floor's time

@@ -17,7 +17,7 @@ env.step(env.action_space.high)
 """
 TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice
 """

@@ -22,8 +22,7 @@ from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
@@ -37,7 +36,7 @@ FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study c
 WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 from tuning.search.study import open_study, quiet_optuna, run_study
 quiet_optuna()
 plan = Plan("enkf", (find_scenario("nominal"),), {seed})

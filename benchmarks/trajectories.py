@@ -19,7 +19,7 @@ from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 TRAJECTORIES, ENSEMBLE_SIZE = 256, 100
 AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart

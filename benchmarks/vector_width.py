@@ -22,10 +22,10 @@ from benchmarks.trajectories import estimates
 from benchmarks.vectors import vector_steps
 from benchmarks.vehicles import member_steps
 from thruster_env.core import optimising
-from tuning.auv.scenarios import find_scenario as find_vehicles
+from tuning.auv.scenario import find_scenario as find_vehicles
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import oracle_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 TARGET = "emeraldrapids"
 ROUNDS, REPEATS = 3, 15  # processes of each width, and measurements in each of which the best counts

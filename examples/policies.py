@@ -21,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 import thruster_env
-from tuning.policies.vec_env import NativeVecEnv
+from tuning.policies.environments import NativeVecEnv
 
 COPIES = 64
 TRAINING_STEPS = 60_000

@@ -15,8 +15,7 @@ from filters.consistency.intervals import Interval
 from pages import ranking_tables
 from pages.page import DOCS, digits
 from thruster_env.core.text_tables import markdown_table
-from tuning.auv.scenario import Scenario
-from tuning.auv.scenarios import find_scenario
+from tuning.auv.scenario import Scenario, find_scenario
 from tuning.evaluation.compare import Contender, Row, compare, contender
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds

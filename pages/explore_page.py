@@ -14,8 +14,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from tuning.exploring.bench import Bench
-from tuning.exploring.page.document import page_of
-from tuning.exploring.page.server import Server
+from tuning.exploring.page.server import Server, page_of
 from tuning.problems.find import find_problem
 
 WIDE = {"width": 1360, "height": 900}

@@ -29,8 +29,7 @@ from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 50
 TRAINED_ON = ("mismatch", "outliers")
@@ -80,7 +79,7 @@ def network_elsewhere() -> str:
 
 def network_further() -> str:
     """Scores over the tuned EKF's on held-out runs, on runs twice as long, and with four times the R."""
-    from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings
+    from tuning.learning.training import HELD_OUT, LONGER, NOISIER, standings
 
     rows = []
     for name in TRAINED_ON:

@@ -19,7 +19,7 @@ from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.compare import contender
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 STEPS, SETTLED = 100, 20  # of a batch, of which errors count from a step on
 POSITIVE = {0: (0.0, None), 1: (0.0, None)}

@@ -22,7 +22,7 @@ from tuning.evaluation.compare import contender
 from tuning.experiments import mixed_linear
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SEEDS = 200
 Numbers = dict[str, object]

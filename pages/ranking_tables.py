@@ -27,7 +27,7 @@ from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.error_tables import unless_blank
 from tuning.search.parameters import KALMAN_SIZES, ensemble_sizes_of
-from tuning.thruster.scenarios import SCENARIOS, find_scenario
+from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 SEEDS = 200
 REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000

@@ -29,7 +29,7 @@ from tuning.cli.demo import FILTER, SCENARIO, before_and_after
 from tuning.cli.tune import tune
 from tuning.reporting.time_figures import axis_label
 from tuning.search.plan import Plan
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SEED = 5
 FIRST, LAST, EVERY = 400, 1000, 8  # steps of the episode of 10 ms each: twelve pictures and a half a second

@@ -28,8 +28,7 @@ from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND, SCORE
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 SEED, TRIALS = 0, 100
 COLUMNS = [

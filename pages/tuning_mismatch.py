@@ -28,8 +28,7 @@ from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice, distributions, suggest, trial_parameters
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 SCENARIO, SEED, TRIALS = "mismatch", 0, 100
 LIFT = "lift_factor"  # on the lift coefficient, which enters several constants of the model

@@ -20,7 +20,7 @@ from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.search.objectives import LOG_SCORE, nees_ratio, nis_ratio
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SCENARIOS = "nominal", "published_tunnel", "outliers", "mismatch", "startup"
 SEEDS, TRIALS, FILTER = range(5), 40, "ekf"

@@ -24,7 +24,7 @@ from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import choice_of
 from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.search.trials import measure
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 CASES = ("startup", "ekf"), ("startup", "enkf"), ("outliers", "ekf"), ("outliers", "enkf"), ("mismatch", "ekf")
 SEEDS, TRIALS = range(10), 60

@@ -23,8 +23,7 @@ from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, oracle_choice, parameters_of
 from tuning.search.study import open_study, quiet_optuna, run_study
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
 SEEDS = range(8)  # of studies

@@ -30,7 +30,7 @@ from tuning.search.storage import open_storage
 from tuning.search.study import open_study, quiet_optuna, run_trials
 from tuning.search.trials import CONSISTENCY, NIS, measure
 from tuning.search.workers import take_share
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 STORAGES = ("journal", "PostgreSQL")
 SETTLE, WINDOW = 1.0, 3.0  # [s] after which a run is counted, and for how long

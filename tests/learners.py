@@ -9,7 +9,7 @@ from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
 from tuning.policies.saved import load, read_configuration
 from tuning.policies.setup import make_configuration
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 COPIES, LIMIT = 4, 30
 SMALL = {

@@ -11,8 +11,7 @@ from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import Scenario, find_scenario
 
 
 def write_untuned(

@@ -9,7 +9,7 @@ from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 UNSCENTED = "filters.estimators.libraries:unscented"
 

@@ -22,7 +22,7 @@ from tuning.evaluation.tuned import check_keepable
 from tuning.problems.parameter import Parameter
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, distributions
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 4)
 HERE = "tests.filters.test_estimators"

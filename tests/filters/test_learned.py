@@ -21,7 +21,7 @@ from filters.wrappers.vector import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.model.affine import affine_model
 from tuning.search.space import Choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6

@@ -21,12 +21,12 @@ from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, values_of
-from tuning.auv.scenarios import find_scenario as find_vehicle
+from tuning.auv.scenario import find_scenario as find_vehicle
 from tuning.cli.templates.filter import Template
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NAMES = ("ekf-robust", "sage-husa", "vb")
 WRITTEN = ("iterations",)  # parameters that programs are written out for

@@ -9,7 +9,7 @@ from filters.consistency.nees import normalized_squares
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.data import FIRST_SCORED_STEP
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 RUNS = 200
 

@@ -5,7 +5,7 @@ import pytest
 
 from filters.bounds import path_bound, riccati_covariances
 from filters.posterior import posterior_bound
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

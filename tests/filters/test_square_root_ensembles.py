@@ -20,7 +20,7 @@ from thruster_env.core.sources import is_array
 from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SIZE = 9
 SQUARE_ROOTS = EnsembleTransformFilter, SerialSquareRootFilter

@@ -17,7 +17,7 @@ from tuning.search.parameters import PRIOR_FACTORS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 STARTUP, NOMINAL = find_scenario("startup"), find_scenario("nominal")
 PLAN = Plan("ekf", (STARTUP,))

@@ -8,7 +8,7 @@ from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.evaluate import check_consistency
 from tuning.search.space import oracle_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 def _said(problem, choice, data):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tuning.policies.setup import TrainingConfiguration, configuration_from_json, make_configuration
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 KILLS = 20
 COPIES, STEPS = 4, 8192

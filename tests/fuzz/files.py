@@ -27,7 +27,7 @@ from tuning.policies.setup import configuration_from_json, make_configuration
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 TRAP = "tests_fuzz_trap"  # a module that nothing may import, with a function that nothing may call
 VALUES = (

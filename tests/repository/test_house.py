@@ -106,7 +106,7 @@ def test_filters_know_no_plant_and_tuning_knows_them_by_the_finder_alone():
     assert knowing and all(name.startswith(KNOW_PLANTS) for name in knowing)
     of_plants = {"tuning.thruster", "tuning.auv"}
     assert not those(lambda path: not name_of(path).startswith(KNOW_PLANTS) and imports_of(path) & of_plants)
-    assert set(PLANT_PACKAGES.values()) == {f"{package}.scenarios" for package in of_plants}
+    assert set(PLANT_PACKAGES.values()) == {f"{package}.scenario" for package in of_plants}
 
 
 def test_imports_of_training_go_in_no_circle_not_even_within_functions():
@@ -115,7 +115,7 @@ def test_imports_of_training_go_in_no_circle_not_even_within_functions():
     for name, text in code.items():  # what only a type checker sees is left out
         code[name] = re.sub(r"^if TYPE_CHECKING:\n(?:    .*\n|\n)+", "", text, flags=re.MULTILINE)
     graph = {name: imports_of(files[name], text) & code.keys() - {name} for name, text in code.items()}
-    assert sum(map(len, graph.values())) > 50
+    assert sum(map(len, graph.values())) > 20
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 

@@ -14,7 +14,7 @@ from thruster_env.core.text_tables import with_tables
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import SCENARIOS, find_scenario
+from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 
 def ranked(name, contenders, seeds=24):

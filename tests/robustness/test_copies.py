@@ -19,7 +19,7 @@ from tests.thruster_env.thruster.test_robustness import AMPLIFIER, FLOW, REFEREN
 from tuning.evaluation.evaluate import evaluate
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.thruster.scenario import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

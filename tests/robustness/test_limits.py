@@ -17,7 +17,7 @@ from tuning.experiments.thruster_papers import compare
 from tuning.policies.setup import configuration_from_json
 from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.thruster.scenario import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 HUGE = 10**12

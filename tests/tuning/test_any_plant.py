@@ -33,7 +33,7 @@ from tuning.reporting.time_figures import estimates_figure, plotted_states
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 SEEDS = range(8)
 

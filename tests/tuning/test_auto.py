@@ -49,7 +49,7 @@ from tuning.search.space import (
 )
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import best_trial, is_over_budget, violation
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)

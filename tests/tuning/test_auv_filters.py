@@ -7,7 +7,7 @@ import pytest
 
 from filters.consistency.intervals import Interval
 from pages.auv_filters import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, main, restless, rows_of, small
-from tuning.auv.scenarios import find_scenario
+from tuning.auv.scenario import find_scenario
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
 BAND = (0.8, 1.25)  # of the mean NIS over what is right, as a study holds it

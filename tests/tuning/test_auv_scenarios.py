@@ -11,8 +11,7 @@ from tests.slow import slow_but
 from tests.tuned_files import write_untuned
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.core.streams import episode_keys
-from tuning.auv.scenario import computed_scale
-from tuning.auv.scenarios import SAILING, SCENARIOS, find_scenario
+from tuning.auv.scenario import SAILING, SCENARIOS, computed_scale, find_scenario
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.check import checked_problem

@@ -23,7 +23,7 @@ from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 EVALUATION = Evaluation(*[None] * len(Evaluation._fields))
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)

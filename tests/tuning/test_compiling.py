@@ -13,7 +13,7 @@ from tuning.search import compiling
 from tuning.search.compiling import compile_filters
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.workers import end, orders_of, plan_of, start
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NAMES = ("ekf", "kf", "ukf", "ckf", "enkf")
 TUNNEL = find_scenario("published_tunnel")

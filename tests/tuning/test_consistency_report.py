@@ -26,7 +26,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.consistency_figures import consistency_figure
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 def scalar(**changes):

@@ -15,7 +15,7 @@ from tuning.evaluation.summary import summary
 from tuning.problems import data as in_parts
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.control.controllers import PIController
 from thruster_env.thruster.plant import make_plant
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
-from tuning.thruster.scenario import ClosedLoop, voltages_of
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import ClosedLoop, find_scenario, voltages_of
 
 PLANT = make_plant()
 KEYS = episode_keys(range(40))

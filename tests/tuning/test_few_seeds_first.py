@@ -8,7 +8,7 @@ from tuning.evaluation.sizes import FEW, SIZE_TOLERANCE, ensemble_sizes, suffici
 from tuning.search import plan as plans
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

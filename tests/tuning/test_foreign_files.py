@@ -14,7 +14,7 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned, verify
 from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.reporting.report import write_report
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 TRAP = f"{__name__}:trap"
 SPRUNG = []

@@ -16,7 +16,7 @@ from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import finished_trials, open_study, run_trials
 from tuning.search.workers import orders_of
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

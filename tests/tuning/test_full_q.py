@@ -19,7 +19,7 @@ from tuning.search.plan import Plan
 from tuning.search.relations import correlation_slopes, correlations_of, full_covariance
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("ekf", (MISMATCH,), full_q=True)

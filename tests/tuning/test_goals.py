@@ -14,7 +14,7 @@ from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NAMES = "startup", "nominal", "published_noise", "mismatch"
 STARTUP, NOMINAL, NOISY, MISMATCH = map(find_scenario, NAMES)

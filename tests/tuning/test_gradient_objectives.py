@@ -13,7 +13,7 @@ from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

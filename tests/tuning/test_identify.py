@@ -16,10 +16,9 @@ from thruster_env.logs.log import Log
 from thruster_env.model import simulate
 from tuning.identification import identify, profile_figure, profiles, validate
 from tuning.identification.family import ModelFamily, with_ranges
-from tuning.identification.result import covariance
+from tuning.identification.profiles import fall_sentence
+from tuning.identification.result import covariance, read_values, with_values, write_values
 from tuning.identification.starts import runs_of
-from tuning.identification.validation import fall_sentence
-from tuning.identification.values import read_values, with_values, write_values
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 

@@ -21,7 +21,7 @@ from thruster_env.logs.steps import in_any_steps, in_steps
 from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
-from tuning.identification.validation import validate
+from tuning.identification.profiles import validate
 from tuning.logs.identify import family_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.parameter import Coordinates

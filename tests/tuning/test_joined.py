@@ -5,7 +5,7 @@ import pytest
 
 from tuning.search.plan import Plan
 from tuning.search.study import open_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

@@ -11,8 +11,8 @@ from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from thruster_env.thruster.logged import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify
-from tuning.identification.gates import kept_variance, lost_information
-from tuning.identification.null_tests import NullTest
+from tuning.identification.objective import kept_variance, lost_information
+from tuning.identification.result import NullTest
 from tuning.problems.parameter import Parameter
 from tuning.thruster.identification import ThrusterFamily
 

@@ -17,7 +17,7 @@ from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import BEST, open_study, run_study
 from tuning.search.trials import CONSISTENCY, best_trial, is_consistent
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
 

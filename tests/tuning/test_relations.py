@@ -16,7 +16,7 @@ from tuning.search.space import parameters_of
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
 from tuning.search.workers import run_in_workers
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 from tuning.ways.registry import find_way
 
 TIED = ("Q22 = 4 Q11", "R22 = 0.1", "Q11 = 1e-3..10")

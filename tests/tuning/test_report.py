@@ -22,7 +22,7 @@ from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 VOID = {"meta", "img", "br", "link", "input", "hr"}

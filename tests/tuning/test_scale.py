@@ -13,8 +13,7 @@ from tuning.evaluation.tuned import verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import computed_scale, is_stable
-from tuning.thruster.scenarios import SCENARIOS, find_scenario
+from tuning.thruster.scenario import SCENARIOS, computed_scale, find_scenario, is_stable
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import oracle_choice, untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 

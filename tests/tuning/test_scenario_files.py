@@ -8,8 +8,7 @@ from tuning.problems.excitation import BinarySequence, Steps
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenario import computed_scale
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import computed_scale, find_scenario
 
 
 @pytest.fixture

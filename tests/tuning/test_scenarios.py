@@ -11,8 +11,7 @@ from filters.bounds import riccati_covariances
 from thruster_env.thruster.model import model_of_plant
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import computed_scale
-from tuning.thruster.scenarios import SCENARIOS, find_scenario, main
+from tuning.thruster.scenario import SCENARIOS, computed_scale, find_scenario, main
 
 
 def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_estimates():
@@ -116,7 +115,7 @@ def test_the_scale_of_the_published_tunnel_is_the_optimum_of_the_papers_runs():
 
 def test_anyone_can_compute_a_scale_anew(capsys, monkeypatch):
     few = partial(computed_scale, sequences=2, truths=2)  # a linear bound depends on neither
-    monkeypatch.setattr("tuning.thruster.scenarios.computed_scale", few)
+    monkeypatch.setattr("tuning.thruster.scenario.computed_scale", few)
     main(["published_tunnel"])
     assert capsys.readouterr().out == "published_tunnel: (0.8066, 0.1457), stored (0.8066, 0.1457)\n"
 

@@ -10,7 +10,7 @@ from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficien
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

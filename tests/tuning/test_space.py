@@ -7,7 +7,7 @@ from tuning.search.parameters import size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, distributions, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

@@ -18,7 +18,7 @@ from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage, retry_once
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

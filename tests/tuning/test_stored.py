@@ -19,7 +19,7 @@ from tuning.reporting.report import write_report
 from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

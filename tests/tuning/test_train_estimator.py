@@ -16,12 +16,22 @@ from tests.models import plane_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.settings import Settings
-from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, standings, twice_as_long, with_larger_noise
-from tuning.learning.starting import new_estimator, scales_of, starting_filter
-from tuning.learning.training import Loss, train
+from tuning.learning.training import (
+    HELD_OUT,
+    LONGER,
+    NOISIER,
+    Loss,
+    new_estimator,
+    scales_of,
+    standings,
+    starting_filter,
+    train,
+    twice_as_long,
+    with_larger_noise,
+)
 from tuning.problems.check import data_of
 from tuning.problems.model_problem import ModelProblem
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MODEL = plane_model()
 

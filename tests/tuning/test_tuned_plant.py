@@ -23,13 +23,12 @@ from thruster_env.thruster.plant import differences, make_plant, plant_data
 from thruster_env.thruster.preset_file import PresetFile, write_preset
 from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned, verify
-from tuning.logs.problem import log_problem, problems_in
-from tuning.logs.read import as_tuned
+from tuning.logs.read import as_tuned, log_problem, problems_in
 from tuning.policies.setup import make_configuration
 from tuning.problems.files import scenario_of
 from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan
-from tuning.thruster.scenarios import SCENARIOS, find_scenario
+from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 TOML = 'base = "nominal"\nscale = [1.0, 0.05]\nsteps = 60\nflow = [{name = "gusts", std = 0.5}]\n'
 

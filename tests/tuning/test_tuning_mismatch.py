@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pages.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

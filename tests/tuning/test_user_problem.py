@@ -31,7 +31,7 @@ from tuning.search.gradient_noise import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 NAME = "my_pendulum:of_one_number"
 

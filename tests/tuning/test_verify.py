@@ -12,7 +12,7 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import Difference, verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 

@@ -24,7 +24,7 @@ from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
 from tuning.search.study import finished_trials, open_study
 from tuning.search.workers import run_in_workers
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
 WORKERS = 3

@@ -17,8 +17,7 @@ from thruster_env.core.plots import panels
 from thruster_env.core.text_tables import plain_text, table, verbatim
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import ORACLE
-from tuning.learning.standings import HELD_OUT, LONGER, NOISIER, Standing
-from tuning.learning.training import Check
+from tuning.learning.training import HELD_OUT, LONGER, NOISIER, Check, Standing
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Table as PageTable
 from tuning.reporting.training_report import write_training_report

@@ -93,8 +93,7 @@ class Explorer:
 
     def _made(self, port: int, *, ends_when_left: bool) -> Server:
         try:
-            from tuning.exploring.page.document import page_of
-            from tuning.exploring.page.server import Server
+            from tuning.exploring.page.server import Server, page_of
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(NEEDS, name=error.name) from error
         return Server(page_of(self.bench, self.seeds), port=port, ends_when_left=ends_when_left)

@@ -20,12 +20,11 @@ from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS
 from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
-from tuning.identification.profiles import profile_figure, profiles
+from tuning.identification.profiles import Validation, fall_sentence, profile_figure, profiles, validate
 from tuning.identification.result import Identification
 from tuning.identification.screening import check_excitation
-from tuning.identification.validation import Validation, fall_sentence, validate
 from tuning.logs.identify import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
-from tuning.logs.model_of_logs import model_of_logs
+from tuning.logs.read import model_of_logs
 from tuning.problems.parameter import Coordinates, Parameter
 
 # `Identified`: parameters identified from recorded runs, as a value.

@@ -24,8 +24,7 @@ from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.worth import all_warnings
 from tuning.likelihood.family import check_gradient
-from tuning.likelihood.goal import OF_STATES
-from tuning.likelihood.gradient import GradientResult, tune_by_gradient
+from tuning.likelihood.gradient import OF_STATES, GradientResult, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.augmented import within

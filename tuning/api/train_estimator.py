@@ -93,8 +93,7 @@ def train_estimator(
     check_installed()
     from filters.learned.file import LEARNED  # torch takes seconds to import
     from tuning.api.estimator_training import EstimatorTraining
-    from tuning.learning.standings import standings
-    from tuning.learning.starting import new_estimator, starting_filter
+    from tuning.learning.training import new_estimator, standings, starting_filter
 
     one_of("an estimator", kind, tuple(LEARNED))
     chosen = problem_of(problem, preset)

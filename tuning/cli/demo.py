@@ -29,7 +29,7 @@ from tuning.reporting.search_figures import comparison_figure, history_figure
 from tuning.reporting.time_figures import estimates_figure
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import AUTO
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs/tuning.md
 BUDGET = 1.0  # us/step of the filters among which the second study chooses

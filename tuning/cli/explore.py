@@ -85,8 +85,7 @@ def command(
     """
     bench = _bench(file, filter_name, scenario, logs, reading, seed)
     try:
-        from tuning.exploring.page.document import page_of
-        from tuning.exploring.page.server import Server
+        from tuning.exploring.page.server import Server, page_of
     except ModuleNotFoundError as error:
         raise ValueError(NEEDS.replace("tuning.explore", "thruster explore")) from error
     announce_compilation()

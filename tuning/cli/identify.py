@@ -39,9 +39,8 @@ from tuning.cli.output import announce_compilation, check_picture, check_targets
 from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.identification.identify import STARTS
 from tuning.identification.identify import identify as identify_logs
-from tuning.identification.profiles import Profile, profile_figure, profiles
+from tuning.identification.profiles import Profile, Validation, fall_sentence, profile_figure, profiles
 from tuning.identification.result import Identification
-from tuning.identification.validation import Validation, fall_sentence
 from tuning.logs.identify import family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs, read_named
 from tuning.problems.parameter import Parameter

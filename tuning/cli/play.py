@@ -196,12 +196,11 @@ def _of_policy(
     size: tuple[int, int] | None,
     json: str | None,
 ) -> tuple:
-    from tuning.policies.extras import check_installed
+    from tuning.policies.algorithms import check_installed
 
     check_installed()
     with progress_console.status("loading torch ..."):
-        from tuning.policies.saved import find_saved, read_configuration
-        from tuning.policies.score import play
+        from tuning.policies.saved import find_saved, play, read_configuration
     folder = find_saved(model)
     seed = held_out_seeds(read_configuration(folder).seed, 2)[0] if seed is None else seed
     video = None if window else out or model / f"episode-seed{seed}.mp4"

@@ -17,9 +17,8 @@ from thruster_env.core.text_tables import table
 from tuning.cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
 from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.cli.train import LEARNABLE
-from tuning.policies.extras import check_installed
-from tuning.policies.observations import find_observation_set
-from tuning.policies.plants.find import plant_of
+from tuning.policies.algorithms import check_installed
+from tuning.policies.plants import find_observation_set, plant_of
 from tuning.policies.setup import TrainingConfiguration, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
@@ -28,7 +27,7 @@ from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
-    from tuning.policies.score import Scores
+    from tuning.policies.saved import Scores
 
 SEEN = "seen"  # heads the column of what the policy is shown
 
@@ -124,8 +123,7 @@ def _learnt(
     model: Path, folder: Path, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
 ) -> Scored:
     from tuning.policies.environments import make_environments
-    from tuning.policies.saved import load
-    from tuning.policies.score import score
+    from tuning.policies.saved import load, score
 
     met = setup if plant is None else in_scenario(setup, plant)
     policy = load(folder, make_environments(met, seeds[:1]))
@@ -136,8 +134,7 @@ def _learnt(
 def _classical(
     name: str, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
 ) -> Scored:
-    from tuning.policies.classical import classical_policy
-    from tuning.policies.score import score
+    from tuning.policies.saved import classical_policy, score
 
     setup = replace(setup, controller=None)  # there is no policy to correct it
     met = setup if plant is None else in_scenario(setup, plant)

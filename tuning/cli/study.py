@@ -92,13 +92,19 @@ def policies(
 
     Example: thruster study policies --quick
     """
-    from tuning.policies.extras import check_installed
+    from tuning.policies.algorithms import check_installed
 
     check_installed()
-    from tuning.policies.comparison.plan import QUICK, Comparison
-    from tuning.policies.comparison.report import PAGE, check_page, write_report
-    from tuning.policies.comparison.runs import run_comparison
-    from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
+    from tuning.policies.comparison import QUICK, Comparison, run_comparison
+    from tuning.policies.comparison_report import (
+        HEADER,
+        PAGE,
+        answers,
+        check_page,
+        rows_of,
+        summary_rows,
+        write_report,
+    )
 
     comparison = QUICK if quick else Comparison()
     changes: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}

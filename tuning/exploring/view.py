@@ -1,11 +1,14 @@
 """What one sees of a filter: estimates with their bands, innovations, consistency over time, and figures.
 
 NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+
+The data that a bench shows: runs of a plant, or recorded logs as a whole with the blocks they are cut into.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +16,61 @@ import numpy as np
 from filters.consistency.nees import LAGS, band_of_means, whiteness
 from filters.engine.batch import Estimates
 from filters.filter import Filter
+from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
-from tuning.exploring.page_data import PageData
-from tuning.problems.data import Data, estimates_on
+from tuning.problems.check import data_of
+from tuning.problems.data import Data, estimates_on, mask_of, only, padded
+from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem, score_label
+
+
+class PageData(NamedTuple):
+    """What is drawn, and what is counted: the same runs, unless they are logs."""
+
+    drawn: Data  # of a plant the runs of some seeds; of logs each log as a whole
+    counted: Data  # of a plant the same; of logs the training blocks
+    held_out: Data | None  # of logs the held-out blocks; None of a plant
+
+
+@lru_cache(maxsize=8)
+def page_data(problem: Problem, seeds: int, seed: int, held_out: bool) -> PageData:
+    """The data of a problem for a bench.
+
+    Args:
+        problem: what makes the data.
+        seeds: number of seeds; logs are shown whole.
+        seed: of the study whose training seeds, or held-out seeds, these are.
+        held_out: whether they are those on which a study's choice is evaluated, as `thruster evaluate` does it.
+    """
+    if isinstance(problem, LogProblem):
+        blocks = [
+            data_of(problem, choose(seed, seeds)) for choose in (problem.training_seeds, problem.held_out_seeds)
+        ]
+        return PageData(_whole(problem), *blocks)
+    choose = problem.held_out_seeds if held_out else problem.training_seeds
+    data = data_of(problem, choose(seed, seeds))
+    return PageData(data, data, None)
+
+
+def _whole(problem: LogProblem) -> Data:
+    """Each log from its first row to its last, with the random numbers of `thruster estimate`."""
+    logs, model = problem.logs, problem.model()
+    rows = max(len(log.measurements) for log in logs)
+    data = Data(
+        tuple(range(len(logs))),
+        padded([log.inputs[: len(log.measurements) - 1] for log in logs], rows - 1, None),
+        padded([log.measurements for log in logs], rows),
+        np.repeat(filter_keys([0]), len(logs), axis=0),
+        problem.first_scored_step,
+        counted=mask_of([len(log.measurements) for log in logs], rows),
+    )
+    if problem.scale is None:
+        return data.read_only()
+    states = padded([truth for log in logs if (truth := log.true_states(model)) is not None], rows)
+    known = only(data.counted, ~np.isnan(states).any(axis=-1))
+    return data._replace(states=states, counted=known).read_only()
+
 
 LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
 
@@ -64,8 +117,8 @@ def view_of(filter_: Filter, page_data: PageData, problem: Problem) -> View:
         deviation=_there(data, _deviations(estimates.covs)[..., :n]),
         innovation=np.where(measured, estimates.innovations, np.nan),
         innovation_deviation=np.where(measured, _deviations(estimates.innovation_covs), np.nan),
-        nees=_whole(runs.nees, data) if truth and runs.nees is not None else None,
-        nis=_whole(runs.nis, data),
+        nees=_padded_scores(runs.nees, data) if truth and runs.nees is not None else None,
+        nis=_padded_scores(runs.nis, data),
         nees_band=_band(np.where(data.scored, float(n), 0.0)) if truth else None,
         nis_band=_band(np.where(data.scored, measured.sum(axis=-1), 0).astype(np.float64)),
         autocorrelation=white[0],
@@ -121,7 +174,7 @@ def _of_innovations(evaluation: Evaluation) -> dict[str, Figure]:
     return {"NIS": nis, "log-likelihood": Figure(evaluation.log_likelihood, "nat", HIGHER), **restarts}
 
 
-def _whole(late: np.ndarray, data: Data) -> np.ndarray:
+def _padded_scores(late: np.ndarray, data: Data) -> np.ndarray:
     """Values (S, T) of late steps as those of all steps, NaN before."""
     values = np.full(data.measurements.shape[:2], np.nan)
     values[:, data.late] = late

@@ -14,10 +14,16 @@ from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.streams import START_POINTS, derived_generator
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.ascent import Ascent, climb
-from tuning.identification.null_tests import NullTest, from_nothing, null_tests
-from tuning.identification.objective import Objective
-from tuning.identification.result import Identification, Optimum, covariances_of, identification_of
+from tuning.identification.objective import Ascent, Objective, climb
+from tuning.identification.result import (
+    Identification,
+    NullTest,
+    Optimum,
+    covariances_of,
+    from_nothing,
+    identification_of,
+    null_tests,
+)
 from tuning.identification.screening import ROUNDS, outliers_of, without_outliers
 from tuning.identification.starts import starts_of
 from tuning.problems.data import Data

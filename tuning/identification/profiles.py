@@ -1,18 +1,31 @@
-"""Profile likelihoods: how far the log-likelihood falls where one parameter is held elsewhere."""
+"""Profile likelihoods: how far the log-likelihood falls where one parameter is held elsewhere.
+
+Validation of a model on runs that it was not identified on: prediction, simulation and likelihood.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from filters.engine.batch import Estimates
+from filters.starts import Starts, as_the_prior_says
+from thruster_env.core.angles import difference, on_one_branch
 from thruster_env.core.checks import one_of
 from thruster_env.core.plots import BLUE, DARK, RUST, panels
+from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import verbatim
-from tuning.identification.ascent import climb
+from thruster_env.logs.log import Log
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.objective import climb
 from tuning.identification.result import Identification
+from tuning.identification.starts import estimates_of, starts_of
 from tuning.likelihood.identifiability import SIGNIFICANT
+from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 
 REACH = (0.75, 1.5, 2.5)  # standard errors at which a parameter is held
@@ -124,3 +137,111 @@ def profile_figure(identification: Identification, curves: Sequence[Profile]):
         axis.set_ylabel("fall in log L")
     axes[0].legend(fontsize=7, frameon=False)
     return figure
+
+
+class Validation(NamedTuple):
+    """Metrics of a model on some runs, by the measurements' symbols, in their units."""
+
+    log_likelihood: float  # of the innovations
+    one_step: dict[str, float]  # RMSE of the one-step prediction
+    simulation: dict[str, float]  # RMSE of the simulation, which uses no measurement
+    fit: dict[str, float]  # 100 (1 - RMSE of the simulation / standard deviation of the measurement) [%]
+    nis: float  # mean NIS over the number of channels; 1 for a consistent filter
+
+
+def validation_of(
+    model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None, starts: Starts | None = None
+) -> Validation:
+    """Metrics of a model on runs.
+
+    The simulation is a filter without process noise and prior covariance, whose gain is zero. Of runs that do not
+    begin as the prior says it begins where their first rows say, and these do not count.
+
+    Args:
+        model: the model of the filter.
+        runs: inputs and measurements.
+        unseen: (m,) which channels the filter only predicts: their errors are those of the estimate.
+        starts: of the runs; None if all begin as the model's prior says.
+    """
+    symbols = [channel.symbol for channel in model.measurements]
+    hidden = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
+    starts = as_the_prior_says(model, len(runs.measurements)) if starts is None else starts
+    counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
+    scored = ~np.isnan(runs.measurements) & counted[..., None]
+    visible = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
+    estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.n, model.n))
+    known = starts._replace(covs=np.zeros_like(starts.covs))
+    simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), visible, known)
+
+    def rmse(estimates: Estimates) -> np.ndarray:
+        errors = np.where(hidden, _less_predicted(model, runs, estimates, hidden), estimates.innovations)
+        return np.sqrt((np.where(scored, errors, 0.0) ** 2).sum(axis=(0, 1)) / scored.sum(axis=(0, 1)))
+
+    one_step, simulation = rmse(estimates), rmse(simulated)
+    rows = np.where(scored, runs.measurements, np.nan).reshape(-1, model.m)
+    rows = on_one_branch(rows, model.shape.measurement_angles)
+    spread = np.array([rows[~np.isnan(rows[:, i]), i].std() for i in range(model.m)])
+    fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
+    weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
+    nis = (weighted * estimates.innovations)[counted].sum() / scored[..., ~hidden].sum()
+
+    def by_symbol(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(symbols, map(float, values), strict=True))
+
+    likelihood = float(estimates.log_likelihoods[counted].sum())
+    return Validation(likelihood, by_symbol(one_step), by_symbol(simulation), by_symbol(fit), float(nis))
+
+
+def validate(
+    identification: Identification, data: Data | Log | Sequence[Data | Log] | None = None
+) -> dict[str, Validation]:
+    """The model at the start and at the identified values, "start" and "identified".
+
+    Args:
+        identification: from `identify`.
+        data: held-out runs; None for those of the identification. If a free parameter moves the data, held-out
+            runs must be given as a function of it, too.
+    """
+    objective = identification.objective
+    if data is not None:
+        objective = objective.with_changes(data=data, starts=None)
+    points = {
+        "start": objective.coordinates.of([identification.start[name] for name in identification.names]),
+        "identified": identification.at,
+    }
+    unseen, starts = objective.unseen, objective.starts
+    if data is not None:
+        prior_moves = objective.moves_prior(identification.at)
+        starts = (
+            None
+            if prior_moves
+            else starts_of(objective.model_at(identification.at), objective.data_at(identification.at), unseen)
+        )
+    return {
+        name: validation_of(objective.model_at(at), objective.data_at(at), unseen, starts)
+        for name, at in points.items()
+    }
+
+
+def fall_sentence(checked: Mapping[str, Validation]) -> list[str]:
+    """A sentence if the log-likelihood of held-out runs fell, in a list; empty if it did not.
+
+    Args:
+        checked: from `validate`, on held-out runs.
+    """
+    start, identified = checked["start"].log_likelihood, checked["identified"].log_likelihood
+    if not identified < start:
+        return []
+    return [
+        f"On the held-out runs the log-likelihood fell by {start - identified:.3g}: there the identified values "
+        "predict no better than those at the start."
+    ]
+
+
+def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hidden: np.ndarray) -> np.ndarray:
+    """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
+    if not hidden.any():
+        return np.zeros_like(runs.measurements)
+    observe, c = model.functions.observe, model.given_constants
+    predicted = [[observe(as_value(x), c) for x in means] for means in estimates.means.tolist()]
+    return difference(runs.measurements, np.array(predicted), model.shape.measurement_angles)

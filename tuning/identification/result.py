@@ -1,18 +1,140 @@
-"""The result of identification: values, standard errors, and which parameters the data determine."""
+"""The result of identification: values, standard errors, and which parameters the data determine.
+
+Likelihood-ratio tests of each free parameter against leaving it out.
+
+Identified values of a user's model, in a file that commands take as the preset of `--model`.
+
+[values]            the model's arguments, named constants, Q11, Q22, ... and R11, ...
+[identified]        how they were found, for readers
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from tuning.identification.ascent import Ascent
-from tuning.identification.gates import lost_information
-from tuning.identification.null_tests import NullTest
-from tuning.identification.objective import Objective
+from thruster_env.core.checks import finite, positive, short_repr
+from thruster_env.core.files import as_toml, read_toml, write_whole
+from thruster_env.logs.write import check_not_among
+from thruster_env.model.continuous import noise_for_dt, same_dt
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.family import ModelFamily
+from tuning.identification.objective import Ascent, Objective, climb, lost_information
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 from tuning.problems.parameter import Coordinates
+
+LEGS = 25  # iterations of the other parameters, at most
+ROUNDS = 4  # of going on from a better place that a test has found, at most
+BETTER = 1e-3  # rise in log-likelihood that counts as one
+
+
+class NullTest(NamedTuple):
+    """The likelihood of the runs with a parameter held at its null instead of free."""
+
+    at: float  # zero where its range holds it, else where the search began
+    is_zero: bool
+    log_likelihood: float  # the largest with all other parameters free
+    p: float  # probability of a fall at least as large, if that were the truth
+
+    @property
+    def said(self) -> str:
+        """The probability, for a table."""
+        return "< 0.001" if self.p < 1e-3 else f"{self.p:.2g}"
+
+
+def null_of(coordinates: Coordinates, index: int, start: np.ndarray) -> tuple[float, bool]:
+    """The coordinate at which a parameter is left out, and whether that is zero; otherwise it is the start."""
+    parameter = coordinates.free[index]
+    is_zero = not parameter.log and parameter.low <= 0.0 <= parameter.high
+    return (0.0 if is_zero else float(start[index])), is_zero
+
+
+def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent | None:
+    """The maximum that is found from that with all effects left out that may be zero; None without any.
+
+    So a further parameter never lowers the log-likelihood.
+    """
+    coordinates = objective.coordinates
+    nulls = [null_of(coordinates, index, start) for index in range(len(start))]
+    fixed = np.array([is_zero for _, is_zero in nulls])
+    if not fixed.any() or fixed.all():
+        return None
+    at = np.where(fixed, [null for null, _ in nulls], start)
+    bounds = coordinates.low, coordinates.high
+    without = climb(objective, at, *bounds, fixed=fixed, stop=stop)
+    return climb(objective, without.at, *bounds, stop=stop, progress=tell)
+
+
+def null_tests(
+    objective: Objective,
+    best: Ascent,
+    start: np.ndarray,
+    errors_of: Callable[[Ascent], tuple[np.ndarray, np.ndarray]],
+    stop: Callable[[], bool],
+) -> tuple[Ascent, dict[str, NullTest]]:
+    """Hold each parameter at its null, maximise over the others, and compare; return the better maximum, too.
+
+        D = 2 (log L - log L held)/lambda,  lambda = var(estimate)/(J^-1)
+
+    is chi-squared with one degree of freedom if the null is true: with probability a half only, else zero, if the
+    null is an end of the range. lambda is 1 where the model is right. If a search with a parameter held ends
+    higher than the best one, the latter continues from there, and the tests start again.
+
+    Args:
+        objective: the log-likelihood.
+        best: its maximum.
+        start: coordinates (p,) of the start.
+        errors_of: covariances (p, p) of the estimates at a maximum: those stated, and J^-1.
+        stop: ends the tests, which are then none.
+
+    Returns:
+        The maximum, and the tests by name.
+
+    Source: Kent (1982), "Robust properties of likelihood ratio tests", Biometrika 69(1); Chernoff (1954), "On the
+    distribution of the likelihood ratio", for ends of ranges.
+    """
+    coordinates = objective.coordinates
+    for _ in range(ROUNDS):
+        cov, naive = errors_of(best)
+        tests: dict[str, NullTest] = {}
+        for index, name in enumerate(coordinates.names):
+            if stop():
+                return best, {}
+            null, is_zero = null_of(coordinates, index, start)
+            restricted = _held_at(objective, best, index, null, cov, stop)
+            if restricted.found.value > best.found.value + BETTER:
+                further = climb(objective, restricted.at, coordinates.low, coordinates.high, stop=stop)
+                best = further if further.found.value > restricted.found.value else restricted
+                break
+            inflation = max(cov[index, index] / naive[index, index], 1.0)
+            fall = max(best.found.value - restricted.found.value, 0.0)
+            p = math.erfc(math.sqrt(fall / inflation))  # of 2 fall/inflation
+            at_end = null <= coordinates.low[index] or null >= coordinates.high[index]
+            value = float(coordinates.values(restricted.at)[index])
+            tests[name] = NullTest(value, is_zero, restricted.found.value, p / 2 if at_end and fall > 0 else p)
+        else:
+            return best, tests
+    return best, tests
+
+
+def _held_at(objective: Objective, best: Ascent, index: int, null: float, cov: np.ndarray, stop) -> Ascent:
+    """The maximum with a parameter held; the others begin in the direction of their correlation with it."""
+    coordinates = objective.coordinates
+    bounds = coordinates.low, coordinates.high
+    fixed = np.arange(len(best.at)) == index
+    along = best.at + cov[:, index] / cov[index, index] * (null - best.at[index])
+    starts = [np.clip(along, *bounds), np.array(best.at)]
+    for at in starts:
+        at[index] = null
+    at = max(starts, key=objective.value)
+    return climb(objective, at, *bounds, fixed=fixed, iterations=LEGS, stop=stop)
+
 
 WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined parameter may take
 TRADED = 0.95  # correlation from which two parameters are reported to trade off
@@ -278,3 +400,95 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
     ratios, turns = np.linalg.eigh(scatter / np.outer(roots, roots))
     wide = turns * np.maximum(ratios, 1.0) @ turns.T * np.outer(roots, roots)
     return axes @ wide @ axes.T * scale
+
+
+TABLES = ("values", "identified")
+
+
+def write_values(
+    path: str | Path, identification: Identification, logs: Sequence[str], dt: float | None = None
+) -> None:
+    """Write the identified values of a model, and the sample time of its logs [s], if that is known.
+
+    Raises:
+        ValueError: unless the path ends in .toml, lies beside no log of its name and can be written.
+    """
+    if not str(path).endswith(".toml"):
+        raise ValueError(f"a file of values must end in .toml, but got {str(path)!r}")
+    check_not_among(path)
+    identified = {
+        "logs": [Path(log).name for log in logs],
+        "log_likelihood": identification.log_likelihood,
+        "standard_errors": identification.standard_errors,
+        "determined": identification.determined,
+        **({} if dt is None else {"dt": float(dt)}),
+    }
+    tables: dict[str, Mapping] = {"values": identification.values, "identified": identified}
+    write_whole(path, as_toml(tables, "Numbers of a model as `thruster identify` found them."))
+
+
+def read_values(path: str | Path) -> dict[str, float]:
+    """The values in such a file by name.
+
+    Raises:
+        ValueError: states the rule and the value, with the path.
+    """
+    content = read_toml(path, "a file of values")
+    values = content.get("values")
+    if not isinstance(values, dict) or not values or set(content) - set(TABLES):
+        raise ValueError(
+            f"a file of values must have the table [values], but {path} has {short_repr(sorted(content))}"
+        )
+    return {name: finite(f"{name} in {path}", value) for name, value in values.items()}
+
+
+def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[[float], StateSpaceModel]:
+    """A function of the sample time that makes a model with the values in a file.
+
+    Values belong to the sample time that the file says they were found at. At another one a function of `dt` makes
+    the model, with variances in Q as `noise_for_dt` has them; any other model is refused.
+
+    Args:
+        make: the model, or a function that makes it, as for `ModelFamily`.
+        path: path of the file.
+
+    Raises:
+        ValueError: if the file is damaged, or names a parameter that the model does not have; the function raises
+            it for another sample time of a model that does not take one.
+    """
+    values, of = read_values(path), _dt_of(path)
+    model_at = partial(_at_dt, make, values, of, str(path))
+    try:
+        model_at(1.0 if of is None else of)
+    except ValueError as error:
+        raise ValueError(f"{error} (in {path})") from None
+    return model_at
+
+
+def _dt_of(path: str | Path) -> float | None:
+    """The sample time of the logs that values were found on [s]; None in a file that does not say."""
+    table = read_toml(path, "a file of values").get("identified")
+    dt = table.get("dt") if isinstance(table, dict) else None
+    return None if dt is None else positive(f"dt in {path}", dt)
+
+
+def _at_dt(
+    make: Callable | StateSpaceModel, values: Mapping[str, float], of: float | None, path: str, dt: float
+) -> StateSpaceModel:
+    """The model with values of one sample time at another."""
+    if of is not None and not same_dt(of, dt):
+        takes = not isinstance(make, StateSpaceModel) and "dt" in inspect.signature(make).parameters
+        if not takes:
+            raise ValueError(
+                f"the dt of a log must be that of {path}, {of:g} s, for a model that takes no dt, but is {dt:g} s"
+            )
+        q_variances = ModelFamily(make, (), noise=False, dt=dt).variances_of_q
+        values = {n: float(noise_for_dt(v, of, dt)) if n in q_variances else v for n, v in values.items()}
+    return valued(make, values, dt)
+
+
+def valued(
+    make: Callable | StateSpaceModel, values: Mapping[str, float], dt: float | None = None
+) -> StateSpaceModel:
+    """A model with other values of some parameters, by name; see `ModelFamily` for the names and errors."""
+    return ModelFamily(make, tuple(values), noise=False, dt=dt).model(**values)

@@ -17,7 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tuning.policies.vec_env import NativeVecEnv
+    from tuning.policies.environments import NativeVecEnv
 
 __all__ = ["NativeVecEnv"]
 
@@ -25,10 +25,10 @@ __all__ = ["NativeVecEnv"]
 def __getattr__(name: str) -> Any:
     """`NativeVecEnv`, which imports Stable-Baselines3 and torch; ValueError unless they are installed."""
     if name in __all__:
-        from tuning.policies.extras import check_installed
+        from tuning.policies.algorithms import check_installed
 
         check_installed()
-        return getattr(import_module("tuning.policies.vec_env"), name)
+        return getattr(import_module("tuning.policies.environments"), name)
     raise AttributeError(f"module 'tuning.policies' has no attribute {name!r}")
 
 

@@ -1,4 +1,8 @@
-"""The envs of a training configuration, for Stable-Baselines3: native vectorised ones, or single ones."""
+"""The envs of a training configuration, for Stable-Baselines3: native vectorised ones, or single ones.
+
+`NativeVecEnv`: a Gymnasium vector env as the VecEnv that Stable-Baselines3 asks for. Vectorised observations
+of a policy: an output of a state, or the last measurements and actions.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +12,191 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
 from filters import EstimateState, EstimateStates
 from filters.registry import filter_type
+from thruster_env.core.checks import short_repr
 from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.policies.controllers import CorrectController
-from tuning.policies.observations import find_observation_set
-from tuning.policies.plants.find import plant_of
+from tuning.policies.plants import box_of, find_observation_set, plant_of, size_of
 from tuning.policies.setup import TrainingConfiguration
-from tuning.policies.vec_env import NativeVecEnv
-from tuning.policies.views import ShowHistory, ShowOutput
+
+RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"
+
+
+class NativeVecEnv(VecEnv):
+    """Step a Gymnasium vector env, all copies in one call, under the contract of Stable-Baselines3.
+
+    A copy whose episode ends is reset within the step; its info then holds `terminal_observation` and
+    `TimeLimit.truncated`. All other infos are empty, because a dictionary for each copy and step takes more time
+    than the plant; the arrays are in `arrays` instead, with one row for each copy.
+
+    Actions are scaled to [-1, 1], as Stable-Baselines3 recommends.
+
+    Args:
+        env: a vector env that resets within the step (autoreset mode "SameStep"), with Box spaces.
+
+    Raises:
+        ValueError: if the env is no vector env, or resets in another mode.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv):
+        """Adapt the env; see the class."""
+        mode = env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
+        if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
+            got = short_repr(env) if mode is None else f"one with autoreset mode {AutoresetMode(mode).value!r}"
+            raise ValueError(f"{RULE}, but got {got}")
+        self.env = env
+        self.arrays: dict[str, Any] = {}
+        space = box_of(env.single_action_space)
+        self._low, self._half = space.low, (space.high - space.low) / 2
+        actions = gym.spaces.Box(-1.0, 1.0, space.shape, np.float32)
+        super().__init__(env.num_envs, env.single_observation_space, actions)
+
+    def reset(self) -> np.ndarray:
+        """Start an episode of every copy; those with a seed use it."""
+        seeds: Any = self._seeds if self._seeds[0] is not None else None  # vector envs take a list, too
+        observations, self.arrays = self.env.reset(seed=seeds, options=self._options[0] or None)
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions (num_envs, d) of the next step."""
+        self._actions = self._low + (actions + 1.0) * self._half
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
+        """Step all copies."""
+        observations, rewards, terminated, truncated, self.arrays = self.env.step(self._actions)
+        dones = terminated | truncated
+        infos: list[dict] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = self.arrays["final_obs"][i]
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        """Close the env."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices=None) -> list:
+        """An attribute of the vector env, once for each copy: the copies are not separate objects."""
+        return [self._find(attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
+        """Set an attribute of the vector env, which all copies share."""
+        self._refuse_some(indices)
+        setattr(self.env.unwrapped, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list:
+        """Call a method of the vector env, for all copies at once; the result, once for each copy."""
+        self._refuse_some(indices)
+        return [self._find(method_name)(*method_args, **method_kwargs)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
+        """Whether each copy has this wrapper of single envs: none has."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _find(self, name: str):
+        if name == "render_mode":  # only single envs draw
+            return None
+        return getattr(self.env, name) if hasattr(self.env, name) else getattr(self.env.unwrapped, name)
+
+    def _refuse_some(self, indices) -> None:
+        if indices is not None and len(list(self._get_indices(indices))) < self.num_envs:
+            raise ValueError(f"indices must be None, for the copies are one object, but got {indices!r}")
+
+
+class ShowOutput(VecEnvWrapper):
+    """Put an output that a model has at a state in front of an observation that begins with the state.
+
+    Args:
+        venv: envs whose observations begin with the model's states.
+        model: the model of the plant that the observer assumes.
+        symbol: of the output, such as the thruster's T.
+    """
+
+    def __init__(self, venv: VecEnv, model: StateSpaceModel, symbol: str):
+        """Wrap the envs; see the class."""
+        self._model, self._symbol = model, symbol
+        super().__init__(venv, _space(size_of(venv.observation_space) + 1))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs."""
+        return self._with_output(np.asarray(self.venv.reset()))
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = self._with_output(infos[i]["terminal_observation"])
+        return self._with_output(np.asarray(observations)), rewards, dones, infos
+
+    def _with_output(self, observations: np.ndarray) -> np.ndarray:
+        states = observations[..., : self._model.n].astype(np.float64)
+        values = self._model.output(self._symbol, states)
+        return np.concatenate([values[..., None].astype(np.float32), observations], axis=-1)
+
+
+class ShowHistory(VecEnvWrapper):
+    """Show the last measurements, each with the action before it, latest first; what the env appends stays last.
+
+    At the start of an episode there is one measurement; earlier entries are zero.
+
+    Args:
+        venv: envs whose observations are a measurement, then `appended` entries.
+        pairs: number of measurements.
+        appended: entries after the measurement, such as the reference.
+    """
+
+    def __init__(self, venv: VecEnv, pairs: int, appended: int):
+        """Wrap the envs; see the class."""
+        self._measured = size_of(venv.observation_space) - appended
+        width = self._measured + size_of(venv.action_space)
+        self._box = box_of(venv.action_space)
+        self._past = np.zeros((venv.num_envs, pairs, width), dtype=np.float32)
+        super().__init__(venv, _space(pairs * width + appended))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs; earlier measurements and actions are zero."""
+        observations = np.asarray(self.venv.reset())
+        return self._begin(np.ones(self.num_envs, dtype=bool), observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions as the env takes them, clipped."""
+        self._actions = np.clip(actions, self._box.low, self._box.high)
+        self.venv.step_async(actions)
+
+    def step_wait(self):
+        """Step the envs."""
+        raw, rewards, dones, infos = self.venv.step_wait()
+        observations = np.asarray(raw)
+        last = observations.copy()
+        for i in np.flatnonzero(dones):
+            last[i] = infos[i]["terminal_observation"]
+        self._past[:, 1:] = self._past[:, :-1].copy()
+        self._past[:, 0] = np.concatenate([last[:, : self._measured], self._actions], axis=1)
+        visible = self._visible(last)
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = visible[i].copy()
+        return (self._begin(dones, observations) if dones.any() else visible), rewards, dones, infos
+
+    def _begin(self, which: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        self._past[which] = 0.0
+        self._past[which, 0, : self._measured] = observations[which, : self._measured]
+        return self._visible(observations)
+
+    def _visible(self, observations: np.ndarray) -> np.ndarray:
+        appended = observations[:, self._measured :]
+        return np.concatenate([self._past.reshape(self.num_envs, -1), appended], axis=1)
+
+
+def _space(size: int) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
 def make_environments(

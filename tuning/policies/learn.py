@@ -1,4 +1,7 @@
-"""Train a policy, with evaluations, checkpoints and TensorBoard; an interrupted training can be continued."""
+"""Train a policy, with evaluations, checkpoints and TensorBoard; an interrupted training can be continued.
+
+The model of Stable-Baselines3 that a training configuration asks for.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,19 @@ import math
 import os
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from thruster_env.core.files import write_whole
+from tuning.policies.algorithms import find_algorithm, learning
 from tuning.policies.environments import make_environments, seed_episodes
-from tuning.policies.model import new_model
 from tuning.policies.saved import (
     BEST,
     CHECKPOINTS,
@@ -32,12 +37,34 @@ from tuning.policies.saved import (
     remove,
     reopen,
     save,
+    score,
 )
-from tuning.policies.score import score
 from tuning.policies.setup import TrainingConfiguration
-from tuning.policies.torch_settings import learning
 from tuning.problems.seeds import SEEDS_APART, training_seeds
 from tuning.search.interruption import stop_on_interrupt
+
+
+def new_model(setup: TrainingConfiguration, envs: VecEnv, tensorboard: Path | None = None) -> BaseAlgorithm:
+    """A model that has learnt nothing yet, with its envs normalised.
+
+    Args:
+        setup: the training configuration.
+        envs: from `make_environments`.
+        tensorboard: folder of TensorBoard's files; no files without one.
+    """
+    algorithm = find_algorithm(setup.algo)
+    kind = algorithm.load_class()
+    numbers: dict[str, Any] = deepcopy(dict(setup.hyperparameters))  # off-policy ones write into policy_kwargs
+    rate = numbers["learning_rate"]
+    # The last rollout may exceed the requested steps: `remaining` is then negative.
+    numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
+    if "noise_std" in numbers:
+        deviation = numbers.pop("noise_std")
+        numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))
+    normalised = VecNormalize(envs, gamma=numbers["gamma"])
+    log = None if tensorboard is None else str(tensorboard)
+    return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)
+
 
 VALIDATION_EPISODES = 32  # of an evaluation during training; always the same ones
 KEPT = 2  # checkpoints

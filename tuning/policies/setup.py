@@ -17,8 +17,7 @@ from filters.registry import filter_type
 from filters.tuned_file import AUGMENTED, read_tuned_file
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
-from tuning.policies.observations import find_observation_set
-from tuning.policies.plants.find import plant_of
+from tuning.policies.plants import find_observation_set, plant_of
 from tuning.problems.scenario import BaseScenario, plain
 
 # Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
@@ -90,7 +89,7 @@ class TrainingConfiguration:
     """Observations, algorithm, task, plant and numbers of a training.
 
     Attributes:
-        observe: name of an observation set, see `tuning.policies.observations`.
+        observe: name of an observation set, see `tuning.policies.plants`.
         algo: name of an algorithm, see `tuning.policies.algorithms`.
         task: name of the task.
         scenario: name of the scenario, with the plant and its noise.

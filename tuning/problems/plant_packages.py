@@ -7,7 +7,7 @@ from types import ModuleType
 
 # Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
 # computed_scale(scenario, sequences).
-PLANT_PACKAGES = {"thruster": "tuning.thruster.scenarios", "auv": "tuning.auv.scenarios"}
+PLANT_PACKAGES = {"thruster": "tuning.thruster.scenario", "auv": "tuning.auv.scenario"}
 LOGS = "tuning.thruster.logs"
 
 

@@ -15,7 +15,7 @@ from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.evaluation.summary import sizes_as_data, stored_sizes
-from tuning.likelihood.goal import OF_STATES
+from tuning.likelihood.gradient import OF_STATES
 from tuning.problems.data import Data
 from tuning.search.among_types import (
     NEAR_BEST,

@@ -7,8 +7,7 @@ import optuna
 
 from filters.registry import filter_type
 from tuning.likelihood.family import has_gradient, keeps_more
-from tuning.likelihood.goal import Goal
-from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
+from tuning.likelihood.gradient import Goal, goal_of, optimum, start_at, starts_of
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.plan import Plan
 from tuning.search.space import within_ranges

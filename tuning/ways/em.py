@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
-from tuning.likelihood.goal import Goal
+from tuning.likelihood.gradient import Goal
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
 from tuning.ways.task import FEW, Task, way_out

@@ -10,7 +10,7 @@ import numpy as np
 from thruster_env.core.angles import difference
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.residuals import predicted
-from tuning.likelihood.goal import Goal
+from tuning.likelihood.gradient import Goal
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.search.objectives import MSE
 from tuning.search.space import Choice

@@ -19,7 +19,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
-from tuning.likelihood.goal import Goal
+from tuning.likelihood.gradient import Goal
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem

@@ -10,7 +10,7 @@ import thruster_env.auv  # noqa: F401 - registers the envs
 from pages import auv_figures, auv_filters, auv_papers
 from thruster_env.auv.channels import SUITES
 from thruster_env.auv.effects import CURRENT_SIGNALS
-from tuning.auv.scenarios import SCENARIOS
+from tuning.auv.scenario import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "auv.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)

@@ -35,7 +35,7 @@ from tuning.experiments.recordings.measure import (
 from tuning.experiments.recordings.model import DT, model, to_identify
 from tuning.experiments.recordings.runs import clock_offset, read_recordings
 from tuning.experiments.recordings.tables import ladder_rows, number_rows
-from tuning.identification.values import valued
+from tuning.identification.result import valued
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
 TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}

@@ -10,19 +10,29 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.policies.classical import classical_policy
-from tuning.policies.comparison import runs
-from tuning.policies.comparison.plan import BEST, CLASSICAL, QUICK, VARIANTS, WRONG, Comparison, Run, runs_of
-from tuning.policies.comparison.runs import Result, run_comparison
-from tuning.policies.comparison.statistics import as_interval, typical_error, typical_return
-from tuning.policies.comparison.tables import HEADER, answers, rows_of, summary_rows
+from tuning.policies import comparison as runs
+from tuning.policies.comparison import (
+    BEST,
+    CLASSICAL,
+    QUICK,
+    VARIANTS,
+    WRONG,
+    Comparison,
+    Result,
+    Run,
+    as_interval,
+    run_comparison,
+    runs_of,
+    typical_error,
+    typical_return,
+)
+from tuning.policies.comparison_report import HEADER, answers, rows_of, summary_rows
 from tuning.policies.environments import make_environments
-from tuning.policies.plants.plant import Part
-from tuning.policies.plants.thruster import FIRST_SCORED_STEP, THRUSTER
-from tuning.policies.score import Scores, run_episodes, score
+from tuning.policies.plants import FIRST_SCORED_STEP, THRUSTER, Part
+from tuning.policies.saved import Scores, classical_policy, run_episodes, score
 from tuning.policies.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 MEDIUM = find_scenario("medium_noise")
 SEEDS = held_out_seeds(0, 3)
@@ -258,7 +268,7 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 
 @pytest.mark.slow
 def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.policies.comparison.plan.QUICK", QUICK._replace(episodes=4))
+    monkeypatch.setattr("tuning.policies.comparison.QUICK", QUICK._replace(episodes=4))
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
     command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page

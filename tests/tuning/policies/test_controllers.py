@@ -9,10 +9,8 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, learn, setup_of, short_episodes  # noqa: F401 - some are fixtures
-from tuning.policies.classical import classical_policy
 from tuning.policies.environments import make_environments
-from tuning.policies.saved import find_saved, load
-from tuning.policies.score import score
+from tuning.policies.saved import classical_policy, find_saved, load, score
 from tuning.policies.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds
 

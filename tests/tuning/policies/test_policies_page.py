@@ -8,15 +8,13 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tuning.cli.study import app
-from tuning.policies.classical import classical_policy
-from tuning.policies.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
-from tuning.policies.comparison.tables import GOAL, HEADER, name_of
-from tuning.policies.observations import OBSERVATION_SETS
-from tuning.policies.plants.find import TASKS
-from tuning.policies.score import score
+from tuning.policies.comparison import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
+from tuning.policies.comparison_report import GOAL, HEADER, name_of
+from tuning.policies.plants import OBSERVATION_SETS, TASKS
+from tuning.policies.saved import classical_policy, score
 from tuning.policies.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "policies.md").read_text()

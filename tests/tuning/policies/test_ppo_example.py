@@ -24,7 +24,7 @@ def ppo():
 
 def test_the_vec_env_is_public_and_found_lazily():
     from tuning.policies import NativeVecEnv
-    from tuning.policies.vec_env import NativeVecEnv as Same
+    from tuning.policies.environments import NativeVecEnv as Same
 
     assert NativeVecEnv is Same and "NativeVecEnv" in dir(tuning.policies)
     with pytest.raises(AttributeError, match="module 'tuning.policies' has no attribute 'Native'"):
@@ -35,7 +35,7 @@ def test_the_vec_env_is_public_and_found_lazily():
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("tuning.policies.extras.NEEDED", ("no_such_package",))
+    monkeypatch.setattr("tuning.policies.algorithms.NEEDED", ("no_such_package",))
     with pytest.raises(ValueError, match=r"no_such_package, which is not installed: pip install '\.\[rl\]'"):
         tuning.policies.NativeVecEnv  # noqa: B018
 

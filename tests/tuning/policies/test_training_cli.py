@@ -15,10 +15,9 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.cli.train import name_of
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
-from tuning.policies.saved import FINAL, load, read_configuration
-from tuning.policies.score import play, score
+from tuning.policies.saved import FINAL, load, play, read_configuration, score
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 @pytest.mark.parametrize(("suffix", "size"), [("mp4", None), ("gif", (96, 64))])

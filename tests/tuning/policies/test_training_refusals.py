@@ -12,12 +12,11 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tuning.policies.algorithms import check_installed
 from tuning.policies.environments import make_environments
-from tuning.policies.extras import check_installed
-from tuning.policies.saved import FINAL, find_saved, load
-from tuning.policies.score import play
+from tuning.policies.saved import FINAL, find_saved, load, play
 from tuning.policies.setup import configuration_from_json, make_configuration
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 def damage(path, how):

@@ -10,12 +10,9 @@ pytest.importorskip("sb3_contrib")
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from tests.learners import COPIES, SMALL, learn
-from tuning.policies.classical import classical_policy
 from tuning.policies.environments import make_environments, make_single
-from tuning.policies.plants.find import PLANTS, TASKS, plant_of
-from tuning.policies.plants.plant import Part
-from tuning.policies.saved import find_saved, load
-from tuning.policies.score import run_episodes, score
+from tuning.policies.plants import PLANTS, TASKS, Part, plant_of
+from tuning.policies.saved import classical_policy, find_saved, load, run_episodes, score
 from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.problems.find import find_problem
 from tuning.problems.seeds import held_out_seeds

@@ -9,7 +9,7 @@ from tests.tuning.ways.problems import P0, A, C, Q, R, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
-from tuning.thruster.scenarios import find_scenario
+from tuning.thruster.scenario import find_scenario
 from tuning.ways.okf import Factors, _squares
 from tuning.ways.registry import WAYS, find_way
 from tuning.ways.searches import BACKWARD, FORWARD

@@ -16,9 +16,8 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments.recordings.model import LOAD_CELL, on_line, to_identify
 from tuning.experiments.recordings.runs import Recording
 from tuning.identification.identify import identify
-from tuning.identification.result import Identification
+from tuning.identification.result import Identification, valued
 from tuning.identification.starts import runs_of
-from tuning.identification.values import valued
 from tuning.problems.digest import digest_of
 from tuning.problems.parameter import Parameter
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 from thruster_env.core.integration import runge_kutta
 from thruster_env.model.quantities import Output, Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.values import read_values, valued
+from tuning.identification.result import read_values, valued
 
 DT = 0.04  # of the recordings [s]
 SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s

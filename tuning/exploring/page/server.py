@@ -7,6 +7,8 @@ Who may talk to it is decided before any handler is chosen, for pages, scripts a
     Origin  where a browser sends one, is this server's own; a websocket must send it
 
 Everything else is one empty answer, 404, whether the token is nearly right or not.
+
+The document of a tab: the template around the pictures.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable
+from functools import cache
 from hmac import compare_digest
+from pathlib import Path
 from typing import Any
 
 from bokeh.document import Document
@@ -24,10 +28,18 @@ from bokeh.resources import Resources
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
+from jinja2 import Environment, FileSystemLoader, Template
+from markupsafe import Markup
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import ErrorHandler, OutputTransform
+
+from thruster_env.model.quantities import Quantity
+from tuning.exploring.bench import Bench
+from tuning.exploring.page.export import KINDS
+from tuning.exploring.page.session import Session
+from tuning.exploring.scenes import SCENES
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
@@ -170,3 +182,69 @@ class Server:
                 self._loop.stop()
 
         return look
+
+
+HERE = Path(__file__).parent
+SEEDS = 8
+
+
+@cache
+def template() -> Template:
+    """The page, whose texts are escaped where they are put in."""
+    return Environment(autoescape=True, loader=FileSystemLoader(HERE)).get_template("page.html")
+
+
+@cache
+def asset(name: str) -> Markup:
+    """A style or script of the page."""
+    return Markup((HERE / name).read_text(encoding="utf-8"))
+
+
+def signals(bench: Bench) -> list[tuple[str, str, str]]:
+    """Name, title and description of each picture over time."""
+    rows = []
+    for i, quantity in enumerate(bench.states):
+        named = _named(quantity)
+        rows.append((f"state{i}", named, f"{named} over time, with the 95 % band of its estimate"))
+    for i, quantity in enumerate(bench.measurements):
+        named = f"Innovation of {_named(quantity)}"
+        rows.append((f"innovation{i}", named, f"{named} over time, with its 95 % band"))
+    rows.append(("nis", "NIS", "Normalised innovation squared over time, with the interval of its mean over runs"))
+    if bench.has_truth:
+        rows.append(("nees", "NEES", "Normalised estimation error squared over time, with its interval"))
+    rows.append(("autocorrelation", "Autocorrelation of innovations", "Autocorrelation over lags, with its band"))
+    return rows
+
+
+def _named(quantity: Quantity) -> str:
+    return f"{quantity.name} [{quantity.unit}]" if quantity.unit else quantity.name
+
+
+def page_of(bench: Bench, seeds: int = SEEDS) -> Callable[[Document], None]:
+    """What fills the document of each new tab: with a bench, or with the scene that the address names."""
+
+    def fill(document: Document) -> None:
+        scene = SCENES.get(_asked(document))
+        here = bench if scene is None else scene.bench()
+        document.title = f"{here.title}: explore"
+        document.template = template()
+        document.template_variables.update(
+            heading=here.title,
+            css=asset("page.css"),
+            js=asset("page.js"),
+            kinds=list(KINDS.items()),
+            signals=signals(here),
+            scenes=[(scene_.name, scene_.title) for scene_ in SCENES.values()],
+            scene=scene,
+            has_truth=here.has_truth,
+        )
+        Session(document, here, seeds, scene)
+
+    return fill
+
+
+def _asked(document: Document) -> str:
+    """The scene that the address asks for; empty if none."""
+    context = document.session_context
+    arguments = getattr(context.request, "arguments", {}) if context is not None else {}
+    return b"".join(arguments.get("scene", [])[:1]).decode(errors="replace")

@@ -17,9 +17,7 @@ from bokeh.model import DataModel
 
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.export import exported
-from tuning.exploring.page.map_picture import MapPicture
-from tuning.exploring.page.pictures import HELD, Look, Pictures, ground
-from tuning.exploring.page.sent import Sent
+from tuning.exploring.page.pictures import HELD, Look, MapPicture, Pictures, Sent, ground
 from tuning.exploring.scenes import Scene
 from tuning.exploring.view import View
 

@@ -17,11 +17,9 @@ from bokeh.document import Document
 
 from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
-from tuning.exploring.figure import present
-from tuning.exploring.page.document import page_of
-from tuning.exploring.page.pictures import DARK, HELD
-from tuning.exploring.page.sent import as_sent
-from tuning.exploring.page.server import Server
+from tuning.exploring.page.export import present
+from tuning.exploring.page.pictures import DARK, HELD, as_sent
+from tuning.exploring.page.server import Server, page_of
 from tuning.exploring.page.session import Session, _plain
 
 SEEDS = 3

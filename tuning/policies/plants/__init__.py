@@ -1,1 +1,0 @@
-"""The plants on which policies learn."""
