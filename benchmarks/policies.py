@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
     """Seconds a step of a short training, as `thruster train` learns."""
-    from tuning.policies.algorithms import learning
     from tuning.policies.environments import make_environments
     from tuning.policies.learn import new_model
+    from tuning.policies.torch_settings import learning
 
     model = new_model(setup, make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=native))
     return _steps_of(model, lambda: learning(model), rollouts)

@@ -12,7 +12,7 @@ from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.identify import split_runs
-from tuning.logs.read import log_problem
+from tuning.logs.problem import log_problem
 from tuning.problems.log_parts import parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.space import untuned_choice

@@ -13,7 +13,7 @@ from tests.tuning.cli.test_cli_log_findings import OWN
 from thruster_env.logs.write import write_columns
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import evaluate
-from tuning.logs.read import log_problem
+from tuning.logs.problem import log_problem
 from tuning.problems.log_problem import MEASURED
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.space import untuned_choice

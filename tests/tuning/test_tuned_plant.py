@@ -23,7 +23,8 @@ from thruster_env.thruster.plant import differences, make_plant, plant_data
 from thruster_env.thruster.preset_file import PresetFile, write_preset
 from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned, verify
-from tuning.logs.read import as_tuned, log_problem, problems_in
+from tuning.logs.problem import log_problem, problems_in
+from tuning.logs.read import as_tuned
 from tuning.policies.setup import make_configuration
 from tuning.problems.files import scenario_of
 from tuning.reporting.subject import find_subject

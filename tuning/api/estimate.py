@@ -22,7 +22,8 @@ from thruster_env.core.checks import short_repr
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_columns
 from tuning.api.showing import drawn, frame, html, number
-from tuning.logs.read import as_tuned, model_of_logs, name_of, read_named
+from tuning.logs.problem import name_of
+from tuning.logs.read import as_tuned, model_of_logs, read_named
 
 # `LogEstimates`: the estimates of a filter or a smoother on a recorded run, as a value.
 

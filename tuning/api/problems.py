@@ -10,7 +10,7 @@ from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
 from thruster_env.core.modules import is_code
-from tuning.logs.read import log_problem, problems_in
+from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named
 from tuning.problems.plant_packages import built_in, logs_package

@@ -21,7 +21,7 @@ from tuning.cli.options import (
 )
 from tuning.cli.output import announce_compilation, check_targets, emit
 from tuning.evaluation.tuned import read_tuned
-from tuning.logs.read import problems_in
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 
 LANGUAGES = ("c",)

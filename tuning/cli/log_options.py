@@ -181,7 +181,7 @@ class BlockOptions:
     ] = None
 
     def named(self) -> dict[str, Any]:
-        """Other arguments of `tuning.logs.read.log_problem`; None where an option is not given."""
+        """Other arguments of `tuning.logs.problem.log_problem`; None where an option is not given."""
         cuts = {"held_out": self.held_out, "blocks": self.blocks, "lead": self.lead, "start": self.start}
         return {**cuts, "hold_gaps": self.hold_gaps or None}
 
@@ -193,7 +193,7 @@ def problems_of(
     names: Sequence[str] | None, logs: BlockOptions, reading: GridOptions, default: str
 ) -> tuple[Problem, ...]:
     """The problems of a study: logs with their options, or problems by name."""
-    from tuning.logs.read import log_problem
+    from tuning.logs.problem import log_problem
     from tuning.problems.find import find_problem
     from tuning.thruster.logs import of_preset
 

@@ -10,7 +10,7 @@ import typer
 from tuning.cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from tuning.cli.output import announce_compilation, emit, working
 from tuning.cli.tune import DEFAULT_STORAGE
-from tuning.logs.read import problems_in
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file

@@ -18,7 +18,8 @@ from tuning.cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOpti
 from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.cli.train import LEARNABLE
 from tuning.policies.algorithms import check_installed
-from tuning.policies.plants import find_observation_set, plant_of
+from tuning.policies.observations import find_observation_set
+from tuning.policies.plants import plant_of
 from tuning.policies.setup import TrainingConfiguration, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds

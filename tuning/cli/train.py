@@ -21,7 +21,8 @@ from tuning.api.run import file_name
 from tuning.cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, OfPresetOption, spelt
 from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.policies.algorithms import ALGORITHMS, check_installed
-from tuning.policies.plants import OBSERVATION_SETS, PLANTS, TASKS, plant_of
+from tuning.policies.observations import OBSERVATION_SETS
+from tuning.policies.plants import PLANTS, TASKS, plant_of
 from tuning.policies.setup import TrainingConfiguration, make_configuration
 from tuning.problems.scenario import plain
 from tuning.thruster.logs import of_preset

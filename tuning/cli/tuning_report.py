@@ -33,7 +33,7 @@ from tuning.evaluation.worth import memory_numbers, memory_sentence
 from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
-from tuning.logs.read import model_named_in
+from tuning.logs.problem import model_named_in
 from tuning.problems.augmented import within
 from tuning.problems.plant_packages import built_in
 from tuning.reporting.choice_words import consistency_sentence, gains, model_doubts, residual_sentences

@@ -13,7 +13,7 @@ from thruster_env.core.text_tables import table
 from tuning.cli.options import CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from tuning.cli.output import announce_compilation, emit, working
 from tuning.evaluation.tuned import TOLERANCE, Verification, verify
-from tuning.logs.read import problems_in
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 
 LISTED = 10  # differences in the table; --json has all

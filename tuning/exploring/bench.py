@@ -95,7 +95,7 @@ def _found(base: Problem, problem: Problem) -> str:
             return "\nproblem = ...  # of these logs"
         files = [log["file"] for log in content["logs"]]
         options = f", {_arguments(content['options'])}" if content["options"] else ""
-        return f"from tuning.logs.read import log_problem\n\nproblem = log_problem({files!r}{options})"
+        return f"from tuning.logs.problem import log_problem\n\nproblem = log_problem({files!r}{options})"
     if base.name not in built_in() and not base.name.endswith(".toml") and ":" not in base.name:
         return f"\nproblem = ...  # {short_repr(base.name)}"
     lines = f"from tuning.problems.find import find_problem\n\nproblem = find_problem({base.name!r})"

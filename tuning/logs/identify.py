@@ -16,7 +16,8 @@ from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
-from tuning.logs.read import read_named, runs_by_name, without_rescaled
+from tuning.logs.problem import runs_by_name, without_rescaled
+from tuning.logs.read import read_named
 from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.parameter import Parameter
 from tuning.problems.plant_packages import logs_package

@@ -2,7 +2,7 @@
 
 The thruster's classical policies: PI, LQR (LQG with an estimator), and the predictive controllers.
 
-They use the observation sets of `tuning.policies.plants`, so that they can be compared with learnt
+They use the observation sets of `tuning.policies.observations`, so that they can be compared with learnt
 policies.
 """
 
@@ -20,7 +20,7 @@ from thruster_env.core.checks import one_of
 from thruster_env.thruster.control.controllers import LQRController, PIController
 from thruster_env.thruster.control.planning import HORIZONS, PredictiveController
 from thruster_env.thruster.dynamics import Constants
-from tuning.policies.plants import TrainingReturns, size_of
+from tuning.policies.observations import TrainingReturns, size_of
 
 
 class Controller(Protocol):

@@ -21,7 +21,8 @@ from thruster_env.core.checks import short_repr
 from thruster_env.env.commands import ObserveState, ObserveStateVector
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.policies.controllers import CorrectController
-from tuning.policies.plants import box_of, find_observation_set, plant_of, size_of
+from tuning.policies.observations import box_of, find_observation_set, size_of
+from tuning.policies.plants import plant_of
 from tuning.policies.setup import TrainingConfiguration
 
 RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"

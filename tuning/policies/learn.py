@@ -20,7 +20,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from thruster_env.core.files import write_whole
-from tuning.policies.algorithms import find_algorithm, learning
+from tuning.policies.algorithms import find_algorithm
 from tuning.policies.environments import make_environments, seed_episodes
 from tuning.policies.saved import (
     BEST,
@@ -40,6 +40,7 @@ from tuning.policies.saved import (
     score,
 )
 from tuning.policies.setup import TrainingConfiguration
+from tuning.policies.torch_settings import learning
 from tuning.problems.seeds import SEEDS_APART, training_seeds
 from tuning.search.interruption import stop_on_interrupt
 

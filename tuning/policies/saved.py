@@ -34,7 +34,8 @@ from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_
 from tuning.policies.algorithms import find_algorithm
 from tuning.policies.controllers import ClassicalPolicy
 from tuning.policies.environments import episode_steps, make_environments, make_single, native_of
-from tuning.policies.plants import Part, TrainingPlant, box_of, plant_of
+from tuning.policies.observations import box_of
+from tuning.policies.plants import Part, TrainingPlant, plant_of
 from tuning.policies.setup import TrainingConfiguration, configuration_from_json
 from tuning.problems.seeds import training_seeds
 

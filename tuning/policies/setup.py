@@ -17,7 +17,8 @@ from filters.registry import filter_type
 from filters.tuned_file import AUGMENTED, read_tuned_file
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
-from tuning.policies.plants import find_observation_set, plant_of
+from tuning.policies.observations import find_observation_set
+from tuning.policies.plants import plant_of
 from tuning.problems.scenario import BaseScenario, plain
 
 # Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.

@@ -9,7 +9,7 @@ import tuning
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.write import write_columns
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.logs.read import log_problem
+from tuning.logs.problem import log_problem
 
 OWN = """
 from thruster_env.model.affine import affine_model

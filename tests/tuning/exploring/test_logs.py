@@ -8,7 +8,7 @@ from tests.tuning.test_identify_stamps import DT, recorded, smooth, stamps_of
 from thruster_env.logs.read import read_log
 from tuning.evaluation.evaluate import evaluate
 from tuning.exploring.bench import Bench
-from tuning.logs.read import log_problem
+from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 

@@ -10,7 +10,8 @@ pytest.importorskip("stable_baselines3")
 from tuning.cli.study import app
 from tuning.policies.comparison import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from tuning.policies.comparison_report import GOAL, HEADER, name_of
-from tuning.policies.plants import OBSERVATION_SETS, TASKS
+from tuning.policies.observations import OBSERVATION_SETS
+from tuning.policies.plants import TASKS
 from tuning.policies.saved import classical_policy, score
 from tuning.policies.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds

@@ -14,7 +14,7 @@ from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, sho
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
-from tuning.policies.plants import OBSERVATION_SETS
+from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration, score
 from tuning.policies.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds

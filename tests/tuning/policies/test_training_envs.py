@@ -15,7 +15,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from tests.slow import slow_but
 from thruster_env.thruster.env import BowThrusterTrackingVectorEnv
 from tuning.policies.environments import NativeVecEnv, make_environments, make_single
-from tuning.policies.plants import OBSERVATION_SETS, STACKED
+from tuning.policies.observations import OBSERVATION_SETS, STACKED
 from tuning.policies.setup import in_scenario, make_configuration
 from tuning.thruster.scenario import find_scenario
 
