@@ -13,11 +13,8 @@ import numpy as np
 
 FEW, MANY = 4, 8  # choices that a message names of more than so many
 MOST_LISTED, LONG = 24, 80  # names that a message has, and characters of each
-ROUNDING, SINGULAR, ASYMMETRY = (
-    1e-9,
-    1e-14,
-    1e-5,
-)  # of correlations: least eigenvalues, and entries beside the diagonal
+# Of correlations: least eigenvalues, and entries beside the diagonal.
+ROUNDING, SINGULAR, ASYMMETRY = 1e-9, 1e-14, 1e-5
 
 
 def short_repr(value) -> str:

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.optimising import Which, optimise_once
-from thruster_env.core.user_functions import OURS, code_text, needs_python, stand_in
+from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read, needs_python, stand_in
 
 # Where machine code is kept: beside the sources, in the user's cache, or, where both refuse it, a private folder.
 
@@ -221,7 +221,7 @@ _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compile
 _only_python: weakref.WeakKeyDictionary[Callable, str] = (
     weakref.WeakKeyDictionary()
 )  # why functions are not compiled
-_lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(Which(_asked, _marked, _called, _apart, _narrow))]
 _untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
@@ -259,16 +259,6 @@ def narrow(function: Callable) -> Callable:
     """Mark a function whose loops keep the vectors that LLVM prefers: wide ones were measured to take longer."""
     _narrow.add(function)
     return function
-
-
-def _which() -> Which:
-    return Which(
-        asked=_asked.__contains__,
-        marked=_marked.__contains__,
-        called=_called.__contains__,
-        apart=_apart.__contains__,
-        narrow=_narrow.__contains__,
-    )
 
 
 def overloaded(function: Callable, teach: Callable[[Callable], None] | None = None) -> Callable:
@@ -400,13 +390,10 @@ def fastmath_of(function: Callable) -> set[str]:
 def rounds(code: types.CodeType) -> bool:
     """Whether a function rounds numbers or computes remainders."""
     signs = {"%", "//", "%=", "//="}
-    return (
-        not JUMPS.isdisjoint(code.co_names)
-        or any(
-            instruction.opname == "BINARY_OP" and instruction.argrepr in signs
-            for instruction in dis.get_instructions(code)
-        )
-        or any(rounds(constant) for constant in code.co_consts if isinstance(constant, types.CodeType))
+    return not JUMPS.isdisjoint(names_read(code)) or any(
+        instruction.opname == "BINARY_OP" and instruction.argrepr in signs
+        for part in codes_in(code)
+        for instruction in dis.get_instructions(part)
     )
 
 
@@ -464,10 +451,8 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
         if package in _packages:
             packages.add(package)
             continue
-        try:
+        with contextlib.suppress(OSError, TypeError):  # from a prompt: the byte code tells changes apart
             digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
-        except (OSError, TypeError):
-            pass  # from a notebook or a prompt: the byte code tells changes apart
     for package in sorted(packages):
         digest.update(_package_hash(package).encode())
     return digest.hexdigest()
@@ -565,20 +550,10 @@ def _described(function: Callable) -> str:
 
 def _reason(error: Exception) -> str:
     # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
-    frames = (
-        "Failed in",
-        "TypingError",
-        "During",
-        "There are",
-        "- Of which",
-        "Overload",
-        "With argument",
-        "Rejected",
-    )
+    frames = *"TypingError During Overload Rejected File >>>".split(), "Failed in", "There are", "- Of which"
+    frames += "With argument", "No impl"
     lines = [line.strip() for line in str(error).splitlines()]
-    telling = [
-        line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
-    ]
+    telling = [line for line in lines if len(line) > 3 and not line.startswith(frames)]
     reason = telling[0] if telling else type(error).__name__
     calls = [line.removeprefix(">>>").strip() for line in lines if line.startswith(">>>")]
     unmatched = reason.lower().startswith(("no match", "raised from"))  # where only the call itself is telling

@@ -108,36 +108,31 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
 
     Source: Squire, Trapp (1998), "Using complex variables to estimate derivatives of real functions", SIAM Review.
     """
-    if is_array(rows, columns) or is_array(columns):
-        return _complex_step_in_loops(function, rows, columns, arguments)
-    lines = []
-    for j in range(columns):
-        point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
-        lines.append(f"y{j} = function({point}, {arguments})")
-    source = matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])")
-    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step}
-    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, source, **names)
+    loops = is_array(rows, columns) or is_array(columns)
+    if loops:
+        lines = _complex_steps_in_loops(rows, columns, arguments)
+    else:
+        points = (
+            tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
+            for j in range(columns)
+        )
+        lines = [f"y{j} = function({point}, {arguments})" for j, point in enumerate(points)]
+        lines.append(matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])"))
+    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step, "np": np}
+    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, _loops=loops, **names)
     _EXACT.add(jacobian_)
     return jacobian_
 
 
-def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+def _complex_steps_in_loops(rows: int, columns: int, arguments: str) -> list[str]:
     if is_array(columns):
         point: tuple[str, ...] = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
     else:
         step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
         point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
     stores = _stores(rows, lambda i: f"slope(y[{i}])")
-    body = *point, f"y = function(point, {arguments})", *stores
-    lines = (
-        f"out = np.empty(({rows}, {columns}))",
-        f"for j in range({columns}):",
-        *(f"    {line}" for line in body),
-    )
-    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step, "np": np}
-    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, "out", _loops=True, **names)
-    _EXACT.add(jacobian_)
-    return jacobian_
+    body = (f"    {line}" for line in (*point, f"y = function(point, {arguments})", *stores))
+    return [f"out = np.empty(({rows}, {columns}))", f"for j in range({columns}):", *body, "out"]
 
 
 def by_complex_step(function: Callable) -> bool:

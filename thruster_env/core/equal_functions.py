@@ -29,19 +29,8 @@ EXACT = bool | int | str | bytes | None  # compared by type and value
 CHANGES_OTHERS = {"STORE_GLOBAL", "DELETE_GLOBAL"}
 CHANGES_PARTS = {"STORE_SUBSCR", "DELETE_SUBSCR", "STORE_ATTR", "DELETE_ATTR", "STORE_SLICE"}
 CHANGING = {
-    *("append", "appendleft", "extend", "insert", "pop", "popleft", "popitem", "remove", "clear", "sort"),
-    *(
-        "reverse",
-        "add",
-        "discard",
-        "update",
-        "setdefault",
-        "setattr",
-        "__setitem__",
-        "__setattr__",
-        "send",
-        "write",
-    ),
+    *"append appendleft extend insert pop popleft popitem remove clear sort reverse add discard update".split(),
+    *"setdefault setattr __setitem__ __setattr__ send write".split(),
 }  # methods after which a list, dictionary, set or object is another
 
 OF_EVERY_CLASS = {
@@ -505,9 +494,6 @@ class _Copy:
 
 
 # Generated functions remember what made them, so that models that hold them can be pickled.
-
-
-__all__ = ["Made", "as_function", "as_made", "makes_functions"]
 
 MOST_RESULTS = 128  # results that are kept for a maker, beyond those that something else holds
 

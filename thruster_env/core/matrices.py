@@ -73,12 +73,8 @@ def _products_of_rows(a, b, lower):
     for i in range(0, rows, 2):
         i_1 = min(i + 1, rows - 1)
         for j in range(0, i + 2 if lower else columns, 4):
-            j_0, j_1, j_2, j_3 = (
-                min(j, columns - 1),
-                min(j + 1, columns - 1),
-                min(j + 2, columns - 1),
-                min(j + 3, columns - 1),
-            )
+            j_0, j_1 = min(j, columns - 1), min(j + 1, columns - 1)
+            j_2, j_3 = min(j + 2, columns - 1), min(j + 3, columns - 1)
             p_0 = p_1 = p_2 = p_3 = q_0 = q_1 = q_2 = q_3 = 0.0
             for k in range(inner):
                 x, y = a[i, k], a[i_1, k]
@@ -205,7 +201,7 @@ def solve_rows(b, factor):
     return turned.T.copy()
 
 
-# Triangular factors of matrices of every size, and solutions with them; see `thruster_env.core.matrices`.
+# Triangular factors of matrices of every size, and solutions with them.
 
 
 NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
@@ -418,31 +414,6 @@ def triangular_root(rows: int, columns: int) -> Callable:
     return source.function(source.lower(root))
 
 
-__all__ = [
-    "careful_factor",
-    "cholesky_factor",
-    "column_solver",
-    "factored_inverse",
-    "forward_solver",
-    "innovation",
-    "innovation_likelihood",
-    "masked",
-    "multiplier",
-    "pivoted_factor",
-    "quadratic_form",
-    "row_solver",
-    "semidefinite_factor",
-    "square",
-    "symmetric_sum",
-    "transposed_multiplier",
-    "transposer",
-    "triangle_divider",
-    "triangular_root",
-    "vector_multiplier",
-    "vector_solver",
-]
-
-
 @cache
 def multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b for shapes (rows, inner) and (inner, columns)."""
@@ -516,10 +487,7 @@ def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
     shape = size, size
     source = Source("add", "a, b", result=shape, a=shape, b=shape)
-
-    def entry(i, j):
-        return f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"
-
+    entry = "0.5 * (a[{0}][{1}] + a[{1}][{0}] + b[{0}][{1}] + b[{1}][{0}])".format
     return source.function(source.symmetric("s", size, entry))
 
 
@@ -527,11 +495,7 @@ def symmetric_sum(size: int) -> Callable:
 def innovation(size: int, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
     source = Source("subtract", "z, y", result=(size,), z=(size,), y=(first + size,))
-
-    def entry(i):
-        return f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"
-
-    return source.function(source.vector(size, entry))
+    return source.function(source.vector(size, lambda i: f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"))
 
 
 @cache

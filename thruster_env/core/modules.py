@@ -60,7 +60,8 @@ def object_named(name: str, what: str):
 def _executed(module_name: str, name: str, what: str) -> ModuleType:
     """The module; an error of rule and value that its lines raise needs no words about imports."""
     try:
-        return _module(module_name)
+        with working_folder_last():
+            return importlib.import_module(module_name)
     except ValueError as error:
         if not module_name:
             raise
@@ -74,12 +75,6 @@ class RuleBroken(ValueError):
 def error_line(error: BaseException) -> str:
     """The kind and message of an error of a user's code, on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def _module(name: str) -> ModuleType:
-    """A module, which may lie in the working folder, as the user's own do."""
-    with working_folder_last():
-        return importlib.import_module(name)
 
 
 @contextmanager
@@ -127,7 +122,6 @@ _USER_FOLDERS = _UserFolders()
 
 
 def _folder_of(name: str) -> str | None:
-    """The folder of a module, or of its package."""
     file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
     if not file:
         return None

@@ -10,7 +10,7 @@ sake of the first ones with 512, which slowed down.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import wraps
 from typing import Any, NamedTuple
 
@@ -20,13 +20,13 @@ RARELY = 1_000_000  # new objects after which garbage is collected meanwhile
 
 
 class Which(NamedTuple):
-    """Which functions are compiled differently; each is a predicate of a plain function."""
+    """Which plain functions are compiled differently."""
 
-    asked: Callable[[Callable], bool]  # whether it is ours to compile; of others' functions nothing is changed
-    marked: Callable[[Callable], bool]  # whether it is one that becomes part of these
-    called: Callable[[Callable], bool]  # whether it is one of those to leave as it is
-    apart: Callable[[Callable], bool]  # whether it is called, and never to become part of a caller
-    narrow: Callable[[Callable], bool]  # whether its vectors are as wide as LLVM prefers
+    asked: Container[Callable | None]  # ours to compile; of others' functions nothing is changed
+    marked: Container[Callable | None]  # those that become part of these
+    called: Container[Callable | None]  # of those, the ones to leave as they are
+    apart: Container[Callable | None]  # of these, the ones that never become part of a caller
+    narrow: Container[Callable | None]  # those whose vectors are as wide as LLVM prefers
 
 
 def optimise_once(which: Which) -> None:
@@ -48,7 +48,7 @@ def optimise_once(which: Which) -> None:
     _emit_outermost(library, getattr(codegen, "JITCPUCodegen", None), compiling, which)
 
 
-def _listener(base: type, asked: Callable[[Callable], bool]):
+def _listener(base: type, asked: Container[Callable | None]):
     """Keeps what is being compiled for a function of ours, which leaves hardly any garbage to collect.
 
     numba holds a lock from the start to the end, which it tells however a compilation ends.
@@ -62,7 +62,7 @@ def _listener(base: type, asked: Callable[[Callable], bool]):
         def on_start(self, event):
             dispatcher = event.data["dispatcher"]
             if not self.dispatchers:
-                if not asked(dispatcher.py_func):
+                if dispatcher.py_func not in asked:
                     return
                 self.thresholds = gc.get_threshold()
                 gc.set_threshold(RARELY, *self.thresholds[1:])
@@ -98,8 +98,8 @@ def _widen_vectors(library: Any, compiling, which: Which) -> None:
     @wraps(add)
     def add_widened(self, module):
         function = compiling.function_of(self)
-        ours = function is compiling.outermost or which.marked(function)
-        if function is not None and ours and not which.narrow(function):
+        ours = function is compiling.outermost or function in which.marked
+        if function is not None and ours and function not in which.narrow:
             for part in module.functions:
                 if not part.is_declaration:
                     set.add(part.attributes, WIDE)  # its own `add` knows attributes without a value only
@@ -114,9 +114,9 @@ def _optimise_outermost(library: Any, compiling, which: Which) -> None:
     @wraps(optimise)
     def optimise_outermost(self):
         function = compiling.function_of(self)
-        if compiling.outermost in (None, function) or not which.called(function):
+        if compiling.outermost in (None, function) or function not in which.called:
             optimise(self)
-        elif which.apart(function):
+        elif function in which.apart:
             for part in self._final_module.functions:
                 if not part.is_declaration and b"alwaysinline" not in b" ".join(part.attributes):
                     part.add_function_attribute("noinline")
@@ -142,7 +142,7 @@ def _emit_outermost(library: Any, codegen: Any, compiling, which: Which) -> None
     @wraps(emit)
     def emit_outermost(self):
         function = compiling.function_of(self)
-        if function is not None and function is not compiling.outermost and which.marked(function):
+        if function is not None and function is not compiling.outermost and function in which.marked:
             self._finalize_dynamic_globals()
             self._finalized = True
         else:

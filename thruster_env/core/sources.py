@@ -4,11 +4,6 @@ A function is described once, as the entries of its result and the sums in them.
 `collections.namedtuple` does for its classes: vectors are tuples of components, matrices tuples of rows, which the
 compiler keeps in registers. Large, the same description becomes loops over float64 arrays, whose text does not
 grow with the size. Which of the two a value is depends on its shape alone, so that all functions agree on it.
-
-A vector is a tuple of components, a matrix a tuple of rows. The makers here write a function out for a fixed
-size, as `collections.namedtuple` does for its classes: numba then sees tuples of known length, keeps them in
-registers and vectorises the loop around. Vectors and matrices that are large are arrays instead, which the same
-makers read and write in loops (`thruster_env.core.sources`).
 """
 
 from __future__ import annotations
@@ -60,7 +55,6 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
 
 
 def _forget(file: str) -> None:
-    """Drop a source text when its last function is gone."""
     _shown[file] -= 1
     if not _shown[file]:
         del _shown[file]
@@ -369,30 +363,10 @@ def entrywise(
 # Vectors and matrices as tuples: one form that floats, arrays, tensors and numba all run fast.
 
 
-__all__ = [
-    "assembled",
-    "column_reader",
-    "column_writer",
-    "joiner",
-    "matrix_of",
-    "matrix_reader",
-    "matrix_writer",
-    "part_of",
-    "scaled_sum",
-    "tuple_of",
-    "vector_part",
-    "vector_reader",
-    "vector_writer",
-    "written_out",
-    "zeros_of",
-]
-
-
 @cache
 def column_reader(count: int, first: int = 0) -> Callable:
     """Return `column(array, j)`: `count` entries of column j, from row first on, as a tuple."""
-    source = Source("column", "array, j", result=(count,))
-    return source.function(source.vector(count, lambda i: f"array[{first + i}, j]"))
+    return entrywise("column", "array, j", (count,), lambda i: f"array[{first + i}, j]")
 
 
 @cache
@@ -407,8 +381,7 @@ def column_writer(count: int, first: int = 0) -> Callable:
 @cache
 def vector_reader(count: int, start: int = 0) -> Callable:
     """Return `read(row)`: entries start ... start + count - 1 of a one-dimensional array as a tuple."""
-    source = Source("read", "row", result=(count,))
-    return source.function(source.vector(count, lambda i: f"row[{start + i}]"))
+    return entrywise("read", "row", (count,), lambda i: f"row[{start + i}]")
 
 
 @cache
@@ -423,8 +396,7 @@ def vector_writer(count: int, start: int = 0) -> Callable:
 @cache
 def matrix_reader(rows: int, columns: int, start: int = 0) -> Callable:
     """Return `read(row)`: a matrix that lies by rows in row[start], row[start + 1], ..., as a tuple of rows."""
-    source = Source("read", "row", result=(rows, columns))
-    return source.function(source.matrix(rows, columns, lambda i, j: f"row[{i * columns + j + start}]"))
+    return entrywise("read", "row", (rows, columns), lambda i, j: f"row[{i * columns + j + start}]")
 
 
 @cache
@@ -448,8 +420,7 @@ def scaled_sum(count: int) -> Callable:
 @cache
 def vector_part(count: int, size: int, first: int = 0) -> Callable:
     """Return `part(x)`: `count` components, from index `first` on, of a vector of `size` components."""
-    source = Source("part", "x", result=(count,), x=(size,))
-    return source.function(source.vector(count, lambda i: f"x[{i + first}]"))
+    return entrywise("part", "x", (count,), lambda i: f"x[{i + first}]", x=(size,))
 
 
 @cache
@@ -498,5 +469,4 @@ def zeros_of(*shape: int) -> Callable:
 @cache
 def part_of(rows: int, columns: int, shape: tuple[int, int], top: int = 0, left: int = 0) -> Callable:
     """Return `part(a)`: the block (rows, columns) at (top, left) of a matrix of this shape."""
-    source = Source("part", "a", result=(rows, columns), a=shape)
-    return source.function(source.matrix(rows, columns, lambda i, j: f"a[{i + top}][{j + left}]"))
+    return entrywise("part", "a", (rows, columns), lambda i, j: f"a[{i + top}][{j + left}]", a=shape)

@@ -191,9 +191,6 @@ def cosine_and_sine(angle):
     return cosine_and_sine_of_turns(turns - nearest_whole(turns))
 
 
-# Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
-
-
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
 DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION, FILTER_KERNEL = range(8, 14)

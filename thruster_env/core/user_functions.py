@@ -10,6 +10,7 @@ import builtins
 import dis
 import functools
 import inspect
+import itertools
 import logging
 import math
 import sys
@@ -74,14 +75,15 @@ def _plain(value: Any) -> str:
 
 def names_read(code: types.CodeType) -> list[str]:
     """Names of globals and attributes in a function's code and in that of functions within it, sorted."""
-    return sorted({name for part in _codes(code) for name in part.co_names})
+    return sorted({name for part in codes_in(code) for name in part.co_names})
 
 
-def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
+def codes_in(code: types.CodeType) -> Iterator[types.CodeType]:
+    """Some code, and that of functions within it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            yield from _codes(constant)
+            yield from codes_in(constant)
 
 
 def _byte_code(code: types.CodeType) -> str:
@@ -162,13 +164,9 @@ def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
     index_at = {instruction.offset: i for i, instruction in enumerate(instructions)}
 
     def catches(target: int) -> bool:
-        for instruction, after in zip(
-            instructions[index_at[target] :], instructions[index_at[target] + 1 :], strict=False
-        ):
-            if instruction.opname in CATCHING or (instruction.opname, after.opname) == (
-                "PUSH_EXC_INFO",
-                "POP_TOP",
-            ):
+        for instruction, after in itertools.pairwise(instructions[index_at[target] :]):
+            names = instruction.opname, after.opname
+            if instruction.opname in CATCHING or names == ("PUSH_EXC_INFO", "POP_TOP"):
                 return True
             if instruction.opname == "WITH_EXCEPT_START":
                 return "suppress" in code.co_names  # of contextlib
@@ -182,33 +180,31 @@ def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
 
 def catches_exceptions(code: types.CodeType) -> bool:
     """Whether some code, or that of a function within it, catches exceptions."""
-    return bool(caught(code)) or any(map(catches_exceptions, _codes_within(code)))
+    return any(map(caught, codes_in(code)))
 
 
 def _asks_for_truth(code: types.CodeType) -> bool:
     """Whether some code asks if a value `is True`, as `match x > 0: case True` does."""
-    pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
     return any(
         after.opname == "IS_OP" and before.opname == "LOAD_CONST" and type(before.argval) is bool
-        for before, after in pairs
-    ) or any(map(_asks_for_truth, _codes_within(code)))
+        for before, after in _neighbours(code)
+    )
 
 
 def inverts(code: types.CodeType) -> bool:
     """Whether code has a `~`, which means "not" only for NumPy's truth values and in machine code."""
-    names = (instruction.opname for instruction in dis.get_instructions(code))
-    return "UNARY_INVERT" in names or any(map(inverts, _codes_within(code)))
+    return any(part.opname == "UNARY_INVERT" for of in codes_in(code) for part in dis.get_instructions(of))
 
 
 def takes_roots(code: types.CodeType) -> bool:
     """Whether code has powers other than those of whole numbers: with Python's floats they may be complex."""
-    pairs = zip(instructions := list(dis.get_instructions(code)), instructions[1:], strict=False)
-    powers = (type(before.argval) is not int for before, after in pairs if after.argrepr in ("**", "**="))
-    return any(powers) or "pow" in code.co_names or any(map(takes_roots, _codes_within(code)))
+    pairs = (pair for pair in _neighbours(code) if pair[1].argrepr in ("**", "**="))
+    return any(type(before.argval) is not int for before, _ in pairs) or "pow" in names_read(code)
 
 
-def _codes_within(code: types.CodeType) -> list[types.CodeType]:
-    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+def _neighbours(code: types.CodeType) -> Iterator[tuple[dis.Instruction, dis.Instruction]]:
+    for part in codes_in(code):
+        yield from itertools.pairwise(dis.get_instructions(part))
 
 
 def needs_python(*functions: Any) -> str | None:

@@ -134,22 +134,14 @@ def along(numbers: Sequence[Number], moves: Mapping[int, Slope]) -> list[Slope]:
     for number in needed_by(numbers, moves):
         if number.place not in slopes:
             of = [slopes[argument.place] for argument in number.of]
-            slopes[number.place] = _RULES[number.operation](number, *number.of, *of) if any_of(of) else None
+            moving = any(slope is not None for slope in of)
+            slopes[number.place] = _RULES[number.operation](number, *number.of, *of) if moving else None
     return [slopes[number.place] for number in numbers]
-
-
-def any_of(slopes: Sequence[Slope]) -> bool:
-    """Whether there is a slope among some."""
-    return any(slope is not None for slope in slopes)
 
 
 def times(slope: Slope, factor: Callable[[], Number | float]) -> Slope:
     """A slope times a factor, which is evaluated only if there is a slope."""
     return None if slope is None else slope * factor()
-
-
-def _choice_slope(y, condition, a, b, of_condition, da, db):
-    return where(condition, 0.0 if da is None else da, 0.0 if db is None else db)
 
 
 def _unless_zero(x, slope: Slope) -> Slope:
@@ -161,10 +153,6 @@ def _fading(slope: Slope, x: Number, factor: Callable[[], Number]) -> Slope:
     """The slope of a function of x times its derivative, which vanishes where x becomes infinite."""
     product = times(slope, factor)
     return _unless_zero(factor(), product) if product is not None and x.may_overflow else product
-
-
-def _quotient_slope(y, a, b, da, db):
-    return added(times(da, lambda: 1.0 / b), _fading(db, b, lambda: -y / b))
 
 
 def _power_slope(y, x, e, dx, de):
@@ -185,29 +173,19 @@ def _angle_slope(y, a, b, da, db):
 def _length_slope(y, a, b, da, db):
     """Half the slope of the square over the length; 0 at zero, as in between."""
     products = times(da, lambda: a), times(db, lambda: b)
-    of_square = added(*map(_twice, products))
+    of_square = added(*(None if slope is None else slope + slope for slope in products))
     return None if of_square is None else _unless_zero(y, 0.5 * of_square / y)
 
 
-def _twice(slope: Slope) -> Slope:
-    return None if slope is None else slope + slope
-
-
 def _bell(x: Number) -> Number:
-    """The derivative of the error function."""
     return (2.0 / math.sqrt(math.pi)) * (-x * x).exp()
-
-
-def _no_slope(y, *arguments):
-    """No slope, for functions that are constant except for jumps."""
-    return None
 
 
 _RULES: dict[str, Callable] = {
     "+": lambda y, a, b, da, db: added(da, db),
     "-": lambda y, a, b, da, db: added(da, None if db is None else -db),
     "*": lambda y, a, b, da, db: added(times(da, lambda: b), times(db, lambda: a)),
-    "/": _quotient_slope,
+    "/": lambda y, a, b, da, db: added(times(da, lambda: 1.0 / b), _fading(db, b, lambda: -y / b)),
     "negative": lambda y, x, dx: -dx,
     "abs": lambda y, x, dx: where(x < 0.0, -dx, dx),
     "sqrt": lambda y, x, dx: _unless_zero(y, 0.5 * dx / y),
@@ -233,9 +211,11 @@ _RULES: dict[str, Callable] = {
     "erfc": lambda y, x, dx: _fading(dx, x, lambda: -_bell(x)),
     "pow": _power_slope,
     "arctan2": _angle_slope,
-    "where": _choice_slope,
+    "where": lambda y, condition, a, b, _, da, db: where(
+        condition, 0.0 if da is None else da, 0.0 if db is None else db
+    ),
     "hypot": _length_slope,
     "fmod": lambda y, a, b, da, db: added(da, times(db, lambda: (y - a) / b)),
     "copysign": lambda y, a, b, da, db: times(da, lambda: where(a < 0.0, -1.0, 1.0) * where(y < 0.0, -1.0, 1.0)),
-    **dict.fromkeys((*CONDITIONS, "floor", "ceil", "rint"), _no_slope),
+    **dict.fromkeys((*CONDITIONS, "floor", "ceil", "rint"), lambda *_: None),  # constant except for jumps
 }

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-# What is known of the size of a number when a graph gets it: whether it may be infinite, whether it can be zero.
-
-
 if TYPE_CHECKING:
     from thruster_env.graphs.graphs import Number
+
+# What is known of the size of a number when a graph gets it: whether it may be infinite, whether it can be zero.
 
 GROWING = frozenset("exp exp2 expm1 log log2 log10 log1p sinh cosh arctanh pow".split())
 """Operations whose results may be infinite for numbers of usual size."""
@@ -48,10 +47,6 @@ def sign_of(operation: str, of: Sequence[Number], value: float | None) -> int:
     if operation in ("exp", "exp2", "erfc"):
         return NEVER_NEGATIVE
     return {"cosh": POSITIVE, "cbrt": of[0].sign if of else UNKNOWN}.get(operation, UNKNOWN)
-
-
-if TYPE_CHECKING:
-    from thruster_env.graphs.graphs import Number
 
 
 def as_number(a: Number) -> Number:

@@ -45,23 +45,8 @@ from thruster_env.graphs.folding import (
 )
 
 UNARY = (
-    *(
-        "sqrt",
-        "exp",
-        "log",
-        "sin",
-        "cos",
-        "tan",
-        "arctan",
-        "tanh",
-        "sinh",
-        "cosh",
-        "floor",
-        "ceil",
-        "cbrt",
-        "exp2",
-    ),
-    *("expm1", "log1p", "log2", "log10", "arcsinh", "arccosh", "arctanh", "erf", "erfc"),
+    *"sqrt exp log sin cos tan arctan tanh sinh cosh floor ceil cbrt exp2 expm1".split(),
+    *"log1p log2 log10 arcsinh arccosh arctanh erf erfc".split(),
 )
 TWO_SIDED = {"+", "*"}  # operations whose arguments may change places
 COMPARISONS: dict[str, Callable] = {
@@ -158,6 +143,18 @@ class Graph:
         return as_number(value) if isinstance(value, Number) else self.constant(value)
 
 
+def _in_both_orders(work):
+    """The methods of an operator: what the operation makes of a number and another one, and of the two in turn."""
+
+    def method(self, other):
+        return NotImplemented if (b := self._as_number(other)) is None else work(as_number(self), b)
+
+    def turned(self, other):
+        return NotImplemented if (b := self._as_number(other)) is None else work(b, as_number(self))
+
+    return method, turned
+
+
 class Number:
     """A float64 that an operation makes of others.
 
@@ -171,18 +168,7 @@ class Number:
         exact: whether machine code rounds it as Python does.
     """
 
-    __slots__ = (
-        "graph",
-        "operation",
-        "arguments",
-        "of",
-        "place",
-        "value",
-        "member",
-        "may_overflow",
-        "sign",
-        "exact",
-    )
+    __slots__ = tuple("graph operation arguments of place value member may_overflow sign exact".split())
     sqrt: Callable[[], Number]  # and so on, as UNARY has them
     log: Callable[[], Number]
     floor: Callable[[], Number]
@@ -217,49 +203,16 @@ class Number:
         """The other one as a Number of this graph; None where it is no number."""
         if isinstance(other, Number):
             return as_number(other)
-        return self.graph.constant(other) if isinstance(other, (int, float)) or _is_scalar(other) else None
+        if isinstance(other, (int, float, np.generic)) or isinstance(other, np.ndarray) and not other.shape:
+            return self.graph.constant(other)
+        return None
 
-    def _binary(self, work: Callable, other, turned: bool = False):
-        """What an operation makes of this number and another one, or of the two in turn."""
-        if (b := self._as_number(other)) is None:
-            return NotImplemented
-        return work(b, as_number(self)) if turned else work(as_number(self), b)
-
-    def __add__(self, other):
-        return self._binary(total, other)
-
-    def __radd__(self, other):
-        return self._binary(total, other, turned=True)
-
-    def __sub__(self, other):
-        return self._binary(difference, other)
-
-    def __rsub__(self, other):
-        return self._binary(difference, other, turned=True)
-
-    def __mul__(self, other):
-        return self._binary(product, other)
-
-    def __rmul__(self, other):
-        return self._binary(product, other, turned=True)
-
-    def __truediv__(self, other):
-        return self._binary(_over, other)
-
-    def __rtruediv__(self, other):
-        return self._binary(_over, other, turned=True)
-
-    def __mod__(self, other):
-        return self._binary(modulus, other)
-
-    def __rmod__(self, other):
-        return self._binary(modulus, other, turned=True)
-
-    def __floordiv__(self, other):
-        return self._binary(floor_quotient, other)
-
-    def __rfloordiv__(self, other):
-        return self._binary(floor_quotient, other, turned=True)
+    __add__, __radd__ = _in_both_orders(total)
+    __sub__, __rsub__ = _in_both_orders(difference)
+    __mul__, __rmul__ = _in_both_orders(product)
+    __truediv__, __rtruediv__ = _in_both_orders(lambda a, b: divided(a, b) if a.graph.exact else quotient(a, b))
+    __mod__, __rmod__ = _in_both_orders(modulus)
+    __floordiv__, __rfloordiv__ = _in_both_orders(floor_quotient)
 
     def __lt__(self, other):
         return self._compared("<", other)
@@ -366,14 +319,6 @@ def _unary(name: str):
 for _name in UNARY:
     setattr(Number, _name, _unary(_name))
 Number.__floor__, Number.__ceil__ = Number.floor, Number.ceil  # type: ignore[attr-defined]
-
-
-def _over(a: Number, b: Number) -> Number:
-    return divided(a, b) if a.graph.exact else quotient(a, b)
-
-
-def _is_scalar(value) -> bool:
-    return isinstance(value, np.generic) or isinstance(value, np.ndarray) and not value.shape
 
 
 def where(condition, a, b):

@@ -131,20 +131,14 @@ class Writer:
             return getattr(builder, OF_TWO[operation])(*values, flags=flags)
         if operation == "negative":
             return builder.fneg(*values, flags=flags)
-        if operation == "where":
-            return builder.select(*values)
         if operation == "call":
             return self._worked_out_by(number.arguments[0], number.arguments[1], values)
         if operation == "entry":
             return values[0][number.arguments[1]]
-        if operation == "and":
-            return builder.and_(*values)
-        if operation == "or":
-            return builder.or_(*values)
-        if operation == "two_to":
-            return self._two_to(*values)
-        if operation == "hypot":
-            return self._length(*values)
+        without_flags = {"where": builder.select, "and": builder.and_, "or": builder.or_}
+        without_flags |= {"two_to": self._two_to, "hypot": self._length}
+        if operation in without_flags:
+            return without_flags[operation](*values)
         if operation == "!=":
             return builder.fcmp_unordered(operation, *values)
         if operation in COMPARISONS:
@@ -267,7 +261,6 @@ class _LoopWriter:
         return self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
 
     def write(self, parts: Cut) -> None:
-        """All of it."""
         self._once.read(parts.reads)
         for turn in parts.turns:
             self._once.work(turn.works)
@@ -279,7 +272,7 @@ class _LoopWriter:
         builder, width = self._builder, self._width
         each = Writer(self._context, builder, self._arrays, width)
         self._same_for_all(each, body)
-        mask = self._lanes() if body.sums else None
+        mask = ir.Constant(ir.VectorType(LONG, width), list(range(width))) if body.sums else None
         before = builder.block
         inside, after = builder.append_basic_block("members"), builder.append_basic_block("after")
         builder.branch(inside)
@@ -312,7 +305,9 @@ class _LoopWriter:
         ends = [(number, phi.incomings[-1][0]) for number, phi in zip(body.sums, sums, strict=True)]
         builder.position_at_end(after)
         for number, value in ends:
-            of_all = self._largest(value) if number.operation == "largest" else self._added(value)
+            is_largest = number.operation == "largest"
+            zero = [] if is_largest else [ir.Constant(DOUBLE, 0.0)]
+            of_all = self._reduced("fmax" if is_largest else "fadd", [*zero, value])
             self._once.values[number.place] = self._as_vector(of_all)
 
     def _same_for_all(self, each: Writer, body: Body) -> None:
@@ -323,9 +318,6 @@ class _LoopWriter:
         needed |= {number.place: number for _, number in body.stores if not number.member}
         for index, number in needed.items():
             each.values[index] = each.same_for_all(self._once.values[index], number)
-
-    def _lanes(self) -> ir.Value:
-        return ir.Constant(ir.VectorType(LONG, self._width), list(range(self._width)))
 
     def _broadcast(self, value: ir.Value, vector: ir.VectorType) -> ir.Value:
         first = self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
@@ -339,12 +331,6 @@ class _LoopWriter:
             self._arrays[location.array], [self._builder.add(row, at)], source_etype=DOUBLE
         )
         return self._builder.bitcast(pointer, vector.as_pointer())
-
-    def _added(self, value: ir.Value) -> ir.Value:
-        return self._reduced("fadd", [ir.Constant(DOUBLE, 0.0), value])
-
-    def _largest(self, value: ir.Value) -> ir.Value:
-        return self._reduced("fmax", [value])
 
     def _reduced(self, operation: str, values: list[ir.Value]) -> ir.Value:
         name, module = f"llvm.vector.reduce.{operation}.v{self._width}f64", self._builder.module

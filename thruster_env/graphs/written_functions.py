@@ -21,7 +21,7 @@ import numpy as np
 
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_of, tuple_of, written_out
-from thruster_env.core.user_functions import MODULES, functions_in, is_plain, needs_floats
+from thruster_env.core.user_functions import MODULES, codes_in, functions_in, is_plain, needs_floats
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import UNARY, Graph, Number
 from thruster_env.graphs.programs import Place, program_of, values_of
@@ -63,12 +63,10 @@ def is_refused(function: Callable) -> bool:
 
 def _has_odd_code(code: types.CodeType) -> bool:
     """Whether it has dictionaries, formats or imports, or lists or sets of texts, or lists in lists."""
-    listed = list(dis.get_instructions(code))
-    within = (constant for constant in code.co_consts if isinstance(constant, types.CodeType))
-    return (
-        any(instruction.opname in REFUSED for instruction in listed)
-        or any(_is_odd_list(listed[:k], instruction) for k, instruction in enumerate(listed))
-        or any(map(_has_odd_code, within))
+    return any(
+        instruction.opname in REFUSED or _is_odd_list(listed[:k], instruction)
+        for listed in map(list, map(dis.get_instructions, codes_in(code)))
+        for k, instruction in enumerate(listed)
     )
 
 
@@ -95,14 +93,10 @@ def _reads_odd_values(function: types.FunctionType) -> bool:
             is_plain(value)
             or isinstance(value, functions)
             or hasattr(value, "py_func")
-            or _is_module_of_numbers(value)
+            or (isinstance(value, types.ModuleType) and value in MODULES)
         )
         for value in (*cells, *(function.__globals__[name] for name in names if name in function.__globals__))
     )
-
-
-def _is_module_of_numbers(value) -> bool:
-    return isinstance(value, types.ModuleType) and value in MODULES
 
 
 def _written(function: Callable, arguments: str, sizes: Sequence[int], form, shape: tuple[int, ...]) -> Callable:
