@@ -8,4 +8,7 @@ precision                         constants in single precision
 programs, instructions            a graph as machine code, for some runs side by side
 loops, loop_instructions          the same for the members of an ensemble, cut into loops
 c_source                          the same as C99
+
+What can be traced, and the arithmetic of programs: docs/machine_code.md. A program is compared with its function
+at a few points, since a function might check the type of its argument.
 """
