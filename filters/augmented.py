@@ -114,7 +114,6 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
 
 
 def _output(function: Callable, shape, positions: tuple[int, ...], x, c):
-    """An output of the model, function(x, c), with its states and estimated constants taken from x."""
     values = list(c[: shape.constants])
     for q, position in enumerate(positions):
         values[position] = x[shape.n + q]

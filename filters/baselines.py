@@ -149,7 +149,6 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
 
     @inlined
     def estimate(row, numbers):
-        """The open loop's state, with the component at which the model gives the low-passed measurement."""
         x = read_open(row)
         if inverts and row[known_place] > 0.0:
             x = solve(x, row[smooth_place], constants(numbers), numbers[reach_place])

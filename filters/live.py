@@ -222,7 +222,6 @@ class Live:
         return values
 
     def _predict(self, time: float, u: np.ndarray) -> None:
-        """Steps of equal length up to a time."""
         session = self._session
         if len(u) != self._inputs:
             raise ValueError(

@@ -128,7 +128,6 @@ def sequences_taken(inputs: np.ndarray, truths: int, model: StateSpaceModel) -> 
 
 
 def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
-    """Keys of the truths of each sequence, (count, truths, 2)."""
     size = count, at_least("truths", truths, 2), 2
     return np.random.default_rng(seed).integers(0, 2**32, size=size).astype(np.float64)
 

@@ -91,7 +91,6 @@ class _OfStates:
     which: Callable | int
 
     def __call__(self, x, c):
-        """The output's value."""
         old = self.to_old(x)
         return old[self.which] if isinstance(self.which, int) else self.which(old, c)
 
@@ -106,7 +105,6 @@ class _OfStates:
 
 @makes_functions
 def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...]) -> dict[str, Callable]:
-    """The functions of the new model, and T and X themselves."""
     bound_of = {bound.place: bound for bound in bounds}
 
     def entry(logit: str, above: str, below: str) -> Callable:

@@ -64,5 +64,4 @@ def _ground_state(mu: float) -> tuple[float, float]:
 
 
 def _means(order: np.ndarray) -> np.ndarray:
-    """Mean of e^2 cos(order e) over the circle."""
     return np.where(order == 0, np.pi**2 / 3.0, 2.0 * np.where(order % 2, -1.0, 1.0) / np.maximum(order**2, 1))

@@ -50,7 +50,7 @@ def triangle(a):
     The modified Gram-Schmidt method orthogonalises the rows of A; L is as accurate as by Householder's method.
     Source: Bjorck (1967), "Solving linear least squares problems by Gram-Schmidt orthogonalization".
     """
-    rows, lower = [row for row in np.array(a)], np.full((len(a), len(a)), 0.0, dtype=a.dtype)
+    rows, lower = [*np.array(a)], np.full((len(a), len(a)), 0.0, dtype=a.dtype)
     for i, row in enumerate(rows):
         square = row @ row
         vanishes = square <= 0.0
@@ -122,7 +122,6 @@ def factor_of(lower):
 
 @forward_quotient.derivative
 def _of_forward_quotient(result, arguments, slopes):
-    """The slope L^-1 (dv - dL y) of y = L^-1 v."""
     (lower, _), (dl, dv) = arguments, slopes
     change = minus(dv, through(lambda slope: slope @ result, dl))
     return through(lambda slope: forward_quotient(lower, slope), change)

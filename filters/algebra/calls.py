@@ -46,7 +46,6 @@ def arguments_of(matrix: Matrix) -> tuple[Matrix, ...]:
 
 
 def _by_transpose(matrix: Matrix) -> bool:
-    """Whether a matrix is A B', for which functions do not form B'."""
     return matrix.operation is matrices.multiply and matrix.arguments[1].operation is matrices.transposed
 
 
@@ -238,7 +237,6 @@ class _Text:
         self.values: dict[Matrix, str] = {}
 
     def can(self, matrix: Matrix, loop: Collection[Matrix] = ()) -> bool:
-        """Whether all arguments of a matrix are evaluated, or are to be in a loop."""
         return matrix in self._known or all(a in self.values or a in loop for a in arguments_of(matrix))
 
     def is_of_each(self, matrix: Matrix) -> bool:
@@ -253,7 +251,6 @@ class _Text:
         return self._functions[matrix.operation] if matrix.operation in self._functions else function_of(matrix)
 
     def write(self, matrix: Matrix) -> None:
-        """Add the line that evaluates a matrix, or reads it."""
         value, values = f"v{len(self.values)}", self.values
         if matrix.operation is operations.present:  # functions look for NaN themselves
             values[matrix] = values[matrix.of[0]]
@@ -296,7 +293,6 @@ class _Text:
 
 
 def _read(position: Place, matrix: Matrix) -> str:
-    """Source of the matrix at a place: tuples of its numbers, or a view of the memory."""
     (array, first), shape = position, matrix.shape
     if matrix.member:
         if array == "table":
@@ -313,7 +309,6 @@ def _read(position: Place, matrix: Matrix) -> str:
 
 
 def _stored(position: Place, matrix: Matrix, value: str) -> list[str]:
-    """Lines that store a matrix, named `value`, at a place."""
     (array, first), shape = position, matrix.shape
     if array == "table":
         loops = [f"for i in range({prod(shape)}):", "    for j in range(table.shape[1]):"]

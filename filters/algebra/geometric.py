@@ -65,7 +65,6 @@ def rounds(size: int) -> int:
 
 
 def _unit(of):
-    """The number by which a matrix is divided to get determinant 1, from its factor."""
     return math.prod(of[1]) ** (1.0 / len(of[1]))
 
 

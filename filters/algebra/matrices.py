@@ -96,7 +96,7 @@ class Operation:
         """`operation` calls this, and so do the functions of a model."""
         self.compute, self.shape, self.symmetric, self.reduces = compute, shape, symmetric, reduces
         self.name, self.__doc__ = compute.__name__, compute.__doc__
-        self.slope: Callable = _no_rule
+        self.slope: Callable = self._no_rule
 
     def __call__(self, *arguments):
         """The result, or a Matrix that stands for it."""
@@ -109,14 +109,13 @@ class Operation:
             created[key] = Matrix(self, arguments, self.shape(*shapes), self.symmetric(*arguments), created)
         return created[key]
 
+    def _no_rule(self, *_) -> Matrix:
+        raise TypeError(f"there is no derivative of {self.name}")
+
     def derivative(self, rule: Callable) -> Callable:
         """Decorate rule(result, arguments, slopes), the slope of the result; None stands for a slope of zero."""
         self.slope = rule
         return rule
-
-
-def _no_rule(result: Matrix, arguments: Sequence, slopes: Sequence) -> Matrix:
-    raise TypeError(f"there is no derivative of {result}")
 
 
 def never(*arguments) -> bool:
@@ -152,10 +151,6 @@ def input_matrix(
 def same(shape, *shapes):
     """The shape of the first argument."""
     return shape
-
-
-def _product_shape(a: tuple, b: tuple) -> tuple:
-    return (*a[:-1], *b[1:])
 
 
 @operation(same, symmetric=lambda a, b: a.symmetric and b.symmetric)
@@ -212,7 +207,7 @@ def transposed(a):
     return a.T
 
 
-@operation(_product_shape)
+@operation(lambda a, b: (*a[:-1], *b[1:]))
 def multiply(a, b):
     """The product a b; its derivative is in `operations`, with that of quotients."""
     return a @ b
@@ -236,14 +231,8 @@ def through(operate: Callable, *arguments) -> Matrix | None:
     return None if any(a is None for a in arguments) else operate(*arguments)
 
 
-@add.derivative
-def _of_sum(result, arguments, slopes):
-    return plus(*slopes)
-
-
-@subtract.derivative
-def _of_difference(result, arguments, slopes):
-    return minus(*slopes)
+add.derivative(lambda result, arguments, slopes: plus(*slopes))
+subtract.derivative(lambda result, arguments, slopes: minus(*slopes))
 
 
 @scale.derivative
@@ -252,9 +241,7 @@ def _of_multiple(result, arguments, slopes):
     return plus(through(lambda slope: slope * factor, da), through(lambda slope: a * slope, df))
 
 
-@transposed.derivative
-def _of_transpose(result, arguments, slopes):
-    return through(lambda slope: slope.T, slopes[0])
+transposed.derivative(lambda result, arguments, slopes: through(lambda slope: slope.T, slopes[0]))
 
 
 def evaluate(wanted: Sequence[Matrix], known: dict[Matrix, Any]) -> list:

@@ -240,8 +240,7 @@ def _called_means(a, size):
 
 
 @not_inlined
-def _square(a, size):
-    out = arrays.square_of_rows(arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size))
+def _over_size(out, size):
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
             out[i, k] /= size - 1
@@ -249,13 +248,18 @@ def _square(a, size):
 
 
 @not_inlined
+def _square(a, size):
+    return _over_size(
+        arrays.square_of_rows(arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size)), size
+    )
+
+
+@not_inlined
 def _covariance(a, b, size):
     d = arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size)
-    out = arrays.product_of_rows(d, arrays.deviations(b, 0, b.shape[0], _called_means(b, size), size))
-    for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            out[i, k] /= size - 1
-    return out
+    return _over_size(
+        arrays.product_of_rows(d, arrays.deviations(b, 0, b.shape[0], _called_means(b, size), size)), size
+    )
 
 
 @not_inlined
@@ -293,11 +297,6 @@ def _weighted_sums(a, w, size):
         for j in range(size):
             out[i] += w[0, j] * a[i, j]
     return out
-
-
-def _weighted_mean(parameters: tuple, kinds: Kinds) -> Callable:
-    (shape, _), _ = kinds
-    return written_out("mean", "a, w, size", f"sums(a, w, size).reshape({shape})", sums=_weighted_sums)
 
 
 @not_inlined
@@ -362,7 +361,9 @@ _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
     matrices.multiply: _product,
     scalars.entries_product: lambda parameters, kinds: _by_entries(kinds, "{a0} * {a1}"),
     samples.total: lambda parameters, kinds: _called_total,
-    samples.weighted_mean: _weighted_mean,
+    samples.weighted_mean: lambda parameters, kinds: written_out(
+        "mean", "a, w, size", f"sums(a, w, size).reshape({kinds[0][0]})", sums=_weighted_sums
+    ),
     samples.largest: lambda parameters, kinds: _largest,
     samples.effective_size: lambda parameters, kinds: _effective_size,
     samples.spread_share: lambda parameters, kinds: _spread_share,
@@ -375,16 +376,8 @@ _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
     scatter: lambda parameters, kinds: _square,
 }
 SIZED = {  # operations whose functions take the number of members
-    *(
-        samples.total,
-        samples.weighted_mean,
-        samples.largest,
-        samples.effective_size,
-        samples.spread_share,
-        samples.weighted_square,
-    ),
-    *(mean, variances, cross_covariance, scatter),
-    *(centred, on_one_branch),
+    *(samples.total, samples.weighted_mean, samples.largest, samples.effective_size, samples.spread_share),
+    *(samples.weighted_square, mean, variances, cross_covariance, scatter, centred, on_one_branch),
 }
 
 

@@ -197,10 +197,10 @@ def of_constant(result, arguments, slopes):
     return None
 
 
-@only.derivative
-@uncorrelated.derivative
-def _of_masked(result, arguments, slopes):
-    return through(lambda slope: result.operation(arguments[0], slope), slopes[1])
+for _masking in (only, uncorrelated):
+    _masking.derivative(
+        lambda result, arguments, slopes: through(lambda slope: result.operation(arguments[0], slope), slopes[1])
+    )
 
 
 @factor.derivative

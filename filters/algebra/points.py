@@ -131,10 +131,7 @@ def on_one_side(y, angles):
 
 # Derivatives; slopes of None are zero
 
-
-@root.derivative
-def _of_root(result, arguments, slopes):
-    return through(lambda slope: root_slope(result, slope), slopes[0])
+root.derivative(lambda result, arguments, slopes: through(lambda slope: root_slope(result, slope), slopes[0]))
 
 
 @outer.derivative
@@ -145,10 +142,9 @@ def _of_outer(result, arguments, slopes):
     return plus(through(lambda slope: outer(slope, b), da), through(lambda slope: outer(a, slope), db))
 
 
-@square.derivative
-def _of_square(result, arguments, slopes):
-    return through(lambda slope: with_transposed(slope @ arguments[0].T), slopes[0])
-
+square.derivative(
+    lambda result, arguments, slopes: through(lambda slope: with_transposed(slope @ arguments[0].T), slopes[0])
+)
 
 units.derivative(of_constant)
 ones.derivative(of_constant)
@@ -191,20 +187,9 @@ def _units(result: tuple, x: tuple) -> Callable:
     return source.function(source.entries(result, entry))
 
 
-def _outer(result: tuple, a: tuple, b: tuple) -> Callable:
-    return entrywise("outer", "a, b", result, lambda i, j: f"a[{i}] * b[{j}]", a=a, b=b)
-
-
-def _columns(result: tuple, a: tuple) -> Callable:
-    return entrywise("without_first", "a", result, lambda i, j: f"a[{i}][{j + 1}]", a=a)
-
-
 def _on_one_side(result: tuple, angles: tuple[bool, ...], of: tuple) -> Callable:
-    turn, back, align = (
-        matrix_functions.transposer(*of),
-        matrix_functions.transposer(*of[::-1]),
-        row_brancher(of[1], angles),
-    )
+    turn, back = matrix_functions.transposer(*of), matrix_functions.transposer(*of[::-1])
+    align = row_brancher(of[1], angles)
     return written_out("on_one_side", "y", "back(align(turn(y)))", turn=turn, back=back, align=align)
 
 
@@ -223,10 +208,10 @@ FUNCTIONS: dict[Operation, Callable] = {
     root_slope: _root_slope,
     units: _units,
     ones: lambda result, of: entrywise("ones", "a", result, lambda i: "1.0"),
-    outer: _outer,
+    outer: lambda result, a, b: entrywise("outer", "a, b", result, lambda i, j: f"a[{i}] * b[{j}]", a=a, b=b),
     square: lambda result, of: matrix_functions.square(*of),
     first: lambda result, of: entrywise("first", "a", result, lambda i: f"a[{i}][0]", a=of),
-    without_first: _columns,
+    without_first: lambda result, a: entrywise("rest", "a", result, lambda i, j: f"a[{i}][{j + 1}]", a=a),
     on_one_side: _on_one_side,
     hats: _hats,
 }

@@ -107,9 +107,9 @@ def constant(value: float, like):
     return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else np.full(np.shape(like), value)[()]
 
 
-@reciprocal.derivative
-def _of_reciprocal(result, arguments, slopes):
-    return through(lambda slope: slope * result * result * -1.0, slopes[0])
+reciprocal.derivative(
+    lambda result, arguments, slopes: through(lambda slope: slope * result * result * -1.0, slopes[0])
+)
 
 
 @power.derivative
@@ -118,9 +118,7 @@ def _of_power(result, arguments, slopes):
     return through(lambda slope: slope * power(a, exponent - 1.0) * exponent, slopes[0])
 
 
-@logarithm.derivative
-def _of_logarithm(result, arguments, slopes):
-    return through(lambda slope: slope / arguments[0], slopes[0])
+logarithm.derivative(lambda result, arguments, slopes: through(lambda slope: slope / arguments[0], slopes[0]))
 
 
 @exponential.derivative
@@ -152,19 +150,9 @@ def _of_magnitude(result, arguments, slopes):
     return through(lambda slope: choose(exceeds(arguments[0], 0.0), slope, slope * -1.0), slopes[0])
 
 
-@diagonal.derivative
-def _of_diagonal(result, arguments, slopes):
-    return through(diagonal, slopes[0])
-
-
-@shifted.derivative
-def _of_shifted(result, arguments, slopes):
-    return slopes[0]
-
-
-@trace.derivative
-def _of_trace(result, arguments, slopes):
-    return through(trace, slopes[0])
+diagonal.derivative(lambda result, arguments, slopes: through(diagonal, slopes[0]))
+shifted.derivative(lambda result, arguments, slopes: slopes[0])
+trace.derivative(lambda result, arguments, slopes: through(trace, slopes[0]))
 
 
 @choose.derivative
@@ -174,13 +162,8 @@ def _of_choice(result, arguments, slopes):
     return choose(condition, *moves)
 
 
-@below.derivative
-@exceeds.derivative
-@is_number.derivative
-@count.derivative
-def _of_decision(result, arguments, slopes):
-    """The slope None of results that are constant but for jumps."""
-    return None
+for _jumps in (below, exceeds, is_number, count):
+    _jumps.derivative(lambda *_: None)
 
 
 def slopes_of(wanted: Sequence[Matrix], moves: Mapping[Matrix, Matrix]) -> list[Matrix | None]:

@@ -42,7 +42,7 @@ def weighted_factors(w, ud):
 
 
 def _orthogonal(w: np.ndarray, weights: list) -> np.ndarray:
-    n, rows = len(w), [row for row in np.array(w)]
+    n, rows = len(w), [*np.array(w)]
     ud = np.full((n, n), 0.0, dtype=w.dtype)
     for j in reversed(range(n)):
         weighted = rows[j] * np.array(weights)
@@ -139,12 +139,6 @@ def called_weighted_factors(w, ud):
 
 
 @not_inlined
-def called_factors(w):
-    """The factors of W W'."""
-    return called_weighted_factors(w, np.zeros((0, 0)))
-
-
-@not_inlined
 def measured(ud, h):
     """`measured_factors` and `measured_gain`."""
     (m, n), updated, k = h.shape, ud.copy(), np.zeros(len(ud))
@@ -176,14 +170,14 @@ def measured(ud, h):
     return updated, gain
 
 
-def _of_arrays(function: Callable, part: str = "") -> Callable:
+def _of_arrays(function: Callable, part: str = "", more: str = "") -> Callable:
     """Return `make(result, *shapes)`: a function of arrays as one of matrices, tuples or arrays by their sizes."""
 
     def make(result: tuple, *shapes: tuple) -> Callable:
         named = dict(zip("ab", shapes, strict=False))
         source = Source(function.__name__, ", ".join(named), result=result, work=LONGEST_TEXT + 1, **named)
         out = source.local("out", *result)
-        source.line(f"out = work({', '.join(source.array_of(name) for name in named)}){part}")
+        source.line(f"out = work({', '.join(source.array_of(name) for name in named)}{more}){part}")
         names: dict[str, Any] = {"work": function}
         return source.function(source.all_entries(out), **names)
 
@@ -193,7 +187,7 @@ def _of_arrays(function: Callable, part: str = "") -> Callable:
 FUNCTIONS: dict[Operation, Callable] = {
     unit_upper: _of_arrays(called_unit_upper),
     upper_root: _of_arrays(called_upper_root),
-    factors: _of_arrays(called_factors),
+    factors: _of_arrays(called_weighted_factors, more=", np.zeros((0, 0))"),
     weighted_factors: _of_arrays(called_weighted_factors),
     measured_factors: _of_arrays(measured, "[0]"),
     measured_gain: _of_arrays(measured, "[1]"),

@@ -207,7 +207,6 @@ def _tables(quantities: tuple[Quantity, ...]) -> str:
 
 
 def _array(name: str, texts: Iterable[str]) -> str:
-    """An array of texts, some to a line."""
     lines, line = list[str](), "   "
     for entry in texts:
         word = f' "{_text(entry)}",'
@@ -218,7 +217,6 @@ def _array(name: str, texts: Iterable[str]) -> str:
 
 
 def _text(text: str) -> str:
-    """Text within a string of C, in UTF-8."""
     return "".join(
         f"\\{byte:03o}" if byte < 32 or byte > 126 or chr(byte) in '"\\?' else chr(byte) for byte in text.encode()
     )

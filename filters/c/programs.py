@@ -197,7 +197,6 @@ def programs_of(filter_: Filter) -> FilterPrograms:
 
 
 def _row_programs(paged: FilterWithPage) -> FilterPrograms:
-    """The programs of a filter of mean and covariance."""
     model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
     shape = model.shape
     layout, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
@@ -226,7 +225,6 @@ def _row_programs(paged: FilterWithPage) -> FilterPrograms:
 
 
 def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
-    """The programs of an ensemble filter."""
     check_page_is_all(paged, "in C")
     model, page, numbers, size = paged.kernel_model, paged.written_page, paged.numbers, paged.size
     shape, memory = model.shape, MembersMemory(model.shape, page)
@@ -318,8 +316,6 @@ def _where(
 def _program(
     stage: Mapping[Place, Matrix], lies: Callable[[Place], Place], numbers: np.ndarray, graph: Graph
 ) -> Program:
-    """The program of a stage, of the numbers of a model and a filter as constants."""
-
     def number(source: Place, **of_member: bool):
         if source.array == "numbers":
             return graph.constant(numbers[source.at])
@@ -362,7 +358,6 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
 
 
 def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Means of a run, (K + 1, n), without restarts."""
     model, n, m = programs.model, programs.model.n, programs.model.m
     start, begin, advance, add_noise, update, _ = map(_compile_program, programs.all)
     names = {**work_names(), "float": _Single, "X": np.zeros(programs.predicted_size, np.float32)}

@@ -387,6 +387,5 @@ def write_project(
 
 
 def _board_section(name: str) -> str:
-    """The part of the README on the emulated controller."""
     build = BUILD.format(name=name, flags="-std=c99 -O2")
     return BOARD_README.format(build=build, emulate=EMULATE.format(name=name))

@@ -270,7 +270,6 @@ def _indented(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text for a comment."""
     return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("/*", "/ *")
 
 

@@ -240,7 +240,6 @@ def _lagged_sums(x: np.ndarray, lags: int) -> np.ndarray:
 
 
 def _all_pairs(mask: np.ndarray, lags: int) -> np.ndarray:
-    """Numbers of pairs at each lag if no value is missing."""
     runs, steps, m = mask.shape
     return np.broadcast_to(runs * (steps - np.arange(1.0, lags + 1.0))[:, None, None], (lags, m, m))
 

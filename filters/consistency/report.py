@@ -270,7 +270,6 @@ def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] 
 
 
 def _component_names(rule: str, names: Sequence[str] | None, count: int, kind: str) -> tuple[str, ...]:
-    """Names of `count` components, numbered if there are none; ValueError for another number of names."""
     names = tuple(names or (f"{kind} {i + 1}" for i in range(count)))
     if len(names) != count:
         raise ValueError(f"{rule} must be {count}, one a {kind}, but got {names!r}")
@@ -278,13 +277,11 @@ def _component_names(rule: str, names: Sequence[str] | None, count: int, kind: s
 
 
 def _deviations(covs: np.ndarray) -> np.ndarray:
-    """Standard deviations (B, T, d) of covariances (B, T, d, d); NaN where a variance is not positive."""
     variances = np.einsum("bkii->bki", covs)
     return np.sqrt(np.where(variances > 0, variances, np.nan))
 
 
 def _mean(values: np.ndarray, axes) -> np.ndarray:
-    """Mean of the entries that are not NaN; NaN where there is none."""
     counts = (~np.isnan(values)).sum(axis=axes)
     return np.where(counts > 0, np.nansum(values, axis=axes) / np.maximum(counts, 1), np.nan)
 

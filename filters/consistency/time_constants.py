@@ -328,7 +328,6 @@ def _steady(f: np.ndarray, h: np.ndarray, q: np.ndarray, factors: np.ndarray) ->
 
 
 def _composed(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """(A, C, J) of one part of a path followed by a second."""
     (a, c, j), (b, d, k) = first, second
     through = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, b.swapaxes(1, 2)).swapaxes(1, 2)  # B (I + C K)^-1
     inner = np.linalg.solve(np.eye(a.shape[-1]) + k @ c, k @ a)
@@ -357,14 +356,12 @@ def _growth(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _steps_of(growth: float) -> float:
-    """The time constant in steps of a growth factor."""
     if growth <= 0.0:
         return 0.0
     return -1.0 / math.log(growth) if growth < 1.0 - SETTLED else math.inf
 
 
 def _others(n: int, constants: Sequence[int]) -> np.ndarray:
-    """Indices of the states that are not constants."""
     return np.delete(np.arange(n), np.asarray(constants, dtype=int))
 
 

@@ -70,7 +70,6 @@ def sentences(report: ConsistencyReport) -> list[str]:
 
 
 def _state_sentences(report: ConsistencyReport) -> list[str]:
-    """Coverage, CRPS and ranks, state by state."""
     ensemble, n = report.ensemble, len(report.states)
     off = [-abs(part.value - 0.95) for part in report.coverage]
     worst = sorted(sorted(range(n), key=off.__getitem__)[:MOST_STATES])

@@ -215,7 +215,6 @@ class Session:
             raise ValueError(f"{name} needs a filter with one model, but got {self._name!r}")
 
     def _remember_noise(self) -> None:
-        """Keep the first numbers, which `clear` restores."""
         if self._noise_was is None:
             self._noise_was = self._numbers.copy()
 

@@ -178,7 +178,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def run_window(memory, source, numbers, size):
-        """Propagate the members from the start of the window to its end."""
         row, table, _ = memory
         copy_rows(table, source, 0, n)
         for k in range(int(row[steps])):
@@ -186,7 +185,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
 
     @inlined
     def drop(memory):
-        """Drop the first step of the window."""
         row, table, _ = memory
         copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
         for k in range((length - 1) * size_of_step):

@@ -84,7 +84,6 @@ class Checks:
         return self._covariance(name, array, where, leading) if is_cov else array
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
-        """The covariances (..., d, d), made exactly symmetric."""
         least, asymmetry = correlation_flaws(covs)
         wrong = (least < -ROUNDING) | (asymmetry > ROUNDING)
         covs = 0.5 * (covs + covs.swapaxes(-1, -2))

@@ -306,7 +306,6 @@ class MultipleModelFilter(Filter):
 
     @cached_property
     def _models(self) -> list[StateSpaceModel]:
-        """The models of the modes with all states."""
         every, moments = tuple(range(self.model.n)), self._moments
         return [
             mode if indices == every else embedded_model(mode, self.model, moments)

@@ -68,7 +68,6 @@ def horizon_kernels(
 
     @inlined
     def keep_sight(row, numbers, step):
-        """Store R and the constants at a measurement."""
         first = steps + step * end
         copy(row, first + step_layout.R, numbers, r_place, m * m)
         copy(row, first + step_layout.seen_by, numbers, constants_place, constants)
@@ -145,7 +144,6 @@ def horizon_kernels(
 
     @not_inlined
     def halve(row, numbers, count):
-        """Undo half of the last step."""
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
             step = row[steps + j * end : steps + (j + 2) * end]
@@ -185,7 +183,6 @@ def horizon_kernels(
 
     @inlined
     def add_step(row, numbers, count):
-        """Append a step, and drop the first if there are more than the horizon."""
         begin_step(row, numbers, count)
         if count == int(numbers[horizon_place]):
             leave_first(row, numbers, count + 1)

@@ -108,7 +108,6 @@ class _WithSlopes(torch.autograd.Function):
 
 @cache
 def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tuple[CompiledOrPython, ...]:
-    """Functions (x, u, numbers, values, jacobians) of batches, for f and h."""
     n, m, (f, by_f, h, by_h) = shape.n, shape.m, functions
     f_slopes = jacobian(f, by_f, n, n, "u, c", shape.state_angles)
     h_slopes = jacobian(h, by_h, m, n, "c", shape.measurement_angles)

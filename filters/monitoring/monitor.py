@@ -263,7 +263,6 @@ def monitor_for(measurements: np.ndarray, monitor: Monitor | None = None) -> Mon
 
 
 def _longest(flags: np.ndarray) -> int:
-    """The longest run of true ones."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 

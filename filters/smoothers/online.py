@@ -96,7 +96,6 @@ class WithSmoother:
         return np.repeat(self._filter.numbers[None], lag if isinstance(self._runs, Session) else 1, axis=0)
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means, covariances and numbers of restarts, with a row for each copy."""
         runs = self._runs
         if isinstance(runs, Session):
             return runs.mean[None], runs.cov[None], np.array([float(runs.divergences)])

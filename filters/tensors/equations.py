@@ -233,7 +233,6 @@ class Called:
         return value, torch.stack(columns, -1)
 
     def _entries(self, *arguments) -> list[Tensor | float]:
-        """The Jacobian's entries, by rows."""
         return [entry for row in self._jacobian(*arguments) for entry in row]  # type: ignore[misc]
 
     def _called(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> Tensor:
@@ -295,7 +294,6 @@ class Called:
 
 
 def _split(values: list, sizes: Sequence[int]) -> list:
-    """Values as the arguments of a function, of so many components, as a model's function takes them."""
     arguments, first = [], 0
     for size in sizes:
         part = values[first : first + size]

@@ -226,7 +226,6 @@ class TensorFilter:
             setattr(self, name, torch.as_tensor(getattr(self._model, name), dtype=dtype, device=device))
 
     def _make(self) -> None:
-        """Make the graphs of the page for the model."""
         paged = with_page(self.filter, "a filter on tensors")
         self._model, self._own = paged.kernel_model, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
@@ -390,7 +389,6 @@ class TensorFilter:
         return compiled_likelihood(self.filter, inputs, measurements, *noise)
 
     def _known(self) -> dict[Place, Tensor]:
-        """Tensors of the numbers that pages read."""
         self._check_what_follows()
         memory, like = self._stages.memory, self.prior_mean
         own_parameters = {

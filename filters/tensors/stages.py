@@ -72,7 +72,6 @@ def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
 
 
 def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
-    """The quotient C S^-1 by L L' = S."""
     right = c.mT if dimensions == 2 else c[..., None]
     solution = torch.cholesky_solve(right, root)
     return solution.mT if dimensions == 2 else solution[..., 0]
@@ -153,7 +152,6 @@ def _reciprocal(a: Tensor) -> Tensor:
 
 
 def _triangle(a: Tensor) -> Tensor:
-    """`blocks.triangle`, row by row."""
     rows, columns = list(a.unbind(-2)), []
     for i, row in enumerate(rows):
         square = (row * row).sum(-1, keepdim=True)
@@ -178,7 +176,6 @@ def _hats(u: Tensor, nodes: Tensor) -> Tensor:
 
 
 def _covariance(x: Tensor, y: Tensor) -> Tensor:
-    """The sample covariance of members, with the divisor N - 1."""
     return _deviations(x) @ _deviations(y).mT / (x.shape[-1] - 1)
 
 
@@ -195,7 +192,6 @@ def _stretches(before: Tensor, after: Tensor, part: Tensor) -> Tensor:
 
 
 def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
-    """`geometric.geometric_mean`."""
     if a.shape[-1] == 1:
         return (a * b).sqrt()
     of_a, of_b = _unit(factor(a)), _unit(factor(b))

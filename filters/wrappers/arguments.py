@@ -167,7 +167,6 @@ def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
 
 
 def _arguments_of(make: Callable) -> set[str]:
-    """Names of a function's arguments; none if it has no signature."""
     try:
         return set(inspect.signature(make).parameters)
     except (TypeError, ValueError):  # some are written in C

@@ -59,7 +59,6 @@ def make_vector_env(
 
 
 def _made(entry: Any, arguments: Mapping) -> Any:
-    """An env by what makes it, "module:class" or the class itself."""
     create = load_env_creator(entry) if isinstance(entry, str) else entry
     return create(**arguments)
 

@@ -44,7 +44,6 @@ def as_floats(value) -> np.ndarray:
 
 
 def _unmasked(value):
-    """A value without masks: masked entries become NaN."""
     if isinstance(value, np.ma.MaskedArray):
         if value.dtype.kind == "O":
             return value.filled(math.nan)

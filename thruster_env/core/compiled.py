@@ -156,14 +156,12 @@ def _elsewhere(function):
 
 
 def _locators() -> list:
-    """Numba's locators of cache folders, in its order."""
     from numba.core.caching import FunctionCache
 
     return list(FunctionCache._impl_class._locator_classes)
 
 
 def _cache_by(function, locators: list):
-    """The cache of a function in the first folder that accepts it."""
     from numba.core.caching import FunctionCache
 
     implementation = type("Placed", (FunctionCache._impl_class,), {"_locator_classes": locators})
@@ -171,7 +169,6 @@ def _cache_by(function, locators: list):
 
 
 def _in_folder(function, folder: str):
-    """The cache of a function below a folder."""
     import numba
     from numba.core.caching import FunctionCache
 
@@ -543,7 +540,6 @@ def _objects_called(function: Callable) -> list[str]:
 
 
 def _described(function: Callable) -> str:
-    """A function's name and module; of generated code its generator."""
     file = function.__code__.co_filename
     return file.strip("<>") if file.startswith("<") else f"{function.__name__} of {function.__module__}"
 

@@ -370,7 +370,6 @@ _names_of = functools.lru_cache(maxsize=4096)(names_read)
 
 
 def _content_of(value: Any) -> bytes:
-    """The bytes of numbers, or a hash of many."""
     if value.nbytes <= LARGEST:
         return value.tobytes()
     known = _hashes.get(id(value))

@@ -98,7 +98,6 @@ def _is_open_as(descriptor: int, status: os.stat_result) -> bool:
 
 
 def _target(path: Path) -> Path:
-    """The path behind all links; OSError where they lead in a circle."""
     return Path(os.path.realpath(path))
 
 
@@ -157,7 +156,6 @@ def _key(name: str) -> str:
 
 
 def _text(value) -> str:
-    """A value in TOML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(name)} = {_text(part)}" for name, part in value.items()) + "}"
     if isinstance(value, (list, tuple)):

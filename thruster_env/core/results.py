@@ -69,6 +69,5 @@ def _by_entries(count: int) -> Callable:
 
 
 def _by_rows(count: int) -> Callable:
-    """Fill row by row; each row may be a tuple or an array."""
     lines = (f"fill(out[{i}], value[{i}])" for i in range(count))
     return written_out("fill_rows", "out, value", *lines, "None", _loops=True, fill=fill)

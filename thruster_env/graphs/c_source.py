@@ -80,7 +80,6 @@ class _Writer:
         self._count = 0
 
     def named(self, number: Number) -> str:
-        """A new name for a number."""
         name = self.names[number.place] = f"{self._letter}{self._count}"
         self._count += 1
         return name
@@ -91,7 +90,6 @@ class _Writer:
         works: Iterable[Number],
         stores: Iterable[tuple[Place, Number]],
     ) -> None:
-        """Read numbers, work some out, and store some."""
         for source, number in reads:
             self.lines.append(f"const {self.kind} {self.named(number)} = {self._lies(source)};")
         for number in (number for number in works if number.place not in self.names):  # sums are known

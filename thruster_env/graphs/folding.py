@@ -99,7 +99,6 @@ def _may_have_no_value(a: Number) -> bool:
 
 
 def _is(a: Number, operation: str) -> bool:
-    """Whether an operation made a number that may be taken apart."""
     return a.operation == operation and a.place not in a.graph.whole
 
 

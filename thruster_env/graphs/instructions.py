@@ -214,7 +214,6 @@ class Writer:
 
 
 def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
-    """The external function of this name, with `count` arguments and a result of one type."""
     return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
 
 

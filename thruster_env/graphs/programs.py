@@ -169,7 +169,6 @@ _TEXTS: WeakValueDictionary[str, Text] = WeakValueDictionary()
 
 
 def _run(digest: str, width: int, *arrays) -> None:
-    """Run a program as Python."""
     kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS)}[len(arrays)]
     work = _TEXTS[digest].in_python(kind)
     if kind is OF_MEMBERS:

@@ -93,7 +93,6 @@ def _clipped(x, a_min=None, a_max=None, *, min=None, max=None):
 
 
 def _rounded(x, decimals=0):
-    """A number with some decimals, as NumPy rounds."""
     unit = 10.0 ** abs(decimals)
     if decimals > 0:
         return round(x * unit) / unit
@@ -192,7 +191,6 @@ def _norm(x, ord=None, axis=None, keepdims=False):
 
 
 def _condition(x):
-    """Whether a number is not zero."""
     return (x if x.is_condition else x != 0.0) if isinstance(x, Number) else bool(x)
 
 
@@ -314,7 +312,6 @@ BUILTINS = {
 
 
 def _replacement(module: types.ModuleType, name: str):
-    """The replacement for a function of `math` or NumPy in traced functions."""
     value, name = getattr(module, name), OTHER_NAMES.get(name, name)
     if value is np.linalg:
         return Module(np.linalg, _replacement)

@@ -160,7 +160,6 @@ def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
 
 
 def _example(wanted: str) -> str:
-    """An option that names a unit."""
     return f"--column NAME=HEADER[{wanted or 'UNIT'}]"
 
 
@@ -306,7 +305,6 @@ def _check_columns(
 
 
 def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
-    """Add the columns whose headers name a quantity."""
     used = {column.header for column in columns.values()}
     left = [header for header in headers if header not in used]
     bare = {header: parted(header) for header in left}

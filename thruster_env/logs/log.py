@@ -321,7 +321,6 @@ def shared_by(first: Sequence[Log], second: Sequence[Log]) -> tuple[Log, Log] | 
 
 
 def _measured_rows(log: Log) -> np.ndarray:
-    """Inputs and measurements of the rows in which something is measured."""
     measured = ~np.isnan(log.measurements[:-1]).all(axis=1)
     return np.column_stack((log.inputs, log.measurements[:-1]))[measured] + 0.0
 

@@ -294,7 +294,6 @@ def table_of(columns: Any, name: str) -> Table:
 
 
 def _unmasked(values: Any) -> np.ndarray:
-    """Values of a column as an array; what a masked array masks is missing."""
     return as_floats(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
 
 

@@ -84,7 +84,6 @@ def write_columns(
 
 
 def _content(suffix: str, columns: dict[str, Any], digits: str | None) -> bytes:
-    """A file's bytes."""
     stream = io.BytesIO()
     if suffix == ".csv":
         text = io.StringIO()

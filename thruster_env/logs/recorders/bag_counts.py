@@ -207,7 +207,6 @@ def _of_ros1(file: BinaryIO, path: Path) -> dict[str, Counts]:
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
-    """The fields of a record's header."""
     fields, offset = {}, 0
     while offset < len(header):
         (count,) = struct.unpack_from("<I", header, offset)
@@ -335,7 +334,6 @@ def unpacker(kind: str, path: Path) -> Any:
 
 
 def _unpacked(files: tuple[Path, ...], folder: Path, path: Path, kind: str) -> tuple[Path, ...]:
-    """Unpack files into a folder; Refused if they have more than MOST_BYTES in all."""
     zstd, total, unpacked = unpacker(kind, path), 0, []
     for file in files:
         unpacked.append(folder / file.stem)

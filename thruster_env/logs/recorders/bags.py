@@ -251,7 +251,6 @@ class Samples:
 
 
 def _stamp(message: Any) -> int:
-    """The stamp of a message's header [ns]."""
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 

@@ -236,7 +236,6 @@ class Dataset:
         return numbers[0] if numbers else None
 
     def _numbers_of(self, name: str) -> list[float | int]:
-        """The numbers of an attribute, empty for none."""
         value = self.attributes.get(name, [])
         numbers = value if isinstance(value, list) else [value]
         if not all(isinstance(number, int | float) for number in numbers):

@@ -167,7 +167,6 @@ def _unit(name: str, samples: Samples) -> str | None:
 
 
 def _times(samples: Samples) -> np.ndarray:
-    """Times of samples, empty if there are none."""
     return np.empty(0) if samples.times is None else samples.times
 
 
@@ -198,7 +197,6 @@ def _plain(fields: Mapping[str, Samples], path: Path) -> Table:
 
 
 def _damage(fields: Mapping[str, Samples]) -> tuple[str, ...]:
-    """Descriptions of the damage in the files of fields, without repetition."""
     return tuple(dict.fromkeys(samples.damage for samples in fields.values() if samples.damage))
 
 

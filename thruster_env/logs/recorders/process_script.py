@@ -143,7 +143,6 @@ def _why_not_whole(dataset: Any, most_bytes: int) -> str:
 
 
 def _address(node: Any) -> int:
-    """The address of an object in its file."""
     import h5py
 
     return h5py.h5o.get_info(node.id).addr
@@ -176,7 +175,6 @@ def _described(dataset: Any, field: str | None) -> dict[str, Any]:
 
 
 def _is_some(value: Any) -> bool:
-    """Whether an attribute has a value."""
     import h5py
 
     return not isinstance(value, h5py.Empty)

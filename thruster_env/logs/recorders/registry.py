@@ -212,7 +212,6 @@ def read(path: str | Path, names: Collection[str] | None) -> dict[str, Samples]:
 
 
 def _samples(topic: Topic) -> Iterator[tuple[str, Samples]]:
-    """Column and samples of each field of a topic."""
     for name, values in topic.values.items():
         unit = topic.units.get(name, "")
         yield topic.column(name), Samples(topic.times, values, unit, topic.damage, *topic[6:])
