@@ -1,6 +1,6 @@
 """What the first use of each filter costs on each model of the vehicle, in processor time and memory.
 
-`python -m benchmarks.first_use` prints a table in Markdown, that of docs/size.md. Every filter is measured in a
+`python -m benchmarks.first_use` prints a table in Markdown. Every filter is measured in a
 process of its own with an empty cache. A model's name and names of
 filters as arguments are measured in this process.
 """
