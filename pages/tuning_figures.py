@@ -105,7 +105,8 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
             ratios.append(f"{result.choice.numbers['ensemble_size']}" if result.sizes else "")
             nees = comparison.tuned.nees.value
             honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{comparison.tuned.nis.value:.2f}"
-            price = f"{100 * (result.best_value / result.free_value - 1):.1f} %"
+            met = result.validation  # whose price decides between a mean NIS in its band and the log score
+            price = "" if met is None or met.price is None else f"{100 * met.price:.1f} %"
             rows.append([f"`{name}`" if kind == FILTERS[0] else "", f"`{kind}`", *ratios, *honesty, price])
     return markdown_table(COLUMNS, rows)
 

@@ -481,6 +481,11 @@ def test_a_log_that_is_none_is_refused_with_the_line(tmp_path):
             "line 1: the unit of column u_uA must be one that this program converts, but got 'uA'" + WAY,
         ),
         (
+            ["U_parsec", "z"],
+            "U_parsec,z\n",
+            "line 1: the unit of column U_parsec must be one that this program converts, but got 'parsec'" + WAY,
+        ),
+        (
             ["u", "z[kg]"],
             "u,z\n",
             "line 1: the unit of column z must be one that this program converts, but got 'kg'" + WAY,

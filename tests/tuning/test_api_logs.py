@@ -128,3 +128,38 @@ def test_errors_state_the_rule_and_the_value(call, said, recorded):
 def test_a_file_of_what_was_identified_ends_in_toml(found, tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.toml, but got 'x\.json'"):
         found.save("x.json")
+
+
+LAG = """from filters import affine_model
+def model(dt, decay=0.9):
+    return affine_model(
+        a=[[decay]], b=[[0.1]], c=[[1.0]], process_noise_cov=[0.01], measurement_noise_cov=[0.04],
+        prior_mean=[0.0], prior_cov=[1.0], states=["level"], input_quantities=[("flow", "u", "")],
+        measurements=[("level", "z", "")],
+    )
+"""
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_model_of_a_tuned_file_s_logs_may_be_given_as_an_object(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lag_of_a_user.py").write_text(LAG)
+    draws = np.random.default_rng(0)
+    level, rows = 0.0, ["t,u,z"]
+    for k in range(400):
+        u = np.sign(np.sin(0.1 * k))
+        rows.append(f"{0.1 * k:.1f},{u},{level + 0.2 * draws.normal():.6f}")
+        level = 0.9 * level + 0.1 * u + 0.1 * draws.normal()
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    study = tuning.tune(("lag_of_a_user:model", "run.csv"), "kf", trials=1, progress=False)
+    file = study.save("tuned.json")
+    from lag_of_a_user import model
+
+    with pytest.raises(ValueError, match="must be given by its name if it is code, but tuned.json names"):
+        tuning.evaluate(file, progress=False)
+    by_object, by_name = (tuning.evaluate(file, model=given) for given in (model, "lag_of_a_user:model"))
+    assert by_object.evaluation.log_likelihood == by_name.evaluation.log_likelihood
+    assert by_object.evaluation.log_likelihood == study.held_out.evaluation.log_likelihood
+    with pytest.raises(ValueError, match="must be the one it was tuned on"):
+        tuning.evaluate(file, model=lambda dt: model(dt, 0.5))

@@ -14,7 +14,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.cli.tuning_report import as_json, report, way_out
-from tuning.evaluation.baselines import rule_of_thumb
+from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence, warnings_of
@@ -22,11 +22,15 @@ from tuning.problems.augmented import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.runs_problem import log_of
+from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
 from tuning.search.forgetting import forgetting, time_constants_on, with_oracle_and_advice
+from tuning.search.measures import measured, over
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, untuned_choice
+from tuning.search.study import open_study, run_study
+from tuning.search.validation import as_data as as_data_of_choice
 from tuning.search.validation import choice_from
 
 DT, STEPS, FORGET = 0.05, 200, 0.5
@@ -206,6 +210,25 @@ def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, 
     )
     assert _plan(plan.identity, "x", lambda name: problem).forget == FORGET
     assert choice_from(awake.tuning.result.choice._asdict()) == awake.choice
+
+
+def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_out():
+    with interpreted():
+        problem = spring(lambda x, c: (x[0] ** 2,))
+        plan = Plan("ekf", (problem,), full_q=True, forget=0.1)
+        result = run_study(open_study("forgets", plan), plan, 3)
+        met, data = result.validation, plan.validation_data()
+        chosen, baseline = met.named(met.chosen), met.named(met.baseline)
+        assert chosen.choice == result.choice
+        exact = {entry.name: measured(entry.choice, plan, data) for entry in (chosen, baseline)}
+        for entry in (chosen, baseline):
+            assert DT * time_constants_on(entry.choice.filter(problem), problem).steps[0] <= 0.1
+            assert entry.value == exact[entry.name].value
+        assert chosen.over == over(exact[chosen.name], exact[baseline.name], ratio=True)
+        assert baseline.raised and not same_filter(baseline.choice, baselines("ekf", problem)[baseline.name])
+    said = " ".join(choice_sentences(as_data_of_choice(met), plan))
+    names = " and ".join(dict.fromkeys((baseline.name, chosen.name)))
+    assert f"Here the {names} have a larger Q, to forget within 0.1 s (--forget); those of the tables may " in said
 
 
 @pytest.mark.parametrize("options", ({"way": "likelihood"}, {"method": "gradient"}, {"way": "noise-estimation"}))

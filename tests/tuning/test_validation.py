@@ -296,6 +296,20 @@ def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
     assert choice_sentences(None, plan) == []
 
 
+def test_a_choice_outside_the_nis_band_is_in_the_headline_whatever_chose_it():
+    plan, baseline = Plan("kf", (LinearProblem(),)), _met(GIVEN, 1.0, 1.0, 1.0, True)
+    rescaled = _met("trial 3 rescaled", 0.5, 0.4, 0.6, False)._replace(nis=0.09)
+    met = Validation((7, 8), True, (baseline, rescaled), GIVEN, "trial 3 rescaled", "trial 3 rescaled", 0.0)
+    _, said = choice_sentences(as_data(met), plan)
+    assert said == (
+        "On 2 validation seeds the mean NIS of trial 3 rescaled is 0.18, outside its band, 1.6 to 2.5, where 2 is "
+        "right: do not rely on its innovation covariance."
+    )
+    inside = met._replace(met=(baseline, rescaled._replace(consistent=True)))
+    assert len(choice_sentences(as_data(inside), plan)) == 1
+    assert len(choice_sentences(as_data(met), plan._replace(consistent=False))) == 1
+
+
 def of_one_number(q=1.0):
     """A model whose Q is q times the unit matrix."""
     return pair().model(process_noise_cov=[q] * 3)

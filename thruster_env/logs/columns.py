@@ -24,6 +24,11 @@ WORDS = (
     *("m", "mm", "cm", "km", "s", "ms", "us", "ns", "min", "h", "sec", "minutes", "hours", "days"),
     *("uV", "nV", "uA", "nA", "mW", "MW", "MHz", "uN", "MN", "mNm", "kNm", "mPa", "hPa", "MPa", "mbar", "mK"),
     *("um", "nm", "urad", "mg", "ug"),
+    # Units that pint converts, or nobody: a header that ends with one is never read as another unit.
+    *("inch", "inches", "ft", "feet", "yd", "yard", "mile", "miles", "nmi", "fathom", "parsec", "lightyear"),
+    *("knot", "knots", "mph", "kph", "kmh", "kWh", "Wh", "kJ", "MJ", "cal", "kcal", "eV", "Ah", "mAh", "ohm"),
+    *("kohm", "Mohm", "uF", "nF", "pF", "mH", "uH", "mT", "uT", "gauss", "lb", "lbs", "oz", "slug", "tonne"),
+    *("psi", "ksi", "torr", "mmHg", "atm", "mol", "arcmin", "arcsec", "dB", "dBm", "liter", "litre", "gallon"),
 )
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K")

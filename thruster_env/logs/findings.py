@@ -14,7 +14,11 @@ OFTENER times as often as the value next to it.
 Outliers. A sample above both of its neighbours, or below both, by more than SPIKE standard deviations of the noise
 (estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours from
 each other and from those beyond: a jump or a peak of the signal is not an outlier. A normal one is one in 10^8.
-Outliers side by side hide each other, so their number is a lower bound.
+
+Bursts of outliers. BURST samples or more, none further than APART samples from the next, that are each above both of
+their neighbours, or below both, by more than SPIKE standard deviations of the noise, while no input changes beside
+them: a stretch of garbage, such as a loose plug. It is at most a tenth of the channel, and the AROUND samples
+before and after it are calm, so that a sensor or a plant that shakes more for long is none.
 """
 
 from __future__ import annotations
@@ -44,6 +48,9 @@ OFTENER = 4.0
 SPIKE, ALONE = 7.0, 2.0
 AROUND = 25  # samples before and after, whose differences tell the noise, too
 NORMAL = 1.4826  # standard deviation over the median of magnitudes
+BURST, APART = 4, 5  # samples of a burst, at least, and the distance of two of them, at most
+LONGEST = 0.1  # share of a channel's samples that a burst may have
+BESIDE = 0.1  # of an input's range: a larger change explains a peak of the sensor
 LISTED = 3  # findings of one kind and channel that are said one by one
 
 
@@ -189,7 +196,12 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
         low, high = int(rows[first]), int(rows[first + count - 1])
         text = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
         findings.append(Finding(STUCK, channel, low, high, count, text))
-    spikes = _spikes(rows, values, quantity.angle)
+    bursts = _bursts(log, rows, values, quantity.angle)
+    for begin, end in bursts:
+        first, last = int(rows[begin]), int(rows[end])
+        text = f"{_name(channel)} has a burst of outliers, {end - begin + 1} samples{_where(log, first, last)}"
+        findings.append(Finding(OUTLIER, channel, first, last, end - begin + 1, text))
+    spikes = _alone(_spikes(rows, values, quantity.angle), bursts)
     if len(spikes):
         first, last = int(rows[spikes[0]]), int(rows[spikes[-1]])
         spike_count = "1 isolated outlier" if len(spikes) == 1 else f"{len(spikes)} isolated outliers"
@@ -199,11 +211,16 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
 
 
 def outliers(log: Log, channel: str) -> np.ndarray:
-    """Rows of the outliers of a measured channel."""
+    """Rows of the outliers of a measured channel, isolated ones and those in bursts."""
     column = [f"measurement:{quantity.symbol}" for quantity in log.measured].index(channel)
     values = log.measurements[:, column]
     rows = np.flatnonzero(~np.isnan(values))
-    return rows[_spikes(rows, values[rows], log.measured[column].angle)]
+    if len(rows) < SHORTEST:
+        return rows[:0]
+    values, angle = values[rows], log.measured[column].angle
+    bursts = _bursts(log, rows, values, angle)
+    indices = [np.arange(begin, end + 1) for begin, end in bursts]
+    return rows[np.sort(np.concatenate([*indices, _alone(_spikes(rows, values, angle), bursts)]).astype(int))]
 
 
 def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
@@ -268,15 +285,63 @@ def _saturated(
     return findings, ends
 
 
-def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
-    """Indices of samples that stand out from both neighbours."""
+def _alone(spikes: np.ndarray, bursts: list[tuple[int, int]]) -> np.ndarray:
+    """The spikes that are in no burst."""
+    inside = [(spikes >= begin) & (spikes <= end) for begin, end in bursts]
+    return spikes[~np.any(inside, axis=0)] if inside else spikes
+
+
+def _steps_and_noise(values: np.ndarray, angle: bool) -> tuple[np.ndarray, float]:
+    """Steps of samples (N - 1,), and the standard deviation of their noise; infinite where hardly any moves."""
     steps = difference(values[1:, None], values[:-1, None], (angle,))[:, 0]
     sizes = abs(steps[steps != 0])
     if len(sizes) < SHORTEST:
+        return steps, np.inf
+    return steps, max(NORMAL * float(np.median(abs(steps))), float(np.median(sizes))) / np.sqrt(2.0)
+
+
+def _heights(steps: np.ndarray) -> np.ndarray:
+    """How far each sample but the first and last is above both neighbours, or below both; 0 if it is between."""
+    before, after = steps[:-1], -steps[1:]
+    return np.where(before * after > 0, np.minimum(abs(before), abs(after)), 0.0)
+
+
+def _bursts(log: Log, rows: np.ndarray, values: np.ndarray, angle: bool) -> list[tuple[int, int]]:
+    """The first and last index of each burst of outliers among the samples of a channel."""
+    steps, noise = _steps_and_noise(values, angle)
+    high = np.flatnonzero((_heights(steps) > SPIKE * noise) & ~_explained(log, rows)) + 1
+    bursts = []
+    for group in np.split(high, np.flatnonzero(np.diff(high) > APART) + 1):
+        if len(group) < BURST or len(group) > LONGEST * len(values):
+            continue
+        begin, end = int(group[0]), int(group[-1])
+        beside = [abs(steps[max(begin - 1 - AROUND, 0) : begin - 1]), abs(steps[end + 1 : end + 1 + AROUND])]
+        calm = [NORMAL * np.median(part) / np.sqrt(2.0) for part in beside if len(part)]
+        if end - begin < LONGEST * len(values) and all(
+            abs(steps[begin - 1 : end + 1]).mean() > SPIKE * part for part in calm
+        ):
+            bursts.append((begin, end))
+    return bursts
+
+
+def _explained(log: Log, rows: np.ndarray) -> np.ndarray:
+    """Whether an input changes much beside each sample but the first and last, (N - 2,)."""
+    inputs = log.inputs
+    if len(inputs) < 2 or not inputs.shape[1]:
+        return np.zeros(len(rows) - 2, dtype=bool)
+    spread = np.ptp(inputs, axis=0)
+    changes = (abs(np.diff(inputs, axis=0)) > BESIDE * spread).any(axis=1) & bool((spread > 0).any())
+    counts = np.append(0, np.cumsum(changes))  # changes before the input of each row
+    first, last = (np.clip(part - 1, 0, len(counts) - 1) for part in (rows[:-2] - 1, rows[2:]))
+    return counts[last] > counts[first]
+
+
+def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
+    """Indices of samples that stand out from both neighbours."""
+    steps, noise = _steps_and_noise(values, angle)
+    if not np.isfinite(noise):
         return np.empty(0, int)
-    noise = max(NORMAL * float(np.median(abs(steps))), float(np.median(sizes))) / np.sqrt(2.0)
-    before, after = steps[:-1], -steps[1:]  # of a sample, above its neighbours
-    height = np.where(before * after > 0, np.minimum(abs(before), abs(after)), 0.0)
+    height = _heights(steps)
     neighbouring = np.maximum(np.append(0.0, abs(steps[:-2])), np.append(abs(steps[2:]), 0.0))
     across = abs(steps[:-1] + steps[1:])
     apart = np.diff(rows)

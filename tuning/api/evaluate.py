@@ -26,7 +26,7 @@ def evaluate(
     seeds: int = HELD_OUT_SEEDS,
     seed: int = 0,
     preset: str | Path | None = None,
-    model: str | None = None,
+    model: Any = None,
     progress: bool | None = None,
 ) -> HeldOut:
     """Run a filter and its baselines on held-out seeds of a problem.
@@ -45,7 +45,7 @@ def evaluate(
         seeds: number of held-out seeds, for problems that can generate any number.
         seed: of the study to which they belong.
         preset: the problem of another thruster, by name or file; of a tuned file alone its own preset.
-        model: "module:object" for the logs of a tuned file, if their model is code.
+        model: of the logs of a tuned file, if it is code: a model, what makes or offers one, or "module:object".
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:

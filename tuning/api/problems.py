@@ -67,7 +67,7 @@ def problems_of(argument: Any, preset: str | Path | None = None, **of_logs: Any)
 def given_for(
     file: str | Path,
     problem: Any = None,
-    model: str | None = None,
+    model: Any = None,
     preset: str | Path | None = None,
 ) -> list[Problem]:
     """The problems of a tuned file: those given by the user, and logs that the file names.

@@ -32,7 +32,7 @@ def report(
     *,
     storage: str | Path = STUDIES,
     problem: Any = None,
-    model: str | None = None,
+    model: Any = None,
     preset: str | Path | None = None,
     progress: bool | None = None,
 ) -> Path:
@@ -49,7 +49,7 @@ def report(
         out: the page, a .html file, or a folder for it; by default beside the tuned file, or in the folder out.
         storage: storage of the study; without it the page on a file omits the search.
         problem: the problem it was tuned on, if that is code or has changed: a file only names it.
-        model: "module:object" for the logs of a tuned file, if their model is code.
+        model: of the logs of a tuned file, if it is code: a model, what makes or offers one, or "module:object".
         preset: the preset with which a tuned file was made, such as the new path of its FILE.toml.
         progress: whether to show progress; by default only in terminals and notebooks.
 
@@ -86,7 +86,7 @@ def report(
         return page
 
 
-def _given(source: str | Path, problem: Any, model: str | None, preset: str | Path | None) -> Sequence[Problem]:
+def _given(source: str | Path, problem: Any, model: Any, preset: str | Path | None) -> Sequence[Problem]:
     """What the user gives of the problems that a file or a study names."""
     if not isinstance(source, str | Path):
         raise ValueError(

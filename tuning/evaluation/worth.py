@@ -11,7 +11,7 @@ from math import inf, isfinite, isnan
 from filters.consistency.intervals import Interval, slightly, span
 from filters.consistency.time_constants import TimeConstants
 from filters.consistency.verdicts import rounded
-from tuning.evaluation.baselines import GIVEN, NO_RANGES, ORACLE, RULE, SCALED, called
+from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
@@ -20,7 +20,7 @@ from tuning.search.forgetting import TOLERANCE
 ALIKE = 1.5  # ratio to the oracle's time constant up to which a filter is as slow as the oracle
 LARGEST_RATIO = 10.0  # of scores, up or down, that sentences give in percent
 MOST_TIMES = 4  # time constants in a sentence
-HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
+HEADLINE = (GIVEN, SCALED, RULE, NOISE)  # baselines that a headline names, in this order: all but the oracle
 
 
 def without_truth(name: str) -> str:
@@ -32,7 +32,7 @@ def without_truth(name: str) -> str:
 
 
 def tuning_effect(comparison: Comparison, what: str = "the score") -> str:
-    """The effect of tuning on `what`: against the scaled default, if there is one, and the rule of thumb.
+    """The effect of tuning on `what` against each baseline but the oracle.
 
     Without truth it is the effect on the log-likelihood of a run's innovations.
     """

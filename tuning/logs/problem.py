@@ -140,10 +140,11 @@ def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[
     return {"options": {**set_options, **cuts}}
 
 
-def problems_in(file: Path, model: str | None = None, preset: str | Path | None = None) -> list[Problem]:
+def problems_in(file: Path, model: Any = None, preset: str | Path | None = None) -> list[Problem]:
     """The problems of logs that a tuned file names, read again; empty if it names none.
 
-    A model that is code is not imported because a file names it: the caller has to give it again.
+    A model that is code is not imported because a file names it: the caller has to give it again, as
+    "module:object" or as a model, or what makes or offers one.
 
     Args:
         file: the tuned file.
@@ -177,6 +178,7 @@ def problems_in(file: Path, model: str | None = None, preset: str | Path | None 
         check_preset_file(options, preset, file)
         _check_logs_are_there(paths, file)
         options |= {} if preset is None else {"preset": str(preset)}
+        options |= {} if model is None else {"model": model}
         problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
             rule = f"logs in a tuned file must be those of {short_repr(name)}"

@@ -140,17 +140,16 @@ def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, An
     return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
 
 
-def check_model(named, trusted: str | None, file: str | Path) -> None:
-    """Raise ValueError unless the caller gives exactly the code that a file names."""
+def check_model(named, trusted: Any, file: str | Path) -> None:
+    """Raise ValueError unless the caller gives the code that a file names, by this name or as an object."""
     if named is None and trusted is not None:
         raise ValueError(
             f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(trusted)}"
         )
-    if named != trusted:
-        value = trusted if trusted is None or isinstance(trusted, str) else type(trusted)
+    if named != trusted and isinstance(trusted, str | None):
         raise ValueError(
             f"the model of logs must be given by its name if it is code, but {file} names {short_repr(named)} and "
-            f"got {short_repr(value)}: use --model {named} (model={named!r} in Python), if you trust it"
+            f"got {short_repr(trusted)}: use --model {named} (model={named!r} in Python), if you trust it"
         )
 
 

@@ -78,7 +78,7 @@ def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[st
         ]
     else:
         sentences = [f"The study returns {the}: on {where} its {what} is {_over(over, likely, best)}."]
-    sentences += _sizes_sentence(met, chosen)
+    sentences += [*_raised_sentence(met, baseline, chosen, plan), *_sizes_sentence(met, chosen)]
     if candidate != chosen and chosen in FULL_NOISE:
         sentences.append(
             f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {the} are "
@@ -89,9 +89,23 @@ def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[st
         sentences.append(_failures_sentence(validation, plan.scenarios[0].seed_word, channels))
     if validation["price"] is not None and validation["price"] > MOST_PRICE:
         sentences.append(_price_sentence(validation, met[candidate], what, channels))
+    elif plan.is_constrained and not met[chosen]["consistent"]:
+        sentences.append(_outside_sentence(met[chosen], where, channels))
     if validation.get("full"):
         sentences.append(_full_sentence(validation["full"], what, where, likely))
     return sentences
+
+
+def _raised_sentence(met: Mapping[str, Mapping], baseline: str, chosen: str, plan: Any) -> list[str]:
+    """That baselines which the sentence above names have a larger Q than in tables, in a list; empty otherwise."""
+    raised = [called(name) for name in dict.fromkeys((baseline, chosen)) if met[name].get("raised")]
+    if not raised:
+        return []
+    have, those = ("has", "that") if len(raised) == 1 else ("have", "those")
+    return [
+        f"Here the {_listed(raised)} {have} a larger Q, to forget within {plan.forget:g} s (--forget); {those} of "
+        "the tables may remember longer."
+    ]
 
 
 def _full_sentence(full: Mapping[str, Any], what: str, where: str, likely: bool) -> str:
@@ -190,6 +204,15 @@ def _price_sentence(validation: Mapping, chosen: Mapping, what: str, channels: i
         f"{100 * MOST_PRICE:g} % allowed: {best['name']}, the best in the band, {has[0]}. Of the trials within "
         f"{100 * MOST_PRICE:g} % of the best, {chosen['name']} has the best log score; it {has[1]}, where "
         f"{channels} is right."
+    )
+
+
+def _outside_sentence(chosen: Mapping, where: str, channels: int) -> str:
+    """That the mean NIS of the choice is outside its band."""
+    low, high = (channels * end for end in NIS_BAND)
+    return (
+        f"On {where} the mean NIS of {_the(chosen['name'])} is {rounded(channels * chosen['nis'])}, outside its "
+        f"band, {low:g} to {high:g}, where {channels} is right: do not rely on its innovation covariance."
     )
 
 

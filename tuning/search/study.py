@@ -211,7 +211,6 @@ def run_study(
         if plan.forget is not None:
             value = measured(choice, plan, data).value
     else:
-        validation = _forgetting(validation, plan)
         choice = validation.named(validation.chosen).choice
         value = measured(choice, plan, data).value
         study.set_user_attr(CHOSEN, {"trials": len(present), **(as_data(validation) or {})})
@@ -243,7 +242,6 @@ def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> S
     if validation is None:
         choice = plan.forgetting(choice, exact=True)
     else:
-        validation = _forgetting(validation, plan)
         choice = validation.named(validation.chosen).choice
     return result._replace(
         choice=choice,
@@ -256,13 +254,6 @@ def answered_by(result: StudyResult, plan: Plan, name: str, choice: Choice) -> S
         sizes=[],
         sized=None,
     )
-
-
-def _forgetting(validation: Validation, plan: Plan) -> Validation:
-    """A validation whose chosen filter has a Q by which its own gain forgets in time."""
-    chosen = validation.named(validation.chosen)
-    raised = chosen._replace(choice=plan.forgetting(chosen.choice, exact=True))
-    return validation._replace(met=tuple(raised if met is chosen else met for met in validation.met))
 
 
 def _begun(study: optuna.Study) -> list[FrozenTrial]:

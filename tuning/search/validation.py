@@ -70,6 +70,7 @@ class Met(NamedTuple):
     state_nees: float = nan  # mean e_i^2 / P_ii of the scored state where it is farthest from 1
     chance: float = 1.0  # p-value of signed ranks: that it is no better than the best baseline in most runs
     worse_in: tuple[str, ...] = ()  # logs in which it is worse than that by more than a standard error
+    raised: bool = False  # whether it is a baseline whose Q was raised for it to forget in time
 
 
 class Failure(NamedTuple):
@@ -156,9 +157,10 @@ def validate(
     if not is_validated(plan) or not finalists:
         return None
     first = next(iter(finalists.values()))
-    before = _baselines_of(plan, first, training)
-    if not before:  # all are over the budget
+    baselines = _baselines_of(plan, first, training)
+    if not baselines:  # all are over the budget
         return None
+    before = {name: plan.forgetting(choice) for name, choice in baselines.items()}
     finalists = {
         name: choice
         for name, choice in finalists.items()
@@ -169,26 +171,52 @@ def validate(
     everyone, data = {**before, **finalists}, plan.validation_data()
     results = {name: measured(choice, plan, data) for name, choice in everyone.items()}
     has_own_seeds = not set(data[0].seeds) & set(training[0].seeds)
-    unfitted = {name: choice for name, choice in before.items() if name in (GIVEN, RULE, SCALED)}
     on_training = {}
-    if GIVEN in unfitted and len(unfitted) > 1 and has_own_seeds:
-        on_training = {name: measured(choice, plan, training) for name, choice in unfitted.items()}
-    choosing = Choosing(
-        plan, {name: results[name] for name in before}, {name: results[name] for name in finalists}, on_training
-    )
-    candidate = next(filter(choosing.wins, choosing.order()), choosing.best)
-    wins = bool(candidate) and choosing.wins(candidate)
+    if GIVEN in before and has_own_seeds:
+        unfitted = [name for name in (GIVEN, RULE, SCALED) if name in before]
+        on_training = {name: measured(before[name], plan, training) for name in unfitted if len(unfitted) > 1}
+    raised = {name for name, choice in before.items() if not same_filter(choice, baselines[name])}
+    exact: set[str] = set()
+    while True:  # until those that the choice is about forget in time by their own gain
+        sides = [{name: results[name] for name in side} for side in (before, finalists)]
+        validation = _chosen(plan, everyone, *sides, on_training, data[0].seeds, has_own_seeds)
+        rest = {validation.chosen, validation.baseline, validation.candidate} - exact
+        if plan.forget is None or not rest:
+            break
+        for name in rest:
+            forgets = plan.forgetting(everyone[name], exact=True)
+            if not same_filter(forgets, everyone[name]):
+                everyone[name], results[name] = forgets, measured(forgets, plan, data)
+                if name in before:
+                    raised.add(name)
+                if name in on_training:
+                    on_training[name] = measured(forgets, plan, training)
+        exact |= rest
+    validation = validation._replace(met=tuple(met._replace(raised=met.name in raised) for met in validation.met))
+    full = _better_with_full_noise(plan, results[validation.chosen], first, training)
+    return _with_failures(validation._replace(full=full), plan, training, results, data)
+
+
+def _chosen(
+    plan: Plan,
+    everyone: Mapping[str, Choice],
+    before: Mapping[str, Measured],
+    trials: Mapping[str, Measured],
+    on_training: Mapping[str, Measured],
+    seeds: tuple[int, ...],
+    has_own_seeds: bool,
+) -> Validation:
+    """The choice between baselines and trials that were measured on validation runs, by `Choosing`."""
+    choosing = Choosing(plan, before, trials, on_training)
+    candidate, baseline = next(filter(choosing.wins, choosing.order()), choosing.best), choosing.baseline
+    chosen = candidate if candidate and choosing.wins(candidate) else baseline
     met = tuple(choosing.met(name, choice) for name, choice in everyone.items())
-    seeds, baseline = data[0].seeds, choosing.baseline
-    validation = Validation(
-        seeds, has_own_seeds, met, baseline, candidate or baseline, candidate if wins else baseline, choosing.price
-    )
-    chosen = validation.chosen
+    validation = Validation(seeds, has_own_seeds, met, baseline, candidate or baseline, chosen, choosing.price)
+    results = {**before, **trials}
     if choosing.ratio and plan.consistent and results[chosen].log_scores:
         decided = {name: results[name] for name in (*before, *([candidate] if candidate else []))}
         validation = validation._replace(chosen=_by_log_score(decided, chosen, baseline), by_error=chosen)
-    full = _better_with_full_noise(plan, results[validation.chosen], first, training)
-    return _with_failures(validation._replace(full=full), plan, training, results, data)
+    return validation
 
 
 def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, training: Sequence[Data]) -> Met | None:
@@ -199,6 +227,7 @@ def _better_with_full_noise(plan: Plan, chosen: Measured, first: Choice, trainin
     for name, choice in _full_noise(plan, first.name, baseline_size(first)).items():
         if plan.budget is not None and cost_of(choice, plan, training) > plan.budget:
             continue
+        choice = plan.forgetting(choice, exact=True)
         result = measured(choice, plan, data)
         gained = over(result, chosen, ratio=ratio)
         if gained.high < (1.0 if ratio else 0.0) and not (ratio and slightly(gained)):
@@ -393,6 +422,8 @@ def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Da
 def _baselines_of(plan: Plan, first: Choice, training: Sequence[Data]) -> dict[str, Choice]:
     """The baselines of a finalist but the oracle, within the budget; of several problems those of the first.
 
+    None forgets in time yet (`Plan.forgetting`).
+
     An ensemble has `baseline_size` members, or, over the budget, the fewer of the finalist's and the usual ones.
     """
     size, budget = baseline_size(first), plan.budget
@@ -441,7 +472,7 @@ def _competing(plan: Plan, kind: str, ensemble_size: int | None) -> dict[str, Ch
     if plan.full_q and problem.parameters is not None:
         full = _full_noise(plan, kind, ensemble_size)
         baselines |= {name: choice for name, choice in full.items() if plan.full_r or name == FULL_Q}
-    return {name: plan.forgetting(choice) for name, choice in baselines.items()}
+    return baselines
 
 
 def _best_of(

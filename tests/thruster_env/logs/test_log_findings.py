@@ -114,6 +114,27 @@ def test_outliers_are_found_and_jumps_are_not():
     assert not found(jump)[0]
 
 
+@pytest.mark.parametrize("count", (6, 60))
+def test_a_run_of_outliers_is_a_burst_and_a_plant_that_shakes_is_none(count):
+    table, rng = recorded(), np.random.default_rng(1)
+    signs = rng.choice([-1.0, 1.0], count) if count > 6 else (-1.0) ** np.arange(count)
+    table["tach"][500 : 500 + count] += 20.0 * signs * rng.uniform(0.5, 1.5, count)
+    table["tach"][100] += 3.0
+    _, log = found(table)
+    burst, isolated = (finding for finding in log.findings if finding.kind == "outlier")
+    assert abs(burst.first - 500) <= 4 and abs(burst.last - (499 + count)) <= 4
+    assert burst.count == burst.last - burst.first + 1 and isolated.count == 1
+    assert f"tach has a burst of outliers, {burst.count} samples in rows {burst.first} to " in burst.sentence
+    assert set(outliers(log, "measurement:tach")) == {100, *range(burst.first, burst.last + 1)}
+    for row in range(300, 900):  # of a plant that shakes for long, and with its input
+        table["tach"][row] += 20.0 * (-1.0) ** row
+    assert [finding.count for finding in found(table)[1].findings if finding.kind == "outlier"] in ([1], [])
+    driven = recorded()
+    driven["voltage"][400:460] = (-1.0) ** np.arange(60)
+    driven["tach"][401:461] += 10.0 * driven["voltage"][400:460]
+    assert not found(driven)[0]
+
+
 def test_the_sample_time_is_found_though_the_clock_jitters_and_pauses():
     rng, worst = np.random.default_rng(3), 0.0
     for _ in range(30):

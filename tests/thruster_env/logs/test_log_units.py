@@ -27,6 +27,8 @@ from thruster_env.logs.read import read_log
         ("p_hPa", "p", "hPa"),
         ("torque_mNm", "torque", "mNm"),
         ("acc_mg", "acc", "mg"),
+        ("U_parsec", "U", "parsec"),
+        ("wind_knots_measured", "wind_knots_measured", None),
     ],
 )
 def test_a_header_tells_its_unit(header, base, unit):
@@ -49,6 +51,14 @@ def test_units_are_converted(tmp_path):
     ):
         with pytest.raises(ValueError, match=f"the unit of column 'motor' of .*b.csv {said}"):
             read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
+
+
+def test_an_unknown_unit_at_the_end_of_a_header_is_never_volts(tmp_path):
+    pytest.importorskip("pint")
+    text = "t,U_parsec,tach\n0,1,2\n0.1,2,3\n0.2,0,4\n"
+    with pytest.raises(ValueError, match="unit of column 'U_parsec' of .*run.csv must be one that converts to V"):
+        log_of(tmp_path / "run.csv", text, columns={"V_s": "U_parsec"})
+    assert log_of(tmp_path / "b.csv", text, columns={"V_s": "U_parsec[V]"}).inputs[1, 0] == 2.0
 
 
 @pytest.mark.parametrize(
