@@ -15,10 +15,10 @@ Outliers. A sample above both of its neighbours, or below both, by more than SPI
 (estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours from
 each other and from those beyond: a jump or a peak of the signal is not an outlier. A normal one is one in 10^8.
 
-Bursts of outliers. BURST samples or more, none further than APART samples from the next, that are each above both of
-their neighbours, or below both, by more than SPIKE standard deviations of the noise, while no input changes beside
-them: a stretch of garbage, such as a loose plug. It is at most a tenth of the channel, and the AROUND samples
-before and after it are calm, so that a sensor or a plant that shakes more for long is none.
+Bursts of outliers. BURST samples or more, none further than APART samples from the next, that are each above both
+of their neighbours, or below both, by more than SPIKE standard deviations of the noise, while no input changes
+beside them: a stretch of garbage, such as of a loose plug. It is at most a tenth of the channel, and the AROUND
+samples before and after it are calm: a plant that shakes more for long is no burst.
 """
 
 from __future__ import annotations
