@@ -158,7 +158,7 @@ def test_the_model_of_a_tuned_file_s_logs_may_be_given_as_an_object(tmp_path, mo
 
     with pytest.raises(ValueError, match="must be given by its name if it is code, but tuned.json names"):
         tuning.evaluate(file, progress=False)
-    by_object, by_name = (tuning.evaluate(file, model=given) for given in (model, "lag_of_a_user:model"))
+    by_object, by_name = (tuning.evaluate(file, model=way) for way in (model, "lag_of_a_user:model"))
     assert by_object.evaluation.log_likelihood == by_name.evaluation.log_likelihood
     assert by_object.evaluation.log_likelihood == study.held_out.evaluation.log_likelihood
     with pytest.raises(ValueError, match="must be the one it was tuned on"):
