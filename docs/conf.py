@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 os.environ.setdefault("MPLBACKEND", "agg")
 
-from pages.site.gallery import SHOWN_ONLY  # noqa: E402
+from docs._ext.generated import SHOWN_ONLY  # noqa: E402
 from thruster_env import __version__ as release  # noqa: E402
 
 project = "thruster-env"
@@ -24,9 +24,9 @@ extensions = [
     "sphinx_design",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
-    "pages.site.docstrings",
-    "pages.site.mathml",
-    "pages.site.command_line",
+    "docs._ext.docstrings",
+    "docs._ext.equations",
+    "docs._ext.generated",
 ]
 exclude_patterns = ["_static", "tutorials/*.ipynb", "tutorials/*.py", "tutorials/*.zip"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
@@ -58,8 +58,8 @@ sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "tutorials",
     "filename_pattern": rf"/(?!{'|'.join(SHOWN_ONLY)})\w+\.py$",
-    "within_subsection_order": "pages.site.gallery.in_order",
-    "image_scrapers": ("matplotlib", "pages.site.gallery.result_figures"),
+    "within_subsection_order": "docs._ext.generated.in_order",
+    "image_scrapers": ("matplotlib", "docs._ext.generated.result_figures"),
     "default_thumb_file": str(ROOT / "docs" / "plant_frame.png"),
     "capture_repr": ("_repr_html_", "__repr__"),
     "download_all_examples": False,

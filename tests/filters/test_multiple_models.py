@@ -5,9 +5,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from docs.scripts.filter_sampled import followed, half_lost
 from filters import StateSpaceModel, make_filter, run
 from filters.gaussian.mixtures import Parts, blender
-from pages.filter_models import followed, half_lost
 from tests.models import pendulum
 from tests.thruster_env.core.test_angles import turning
 from thruster_env.model.affine import affine_model, linearize

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
+from docs.scripts import filter_gaussian, filter_sampled, made_by
+from docs.scripts import main as make_page
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
-from pages import filter_gaussian, filter_horizon, filter_particles
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS
@@ -34,7 +35,6 @@ NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
 FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
 TUNING_PAGE = (ROOT / "docs" / "tuning.md").read_text()
 PAGES = {"plant": PAGE, "filters": FILTER_PAGE, "tuning": TUNING_PAGE}
-SCRIPTS = {"plant": "pages.plant_figures", "filters": "pages.filter_figures", "tuning": "pages.tuning_figures"}
 FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
 every_page = pytest.mark.parametrize("page", PAGES)
 KINDS = {
@@ -144,10 +144,9 @@ def test_every_link_leads_somewhere(page):
 
 @every_page
 def test_the_page_shows_what_its_script_draws_and_has_the_tables_it_makes(page):
-    script = importlib.import_module(SCRIPTS[page])
-    assert set(script.FIGURES) <= pictures_of(page)
-    assert set(script.TABLES) <= set(re.findall(r"<!-- table (\w+) -->", PAGES[page]))
-    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in script.FIGURES)
+    assert set(made_by(page, "FIGURES")) <= pictures_of(page)
+    assert set(made_by(page, "TABLES")) == set(re.findall(r"<!-- table (\w+) -->", PAGES[page]))
+    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in made_by(page, "FIGURES"))
 
 
 @pytest.mark.slow
@@ -176,7 +175,7 @@ def test_every_family_of_filters_has_an_example_and_a_picture():
 
 
 def test_the_table_of_all_filters_is_that_of_the_code():
-    from pages.filter_tables import kinds
+    from docs.scripts.filters import kinds
 
     table = kinds()
     assert table in FILTER_PAGE
@@ -185,8 +184,8 @@ def test_the_table_of_all_filters_is_that_of_the_code():
 
 
 def test_the_chart_of_filters_names_filters_that_there_are():
+    from docs.scripts.ranking import FILE, OTHERWISE, STEPS, as_text
     from filters.learned.file import LEARNED
-    from pages.ranking_chart import FILE, OTHERWISE, STEPS, as_text
 
     assert {name for step in (*STEPS, OTHERWISE) for name in step.filters} <= {*FILTERS, *LEARNED}
     page = (ROOT / "docs" / "ranking.md").read_text()
@@ -212,21 +211,21 @@ def test_the_table_of_info_is_that_of_the_wrapper():
 @pytest.mark.parametrize("page", ["plant", "filters"])
 def test_pictures_and_tables_are_those_of_the_code(page, tmp_path, monkeypatch):
     pytest.importorskip("pygame")
-    monkeypatch.setattr(filter_particles, "SIZES", (20, 50))  # of a picture alone, which takes minutes otherwise
-    monkeypatch.setattr(filter_horizon, "LENGTHS", (5, 10))
+    monkeypatch.setattr(filter_sampled, "SIZES", (20, 50))  # of a picture alone, which takes minutes otherwise
+    monkeypatch.setattr(filter_sampled, "LENGTHS", (5, 10))
     monkeypatch.setattr(filter_gaussian, "RUNS", 4)
     shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
-    importlib.import_module(SCRIPTS[page]).main([str(tmp_path)])
+    make_page([page, "--out", str(tmp_path)])
     anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))
     assert anew[::2] == here[::2]
     assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
-    assert {path.name for path in tmp_path.glob("*.png")} == set(importlib.import_module(SCRIPTS[page]).FIGURES)
+    assert {path.name for path in tmp_path.glob("*.png")} == set(made_by(page, "FIGURES"))
     assert all(path.stat().st_size < 150_000 for path in tmp_path.glob("*.png"))
 
 
 @pytest.mark.slow
 def test_the_page_on_tuning_holds_what_its_script_makes():
-    import pages.tuning_figures as script
+    import docs.scripts.tuning as script
 
     assert script.maximum_likelihood() in TUNING_PAGE
     lines = script.earned(["outliers"], trials=8).splitlines()[2:]

@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from pages.site.gallery import SHOWN_ONLY
+from docs._ext.generated import SHOWN_ONLY
 from tests.models import TUNED
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

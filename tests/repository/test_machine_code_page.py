@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.scripts.machine_code import TABLES, body
 from filters import ExtendedKalmanFilter
 from filters.differentiated.memory import Memory
 from filters.differentiated.recursion import Wanted, stages_of
@@ -13,7 +14,6 @@ from filters.likelihood import likelihood
 from filters.pages.equations import Equations
 from filters.pages.kernels import as_programs
 from filters.pages.traced import MOST
-from pages.machine_code import TABLES, body
 from thruster_env.core.compiled import interpreted
 
 PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()

@@ -9,7 +9,7 @@ PACKAGES = (
     "thruster_env",
     "filters",
     "tuning",
-    "pages",
+    "docs",
     "benchmarks",
     "examples",
 )

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.scripts import made_by, main
+from docs.scripts.ranking import DISCUSSED, by_default, ratios_of, scenarios
 from filters.registry import FILTERS
-from pages import ranking_estimators, ranking_horizon, ranking_particles
-from pages.ranking_tables import DISCUSSED, TABLES, by_default, main, ratios_of, scenarios
 from thruster_env.core.text_tables import with_tables
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.excitation import EXCITATIONS
@@ -98,8 +98,7 @@ def center(cell):
 
 
 def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
-    made = {*TABLES, *ranking_estimators.TABLES, *ranking_particles.TABLES, *ranking_horizon.TABLES}
-    assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == made
+    assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == set(made_by("ranking", "TABLES"))
     published = table("published")
     assert float(published["ekf"][4]) > 20
     assert upper(published["enkf 100"][3]) < 0.7
@@ -145,9 +144,11 @@ def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):
     page = "<!-- table scenarios -->\n<!-- end --> <!-- table speed -->\nold\n<!-- end -->"
     made = f"<!-- table scenarios -->\n{scenarios()}\n<!-- end --> <!-- table speed -->\nold\n<!-- end -->"
     assert with_tables(page, {"scenarios": scenarios}) == made
-    (tmp_path / "page.md").write_text(page)
-    main([str(tmp_path / "page.md"), "--table", "scenarios"])
-    assert (tmp_path / "page.md").read_text() == made
+    (tmp_path / "ranking.md").write_text(page)
+    arguments = ["ranking", "--table", "scenarios", "--out", str(tmp_path)]
+    assert main([*arguments, "--check"]) == 1 and (tmp_path / "ranking.md").read_text() == page
+    assert main(arguments) == 0 and (tmp_path / "ranking.md").read_text() == made
+    assert main([*arguments, "--check"]) == 0
     assert scenarios() in PAGE
 
 

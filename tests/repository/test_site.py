@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from docs._ext.docstrings import readable
+from docs._ext.equations import inline, latex_of
+from docs._ext.generated import ORDER, commands
 from filters.registry import FILTERS
-from pages.site.command_line import commands
-from pages.site.docstrings import readable
-from pages.site.equations import inline, latex_of
-from pages.site.gallery import ORDER
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from docs.scripts import main
+from docs.scripts.auv import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, restless, rows_of, small
 from filters.consistency.intervals import Interval
-from pages.auv_filters import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, main, restless, rows_of, small
 from tuning.auv.scenario import find_scenario
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
@@ -89,10 +90,10 @@ def test_numbers_are_printed_with_half_their_interval():
 
 def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):
     made = {name: (lambda: "new") for name in TABLES}
-    monkeypatch.setattr("pages.auv_filters.TABLES", made)
-    page = tmp_path / "page.md"
+    monkeypatch.setattr("docs.scripts.auv.TABLES", made)
+    page = tmp_path / "auv.md"
     page.write_text("<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\n<!-- end -->\n")
-    main([str(page), "--table", "filters_drag"])
+    main(["auv", "--out", str(tmp_path), "--table", "filters_drag"])
     assert page.read_text() == (
         "<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\nnew\n<!-- end -->\n"
     )

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from filters.consistency.intervals import Interval
-from pages.tuning_choice import (
+from docs.scripts.tuning_choice import (
     CASES,
     GIVEN,
     TRUTH_CASES,
@@ -16,6 +15,7 @@ from pages.tuning_choice import (
     measured_of,
     plan_of,
 )
+from filters.consistency.intervals import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import RULE

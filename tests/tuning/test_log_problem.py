@@ -10,7 +10,6 @@ import pytest
 
 from filters import run
 from filters.likelihood import likelihood
-from pages import log_tables
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
@@ -19,6 +18,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
+from tuning.experiments import hidden_truth
 from tuning.experiments.hidden_truth import hide_truth
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
@@ -215,12 +215,12 @@ def test_the_page_has_the_table_of_its_script_and_says_what_the_truth_is_worth()
     page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
     lines = page.partition("<!-- table hidden_truth -->")[2].partition("<!-- end -->")[0].strip().splitlines()
     rows = {(row[1].strip(" `"), row[2].strip(" `")): row for row in (line.split("|") for line in lines[2:])}
-    assert set(rows) == set(log_tables.CASES)
+    assert set(rows) == set(hidden_truth.CASES)
     ratios = {case: float(row[4].split()[0]) for case, row in rows.items()}  # with the most logs
     fitting = [ratios[case] for case in ratios if case[1] != "kf" or case[0] == "published_tunnel"]
     assert len(fitting) == 5 and max(fitting) <= 1.02
     assert min(ratios["nominal", "kf"], ratios["outliers", "kf"]) > 1.5  # as the text says
-    made = log_tables.hidden_truth(trials=2, cases=[("nominal", "ekf")], runs=(6,))
+    made = hidden_truth.hidden_truth(trials=2, cases=[("nominal", "ekf")], runs=(6,))
     assert made.startswith("| scenario | filter | 6 logs |") and "| `nominal` | `ekf` | " in made
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pages.tuning_pruning import TOP_RUNS, over_studies, pair
+from docs.scripts.tuning_choice import TOP_RUNS, over_studies, pruning_pair
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.study import quiet_optuna
 
@@ -12,7 +12,7 @@ from tuning.search.study import quiet_optuna
 @pytest.mark.slow
 def test_with_pruning_a_study_ends_at_the_score_that_it_has_without():
     quiet_optuna()
-    found = pair(
+    found = pruning_pair(
         "ekf", "startup", 16, seed=2
     )  # so short a study may end elsewhere by its other trials, too: seed 1
     assert found.pruned >= 2 and found.skipped > 0.05

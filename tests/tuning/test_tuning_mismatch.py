@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pages.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
+from docs.scripts.tuning import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
 from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")

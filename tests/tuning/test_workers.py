@@ -173,7 +173,7 @@ def test_the_page_names_options_that_there_are():
 
 
 def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
-    import pages.workers_figures as script
+    import docs.scripts.workers as script
 
     folder = Path(__file__).parents[2] / "docs"
     page = (folder / "workers.md").read_text()
@@ -187,7 +187,7 @@ def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
 
 
 def test_a_worker_gets_through_trials_while_it_is_watched(tmp_path):
-    from pages.workers_rates import NOTHING, rate
+    from docs.scripts.workers import NOTHING, rate
 
     path = str(tmp_path / "j")
     assert 0 <= rate(NOTHING, path, 1) < math.inf  # none in a window of a second, if the machine is busy

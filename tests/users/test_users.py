@@ -25,7 +25,7 @@ from tests.users import (
     reactor,
 )
 from tuning.evaluation.evaluate import evaluate
-from tuning.experiments.users.runs import PANEL, found_problems, name_of
+from tuning.experiments.users import PANEL, found_problems, name_of
 
 PAGES = (
     altitude,

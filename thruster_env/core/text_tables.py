@@ -8,15 +8,12 @@ import sys
 import unicodedata
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from io import StringIO
-from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
-
-from thruster_env.core.files import write_whole
 
 # Tables in Markdown, and pages whose tables are computed.
 
@@ -39,15 +36,6 @@ def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
         return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
 
     return re.sub(r"(<!-- table ([^\n]+?) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
-
-
-def print_or_write(name: str, text: str, arguments: Sequence[str]) -> None:
-    """Print a table, or write it anew on the page whose path is the first argument of a command line."""
-    if not arguments:
-        print(text)
-        return
-    page = Path(arguments[0])
-    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {name: lambda: text}))
 
 
 # Characters that a terminal lacks, in others that it has: no table ends in its middle.

@@ -49,9 +49,8 @@ def command(
 
     Example: thruster study recordings --data rov_thruster
     """
-    from tuning.experiments.recordings.identification import identify_all
-    from tuning.experiments.recordings.measure import estimates_of
-    from tuning.experiments.recordings.runs import read_recordings
+    from tuning.experiments.recordings.identification import estimates_of, identify_all
+    from tuning.experiments.recordings.model import read_recordings
     from tuning.experiments.recordings.tables import sentences, tables_of
 
     runs = read_recordings(data)

@@ -32,7 +32,7 @@ from tuning.experiments.thruster_papers import (
     study_statements,
 )
 from tuning.experiments.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
-from tuning.experiments.vehicle.models import RUNS as VEHICLE_RUNS
+from tuning.experiments.vehicle.papers import RUNS as VEHICLE_RUNS
 
 ALL = "all"
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."

@@ -65,8 +65,16 @@ def command(
     Example: thruster study users --quick
     """
     from thruster_env.core.files import check_target, write_whole
-    from tuning.experiments.users.runs import QUICK, Panel, run_panel
-    from tuning.experiments.users.tables import csv_text, header, markdown, rows_of, sentences
+    from tuning.experiments.users import (
+        QUICK,
+        Panel,
+        csv_text,
+        header,
+        markdown,
+        rows_of,
+        run_panel,
+        sentences,
+    )
 
     arguments: dict[str, Any] = {"problems": problem, "filters": filters, "trials": trials, "seed": seed}
     changes: dict[str, Any] = {

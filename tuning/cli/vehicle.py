@@ -15,20 +15,20 @@ from filters.consistency.intervals import Interval, mean_interval
 from thruster_env.core.text_tables import table
 from tuning.cli.benchmark import fitted, list_of
 from tuning.cli.output import announce_compilation, progress_console
-from tuning.experiments import ngatini2017, ngatini2019
 from tuning.experiments.vehicle.estimators import MEASUREMENTS
 from tuning.experiments.vehicle.experiment import (
     PAPERS,
     PATHS,
     PathResult,
     Scores,
+    path_runs,
+    paths_figure,
     position_ratio,
     run_tasks,
     tasks_of,
 )
-from tuning.experiments.vehicle.figure import path_runs, paths_figure
-from tuning.experiments.vehicle.models import POSE, RUNS, PrintedRow
-from tuning.experiments.vehicle.statements import ENKF, FKF, Finding, digits, findings, statements, with_interval
+from tuning.experiments.vehicle.papers import PARTICULARS, POSE, PRINTED_PATHS, RUNS, PrintedRow
+from tuning.experiments.vehicle.tables import ENKF, FKF, Finding, digits, findings, statements, with_interval
 
 # Tables of the papers on the underwater vehicle.
 
@@ -43,7 +43,7 @@ def particulars_table() -> Table:
     ours = {"mass": "15", "length": "0.98", "beam": "0.188", "speed": "1.94 (1 m/s) at 2.85 N"}
     rows = [
         [f"{name} [{unit}]", f"{value:g}", ours.get(name, "not in the equations")]
-        for name, (value, unit) in ngatini2019.PARTICULARS.items()
+        for name, (value, unit) in PARTICULARS.items()
     ]
     return table("ngatini2019, table I: the vehicle", ["", "published", "ours"], rows, words=True)
 
@@ -119,7 +119,7 @@ def end_table(results: list[PathResult]) -> Table:
     for result in results:
         if result.world != "vehicle":
             continue
-        for label, printed in zip((ENKF, FKF), ngatini2017.PATHS[result.path][:2], strict=True):
+        for label, printed in zip((ENKF, FKF), PRINTED_PATHS[result.path][:2], strict=True):
             names = list(printed.final_percent)
             indices = [("x", "y", "z", "angle").index("angle" if name == "psi" else name) for name in names]
             ends, scores = np.abs(result.end[indices]), result.scores[label]

@@ -9,19 +9,29 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from filters import StateSpaceModel, make_filter
 from filters.consistency.intervals import Interval, mean_interval
 from filters.engine.batch import run
+from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of
+from thruster_env.core.text_tables import markdown_table
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.runs import state_errors
 from tuning.experiments import BENCHMARKS
+from tuning.problems.data import Data
 from tuning.problems.model_problem import ModelProblem
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.plan import Plan
+from tuning.search.space import Choice
 
-RUNS = 16  # of 1000 analyses each; published scores seem to be of one such run
+if TYPE_CHECKING:
+    from tuning.search.study import StudyResult
+
+RUNS, TRIALS = 16, 20  # of 1000 analyses each; published scores seem to be of one such run
 MOST_RUNS = 10_000
 CLOSE = 0.05  # relative difference up to which two scores are called the same
 WHY = "why different"
@@ -92,6 +102,11 @@ class Benchmark(NamedTuple):
         """Headings of a table of rows."""
         return ["filter", self.theirs, f"ours, {self.score}", "ratio", "median run", "pooled", WHY]
 
+    def markdown(self) -> str:
+        """The table of rows, and the remarks."""
+        remarks = "\n".join(f"- {remark}" for remark in self.remarks)
+        return f"{markdown_table(self.header, [row.cells() for row in self.reproduce()])}\n\n{remarks}"
+
     def reproduce(self, runs: int = RUNS, seed: int = 0, on_row: OnRow = lambda row: None) -> list[Row]:
         """All rows over so many seeds from `seed` on; ValueError for fewer than two."""
         first, count = at_least("seed", seed, 0), at_least("runs", runs, 2, MOST_RUNS)
@@ -118,7 +133,16 @@ class Published(NamedTuple):
 
 def find_benchmark(name: str) -> Benchmark:
     """A benchmark by name; ValueError for an unknown one."""
-    return importlib.import_module(BENCHMARKS[one_of("benchmark", name, tuple(BENCHMARKS))]).BENCHMARK
+    module, _, benchmark = BENCHMARKS[one_of("benchmark", name, tuple(BENCHMARKS))].partition(":")
+    return getattr(importlib.import_module(module), benchmark)
+
+
+def run_in_memory(plan: Plan, trials: int, start: Choice | None = None) -> StudyResult:
+    """The result of a study that is not stored; its first trial is `start`, by default the untuned filter."""
+    from tuning.search.study import open_study, quiet_optuna, run_study
+
+    quiet_optuna()
+    return run_study(open_study("in memory", plan, None, start), plan, trials).or_interrupted()
 
 
 def noise_free_problem(truth: StateSpaceModel, **arguments) -> ModelProblem:
@@ -126,6 +150,12 @@ def noise_free_problem(truth: StateSpaceModel, **arguments) -> ModelProblem:
     r = tuple(np.diag(truth.measurement_noise_cov).tolist())
     untuned = {"process_noise_cov": (0.0,) * truth.n, "measurement_noise_cov": r}
     return ModelProblem(truth, untuned=untuned, **arguments)
+
+
+def analysis_errors(filter_: Filter, data: Data) -> tuple[np.ndarray, int]:
+    """Errors (B, K, n) of a filter at the scored analyses, and how often it restarted."""
+    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+    return state_errors(filter_, estimates, data)[:, data.late], int(estimates.divergences.sum())
 
 
 def mean_of_roots(errors: np.ndarray) -> np.ndarray:
@@ -148,13 +178,52 @@ def against_published(
         data, rows = problem.data(seeds), []
         for row in published:
             filter_ = make_filter(row.filter, model(**row.model), **row.numbers)
-            estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-            errors = state_errors(filter_, estimates, data)[:, data.late]
-            pooled, lost = np.sqrt(np.square(errors).mean()), estimates.divergences.sum()
+            errors, lost = analysis_errors(filter_, data)
+            pooled = np.sqrt(np.square(errors).mean())
             scores = mean_of_roots(errors)
             runs = float(np.median(scores)), float(scores.std(ddof=1))
-            rows.append(Row(row.label, row.value, mean_interval(scores), float(pooled), int(lost), *runs, row.why))
+            rows.append(Row(row.label, row.value, mean_interval(scores), float(pooled), lost, *runs, row.why))
             on_row(rows[-1])
         return rows
 
     return rows
+
+
+# Inflation tuned by a study like any other parameter, on problems whose published scores depend on it.
+
+
+def tune_inflation(
+    filter_name: str, problem: ModelProblem, trials: int, runs: int, seed: int = 0
+) -> tuple[Choice, Interval]:
+    """Tune an ensemble filter's N, inflation and relaxation, with R held; also rmse.a on held-out seeds.
+
+    Args:
+        filter_name: "enkf", "etkf", "ensrf" or "denkf".
+        problem: a problem without process noise, so that Q is not tuned either.
+        trials: number of trials of the study.
+        runs: number of held-out seeds.
+        seed: seed of the study.
+    """
+    choice = run_in_memory(Plan(filter_name, (problem,), seed, hold_r=True), trials).choice
+    data, filter_ = problem.data(held_out_seeds(seed, runs)), choice.filter(problem)
+    return choice, mean_interval(mean_of_roots(analysis_errors(filter_, data)[0]))
+
+
+def pendulum_errors() -> str:
+    """Filters of the pendulum before and after tuning."""
+    from tuning.experiments.pendulum import problem
+
+    rows = []
+    for name in ("ekf", "ukf"):
+        choice = run_in_memory(Plan(name, (problem,)), TRIALS).choice
+        comparison = evaluate_held_out(choice, problem, 0)
+        for word, evaluation in (("rule of thumb", comparison.untuned), ("tuned", comparison.tuned)):
+            sigma = choice.model["sigma"] if word == "tuned" else problem.untuned["sigma"]
+            errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in evaluation.rmse]
+            consistency = f"{evaluation.nees.value:.2f}", f"{evaluation.nis.value:.2f}"
+            rows.append([name, word, f"{sigma:.3f}", *errors, *consistency])
+    header = ["filter", "", "sigma [rad/s]", "theta [rad]", "omega [rad/s]", "mean NEES", "mean NIS"]
+    return markdown_table(header, rows)
+
+
+TABLES = {"pendulum": pendulum_errors}

@@ -1,12 +1,8 @@
-"""How soon a monitor finds faults: delays on the thruster and the vehicle, beside the best test for each bias.
-
-python -m tuning.experiments.faults [docs/monitoring.md]  # the page, whose table "delays" is written anew
-"""
+"""How soon a monitor finds faults: delays on the thruster and the vehicle, beside the best test for each bias."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +15,7 @@ from filters.monitoring.monitor import TESTS, Monitor
 from filters.monitoring.recursion import cusum_run_length, cusum_threshold
 from filters.registry import make_filter
 from thruster_env.core.streams import filter_keys
-from thruster_env.core.text_tables import markdown_table, print_or_write
+from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
@@ -172,10 +168,4 @@ def markdown(runs: int = RUNS) -> str:
     return markdown_table(["fault", *heads], rows)
 
 
-def main() -> None:
-    """Print the table, or write it on a page."""
-    print_or_write("delays", markdown(), sys.argv[1:])
-
-
-if __name__ == "__main__":
-    main()
+TABLES = {"delays": markdown}

@@ -8,8 +8,6 @@ N(0, 2^2) along the path and uniform within +-15 across it. Only positions count
 Source: the example of I. Greenberg, N. Yannay, S. Mannor (2023), "Optimization or architecture: how to hack Kalman
 filtering", NeurIPS, arXiv 2310.00675, in their package Optimized-Kalman-Filter; written anew.
 
-    python -m tuning.experiments.lidar [docs/ways.md]  # the page, whose table "okf" is written anew
-
 The package is `Optimized-Kalman-Filter` (PyPI), in the extra `peers`; without it the rest is computed.
 """
 
@@ -18,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -27,7 +24,7 @@ import numpy as np
 
 from filters import affine_model
 from filters.consistency.intervals import Interval
-from thruster_env.core.text_tables import markdown_table, print_or_write
+from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
 from tuning.problems.runs_problem import RunsProblem
@@ -246,10 +243,4 @@ def markdown(rows: list[Row]) -> str:
     return markdown_table(heads, cells)
 
 
-def main() -> None:
-    """Print the table, or write it on a page."""
-    print_or_write("okf", markdown(compared()), sys.argv[1:])
-
-
-if __name__ == "__main__":
-    main()
+TABLES = {"okf": lambda: markdown(compared())}

@@ -26,11 +26,10 @@ from filters import StateSpaceModel, make_filter
 from filters.consistency.intervals import rmse_intervals
 from filters.engine.batch import run
 from thruster_env.model.quantities import Quantity
-from tuning.experiments.benchmark import Benchmark, OnRow, Row
+from tuning.experiments.benchmark import Benchmark, OnRow, Row, run_in_memory
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.search.plan import Plan
-from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.search.trials import best_trial
 
 # Stone Soup's Kalman filters for a target at nearly constant velocity, seen in range and bearing.
@@ -144,10 +143,7 @@ def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
 
     Whether that trial wins does not count: a baseline may have its own Q, and no sigma_a.
     """
-    quiet_optuna()
-    plan = Plan("ekf", (problem,), seed)
-    study = open_study("range-bearing", plan)
-    best = best_trial(run_study(study, plan, trials).trials)
+    best = best_trial(run_in_memory(Plan("ekf", (problem,), seed), trials).trials)
     assert best is not None
     return best.params["sigma_a"]
 
@@ -195,3 +191,4 @@ BENCHMARK = Benchmark(
     ),
     rows=rows,
 )
+TABLES = {"range_bearing": BENCHMARK.markdown}

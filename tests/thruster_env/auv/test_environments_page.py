@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
-from pages import auv_figures, auv_filters, auv_papers
+from docs.scripts import made_by
 from thruster_env.auv.channels import SUITES
 from thruster_env.auv.effects import CURRENT_SIGNALS
 from tuning.auv.scenario import SCENARIOS
@@ -35,10 +35,8 @@ def test_scenarios_are_listed_with_their_states_and_what_they_are():
 
 
 def test_the_page_has_what_its_scripts_make():
-    figures = {*auv_figures.FIGURES, *auv_papers.FIGURES}
-    tables = {*auv_figures.TABLES, *auv_papers.TABLES, *auv_filters.TABLES}
-    assert figures == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
-    assert tables == set(re.findall(r"<!-- table (\w+) -->", PAGE))
+    assert set(made_by("auv", "FIGURES")) == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
+    assert set(made_by("auv", "TABLES")) == set(re.findall(r"<!-- table (\w+) -->", PAGE))
     folder = Path(__file__).parents[3] / "docs"
     for target in re.findall(r"\]\((?!http)([^)#]+)", PAGE):
         assert (folder / target).exists(), target

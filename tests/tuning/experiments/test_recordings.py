@@ -10,30 +10,27 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
 from tuning.experiments.recordings.identification import (
     CHOSEN,
-    STRUCTURES,
-    Structure,
-    identified,
-    identify_all,
-    tasks_of,
-    thrusts,
-)
-from tuning.experiments.recordings.measure import (
     LOOKUP,
     OURS,
     OWN,
-    STATIC,
+    STATIC_MAP,
+    STRUCTURES,
+    Structure,
     after_reversal,
     averaged,
     best_rmse,
     error,
     estimates_of,
+    identified,
+    identify_all,
     ratios,
     regimes,
     rmse,
     settled_rmse,
+    tasks_of,
+    thrusts,
 )
-from tuning.experiments.recordings.model import DT, model, to_identify
-from tuning.experiments.recordings.runs import clock_offset, read_recordings
+from tuning.experiments.recordings.model import DT, clock_offset, model, read_recordings, to_identify
 from tuning.experiments.recordings.tables import ladder_rows, number_rows
 from tuning.identification.result import valued
 
@@ -178,7 +175,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
 def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):  # noqa: F811
     found = as_json("study", "recordings", "--data", folder)
     assert [row["run"] for row in found["ratios"]] == ["CLLookupStep", "Ramp", "mean"]
-    assert {OURS, OWN, STATIC, LOOKUP} <= set(found["estimators"][0])
+    assert {OURS, OWN, STATIC_MAP, LOOKUP} <= set(found["estimators"][0])
     assert float(found["clocks"][1]["offset, s"]) == pytest.approx(OFFSET, abs=1e-2)
 
 

@@ -15,7 +15,7 @@ from filters import EstimateState, make_filter, run
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.experiments import BENCHMARKS, benchmark, lorenz63, lorenz63_sparse, lorenz96, pendulum, range_bearing
+from tuning.experiments import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_bearing
 from tuning.experiments.benchmark import (
     Published,
     against_published,
@@ -23,7 +23,6 @@ from tuning.experiments.benchmark import (
     mean_of_roots,
     noise_free_problem,
 )
-from tuning.experiments.lorenz96 import tune_inflation
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.seeds import held_out_seeds
@@ -128,11 +127,16 @@ def row_of_page(table, first_cells):
 
 
 # A cheap row of each table. States are chaotic, so that rounding of another machine moves single runs.
+DENSE = lorenz63.problem, lorenz63.model, lorenz63.PUBLISHED
+SPARSE = lorenz63.sparse, lorenz63.sparse_model, lorenz63.SPARSE_PUBLISHED
 OF_PAGE = {
-    "lorenz63": (lorenz63, "etkf, N = 3, inflation 1.3"),
-    "lorenz63, particles": (lorenz63, "pf, N = 100, regularisation 2.48, threshold 0.3"),
-    "lorenz63_sparse": (lorenz63_sparse, "ensrf, N = 20, inflation 1.01, rotations"),
-    "lorenz96": (lorenz96, "letkf, N = 7, radius 4, inflation 1.04, rotations"),
+    "lorenz63": (DENSE, "etkf, N = 3, inflation 1.3"),
+    "lorenz63, particles": (DENSE, "pf, N = 100, regularisation 2.48, threshold 0.3"),
+    "lorenz63_sparse": (SPARSE, "ensrf, N = 20, inflation 1.01, rotations"),
+    "lorenz96": (
+        (lorenz96.problem, lorenz96.model, lorenz96.PUBLISHED),
+        "letkf, N = 7, radius 4, inflation 1.04, rotations",
+    ),
 }
 
 
@@ -144,8 +148,9 @@ OF_PAGE = {
     ],
 )
 def test_a_row_of_the_page_is_recomputed(name, study, label):
-    (published,) = [one for one in study.PUBLISHED if one.label == label]
-    (row,) = against_published(study.problem, study.model, [published])(range(benchmark.RUNS), lambda row: None)
+    problem, model, rows = study
+    (published,) = [one for one in rows if one.label == label]
+    (row,) = against_published(problem, model, [published])(range(benchmark.RUNS), lambda row: None)
     _, theirs, ours, _, median, *_ = row_of_page(name.partition(",")[0], label)
     half = (ours[2] - ours[1]) / 2
     assert theirs == [published.value] and abs(row.ours.value - ours[0]) < half
@@ -236,9 +241,10 @@ class TestReproduce:
 
 
 def test_every_benchmark_is_found_and_its_problem_is_one():
-    for name, module in BENCHMARKS.items():
+    for name, path in BENCHMARKS.items():
         assert find_benchmark(name).name == name
-        assert find_problem(f"{module}:problem").name == f"{module}:problem"
+        problem = f"{path.partition(':')[0]}:{'sparse' if 'sparse' in name else 'problem'}"
+        assert find_problem(problem).name == problem
     for other in ("faded", "jittered"):
         (parameter,) = find_problem(f"tuning.experiments.lorenz63:{other}").parameters
         assert parameter.name in ("inflation", "jitter")
@@ -254,7 +260,7 @@ def test_a_study_finds_the_acceleration_of_a_target():
 @pytest.mark.slow
 def test_a_study_tunes_inflation_and_nothing_else():
     short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
-    choice, score = tune_inflation("etkf", short, trials=3, runs=4)
+    choice, score = benchmark.tune_inflation("etkf", short, trials=3, runs=4)
     assert set(choice.numbers) == {"ensemble_size", "inflation", "relaxation"} and 1 <= choice.numbers["inflation"]
     assert choice.model["process_noise_cov"] == (0.0, 0.0, 0.0) and 0.2 < score.value < 1.5
 

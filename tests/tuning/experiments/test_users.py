@@ -10,9 +10,8 @@ from filters.consistency.intervals import Interval
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.evaluation.evaluate import score, score_ratio
-from tuning.experiments.users import runs, significance, tables
-from tuning.experiments.users.runs import Case, Paired, Panel, found_problems, run_panel
-from tuning.experiments.users.significance import chance_if_no_worse, holm
+from tuning.experiments import users
+from tuning.experiments.users import Case, Paired, Panel, chance_if_no_worse, found_problems, holm, run_panel
 
 SAME = Interval(1.0, 1.0, 1.0)
 blind = LinearProblem(truth=False)
@@ -85,33 +84,33 @@ def test_the_verdict_counts_neither_the_oracle_nor_the_same_filter():
         case("b", given=Paired(SAME, 1.0), rule_of_thumb=Paired(Interval(0.5, 0.4, 0.6), 1.0)),
         case("b", "ukf", given=Paired(Interval(1.01, 1.001, 1.02), 0.03)),
     ]
-    found = tables.verdict_of(cases)
+    found = users.verdict_of(cases)
     assert (found.comparisons, found.above, found.wins) == (3, 2, 1) and found.by_chance == pytest.approx(0.075)
     (loss,) = found.losses
     assert (loss.case.problem, loss.baseline) == ("a", "given")
-    assert tables.header(cases)[2:5] == ["over given", "over rule of thumb", "over oracle"]
-    rows = tables.rows_of(cases)
+    assert users.header(cases)[2:5] == ["over given", "over rule of thumb", "over oracle"]
+    rows = users.rows_of(cases)
     assert rows[0][2] == "1.100 [1.050, 1.150] !" and rows[1][2] == "1, the same" and rows[2][0] == ""
-    said = tables.sentences(cases)
+    said = users.sentences(cases)
     assert (
         "in 1 of 3 comparisons" in said[0] and "1.100 [1.050, 1.150] times the score of what was given." in said[2]
     )
-    lines = tables.csv_text(cases).splitlines()
+    lines = users.csv_text(cases).splitlines()
     assert len(lines) == 6 and [line.split(",")[7] for line in lines[1:3]] == ["True", "False"]
-    assert tables.markdown(cases).splitlines()[2].startswith("| `a` | `ekf` | 1.100 [1.050, 1.150] ! | none |")
+    assert users.markdown(cases).splitlines()[2].startswith("| `a` | `ekf` | 1.100 [1.050, 1.150] ! | none |")
 
 
 def test_an_error_is_kept_and_the_others_go_on(monkeypatch, tmp_path):
     def failing(problem, **arguments):
         raise ValueError("Matrix is not positive definite")
 
-    monkeypatch.setattr(runs.tuning, "tune", failing)
+    monkeypatch.setattr(users.tuning, "tune", failing)
     begun = []
     (found,) = run_panel(
-        Panel(runs.PANEL[:1], ("ekf",), 2), tmp_path, lambda text, done, count: begun.append((text, done, count))
+        Panel(users.PANEL[:1], ("ekf",), 2), tmp_path, lambda text, done, count: begun.append((text, done, count))
     )
     assert found.error == "Matrix is not positive definite" and begun == [("altitude, ekf", 0, 1)]
-    assert tables.rows_of([found])[0][-1] == "failed" and "failed: Matrix" in tables.sentences([found])[-1]
+    assert users.rows_of([found])[0][-1] == "failed" and "failed: Matrix" in users.sentences([found])[-1]
 
 
 @pytest.mark.slow
@@ -131,30 +130,30 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
     def forbidden(*arguments):
         raise AssertionError("a case that is there was done again")
 
-    monkeypatch.setattr(runs, "tuned_case", forbidden)
+    monkeypatch.setattr(users, "tuned_case", forbidden)
     assert as_json(*arguments) == first
     (file,) = tmp_path.glob("battery-*.json")
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"of": content["of"] | {"problem": "another"}}))
     with pytest.raises(AssertionError, match="done again"):
-        run_panel(Panel(runs.PANEL[:2], ("ekf",), 3), tmp_path)
+        run_panel(Panel(users.PANEL[:2], ("ekf",), 3), tmp_path)
     file.write_text("{")
     with pytest.raises(ValueError, match="must be a whole file of results, but cannot be read"):
-        run_panel(Panel(runs.PANEL[:2], ("ekf",), 3), tmp_path)
+        run_panel(Panel(users.PANEL[:2], ("ekf",), 3), tmp_path)
 
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done(monkeypatch, tmp_path):
-    real = runs.tuned_case
+    real = users.tuned_case
 
     def second_is_interrupted(problem, name, trials, seed):
         if "battery" in problem.name:
             raise KeyboardInterrupt
         return real(problem, name, trials, seed)
 
-    monkeypatch.setattr(runs, "tuned_case", second_is_interrupted)
+    monkeypatch.setattr(users, "tuned_case", second_is_interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run_panel(Panel(runs.PANEL[:2], ("ekf",), 2), tmp_path)
+        run_panel(Panel(users.PANEL[:2], ("ekf",), 2), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["altitude-ekf-2-seed0.json"]
 
 
@@ -163,10 +162,10 @@ def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
         ValueError, match="a problem of the panel must have true states, but tests.tuning.experiments"
     ):
         found_problems(["tests.tuning.experiments.test_users:blind"])
-    monkeypatch.setattr(runs, "PANEL", ("no_such_module:problem",))
+    monkeypatch.setattr(users, "PANEL", ("no_such_module:problem",))
     with pytest.raises(ValueError, match="must be found in tests/users of the working folder, a checkout"):
         found_problems(["no_such_module:problem"])
 
 
 def test_levels_are_those_that_the_page_says():
-    assert significance.LEVEL == 0.05 and tables.TAIL == 0.025
+    assert users.LEVEL == 0.05 and users.TAIL == 0.025

@@ -7,7 +7,7 @@ from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, affine_model, ru
 from tests.slow import slow_but
 from tests.tuning.experiments.test_studies import command_line
 from tuning.cli import output
-from tuning.experiments import VEHICLE_STUDIES, ngatini2017, ngatini2019
+from tuning.experiments import VEHICLE_STUDIES
 from tuning.experiments.vehicle import estimators
 from tuning.experiments.vehicle.estimators import (
     MeanPropagatingEnKF,
@@ -31,8 +31,8 @@ from tuning.experiments.vehicle.experiment import (
     scores_of,
     true_runs,
 )
-from tuning.experiments.vehicle.models import DT, NOISE, PrintedRow, papers_model
-from tuning.experiments.vehicle.statements import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
+from tuning.experiments.vehicle.papers import DT, NOISE, PRINTED_PATHS, TABLE_III, PrintedRow, papers_model
+from tuning.experiments.vehicle.tables import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code
     "I": (-2.415, 3.789, 0.114),
@@ -162,16 +162,16 @@ def test_corners_of_the_bounds_are_unstable():
 
 def test_printed_tables_are_whole():
     assert set(PAPERS) == set(VEHICLE_STUDIES)
-    assert set(ngatini2017.PATHS) == set(PATHS) and list(ngatini2019.TABLE_III) == [50, 100, 200, 300]
-    assert [len(row.rmse) for row in ngatini2019.TABLE_III.values()] == [4] * 4
-    fourth = ngatini2017.PATHS["IV"].enkf.rmse
-    for name, value in ngatini2019.TABLE_III[50].rmse.items():
+    assert set(PRINTED_PATHS) == set(PATHS) and list(TABLE_III) == [50, 100, 200, 300]
+    assert [len(row.rmse) for row in TABLE_III.values()] == [4] * 4
+    fourth = PRINTED_PATHS["IV"].enkf.rmse
+    for name, value in TABLE_III[50].rmse.items():
         assert fourth[name] == pytest.approx(value, abs=5e-4)  # one run of the two papers is the same
-    for path in ngatini2017.PATHS.values():
+    for path in PRINTED_PATHS.values():
         assert set(path.enkf.rmse) == set(path.fkf.rmse) and set(path.enkf.final_percent) == set(
             path.fkf.final_percent
         )
-    dynamic = ngatini2017.PATHS["dynamic"]
+    dynamic = PRINTED_PATHS["dynamic"]
     assert dynamic.enkf.final_percent == dynamic.enkf.rmse and dynamic.remark
 
 

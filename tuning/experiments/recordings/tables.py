@@ -1,16 +1,31 @@
-"""Rows of the tables of docs/real_data.md and of `thruster study recordings`."""
+"""Tables of docs/real_data.md and of `thruster study recordings`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from tuning.experiments.recordings.identification import CHOSEN, STRUCTURES, Task
-from tuning.experiments.recordings.measure import OURS, ratios, rmse, settled_rmse, structure_ratios
-from tuning.experiments.recordings.runs import Recording
+from thruster_env.core.files import as_toml, write_whole
+from thruster_env.core.text_tables import markdown_table
+from tuning.experiments.recordings.identification import (
+    CHOSEN,
+    OURS,
+    STRUCTURES,
+    Task,
+    estimates_of,
+    identify_all,
+    ratios,
+    regimes,
+    rmse,
+    settled_rmse,
+    structure_ratios,
+)
+from tuning.experiments.recordings.model import IDENTIFIED, Recording, model, read_recordings
 
+RESULTS = Path("out") / "recordings.json"
 MEAN = "mean"
 RATIO_HEADER = ["run", "own, N", "ours, N", "ratio", "best clocks", "raw rows"]
 CLOCK_HEADER = ["run", "offset, s", "first half", "second half"]
@@ -102,3 +117,40 @@ def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
         f"the recorder's own, at most {averaged.max():.2f}; with the best clocks at most {best.max():.2f}; "
         f"on raw rows {raw.min():.2f} to {raw.max():.2f}."
     ]
+
+
+def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable[[], str]]:
+    """The tables of docs/real_data.md by name, from a folder of recordings; the project's numbers are written.
+
+    Identifications that are in the file of results are not done again; all take a quarter of an hour on two cores.
+    """
+    runs = read_recordings(recordings)
+    tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
+    keep(tasks[Task(CHOSEN).name], [run.name for run in runs])
+    left_out, on_all = estimates_of(runs, tasks), estimates_of(runs)
+
+    def regime() -> str:
+        rows = [
+            [f"{row.factor:g}", f"{row.log_likelihood:.0f}", f"{row.nis:.2f}", f"{row.ratio:.3f}"]
+            for row in regimes(model(), runs)
+        ]
+        return markdown_table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
+
+    tables = {
+        name: (lambda table=table: markdown_table(*table))
+        for name, table in tables_of(runs, left_out, tasks).items()
+    }
+    ratios = tables["ratios"]
+    return {
+        **tables,
+        "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
+        "all_runs": lambda: markdown_table(*tables_of(runs, on_all)["ratios"]),
+        "regime": regime,
+    }
+
+
+def keep(task: Mapping, runs: Sequence[str]) -> None:
+    """Write the numbers that the project takes."""
+    known = {name: task[name] for name in ("log_likelihood", "standard_errors", "determined")}
+    tables = {"values": task["values"], "identified": {"logs": list(runs), **known}}
+    write_whole(IDENTIFIED, as_toml(tables, "Found by `python -m docs.scripts real_data`; see docs/real_data.md."))

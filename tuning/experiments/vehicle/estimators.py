@@ -26,7 +26,7 @@ from thruster_env.core.angles import difference
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.experiments.vehicle.models import FUZZY_HIGH, FUZZY_LOW, papers_model
+from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_model
 
 # Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from thruster_env.core.files import write_whole
-from tuning.experiments.users.significance import holm
+from tuning.experiments.users import holm
 from tuning.experiments.ways.entries import Result, Scored, reference, run_way
 from tuning.experiments.ways.problems import REFERENCE, Case, Protocol
 

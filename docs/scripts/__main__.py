@@ -1,0 +1,7 @@
+"""The command line of the scripts."""
+
+import sys
+
+from docs.scripts import main
+
+sys.exit(main())

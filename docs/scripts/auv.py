@@ -1,0 +1,244 @@
+"""The tables of docs/auv.md on control and on filters, which of them, with which Q, R and N, and a frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+import thruster_env.auv  # noqa: F401 - registers the envs
+from docs.scripts import by_name, digits
+from filters import EstimateState
+from filters.augmented import Unknown
+from filters.consistency.intervals import Interval
+from thruster_env.auv.control import DepthAndCourse
+from thruster_env.auv.paths import MANOEUVRES
+from thruster_env.core.files import write_whole
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.env.commands import ObserveStateVector
+from tuning.auv.scenario import Scenario, find_scenario
+from tuning.evaluation.compare import Contender, Row, compare, contender
+from tuning.problems.problem import Problem
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.space import Choice
+
+EPISODES = 50
+
+
+def frame(path: Path) -> Path:
+    """A frame of path IV under PD on the estimate of an extended Kalman filter."""
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    from matplotlib.image import imsave
+
+    env = EstimateState(gym.make("SegorogeniAUVPath-v0", path="IV", render_mode="rgb_array"), "ekf")
+    controller, state = DepthAndCourse.for_env(env, "navigation"), None
+    observation, _ = env.reset(seed=3)
+    for _ in range(420):
+        action, state = controller.predict(observation, state)
+        observation, *_ = env.step(action)
+    picture = env.render()
+    env.close()
+    write_whole(path, lambda stream: imsave(stream, picture, format="png"))
+    return path
+
+
+def returns() -> str:
+    """Mean return of an episode: PD on measurements, on the true state, and planes held still."""
+    tasks = [("Path", {"path": name}) for name in MANOEUVRES] + [("Depth", {})]
+    rows = []
+    for task, arguments in tasks:
+        name = f"SegorogeniAUV{task}-v0"
+        env = gym.make_vec(name, EPISODES, **arguments)
+        true = ObserveStateVector(gym.make_vec(name, EPISODES, **arguments))
+        scores = (
+            mean_return(env, DepthAndCourse.for_env(env)),
+            mean_return(true, DepthAndCourse.for_env(true, "navigation")),
+            mean_return(env, None),
+        )
+        rows.append([f"path {arguments['path']}" if arguments else "depth", *(digits(score) for score in scores)])
+    return markdown_table(["task", "PD on measurements", "PD on the true state", "planes still, 2.845 N"], rows)
+
+
+def mean_return(env, controller: DepthAndCourse | None) -> float:
+    """Mean return of the first episodes of all copies, which none may end before its time."""
+    observations, _ = env.reset(seed=0)
+    action, state, total = np.tile(np.float32([2.845, 0.0, 0.0]), (env.num_envs, 1)), None, 0.0
+    for _ in range(gym.spec(env.spec.id).max_episode_steps):
+        if controller is not None:
+            action, state = controller.predict(observations, state)
+        observations, rewards, terminated, *_ = env.step(action)
+        if terminated.any():
+            raise RuntimeError(f"no episode of {env.spec.id} may end early, but one did")
+        total += rewards.mean()
+    return total
+
+
+# Filters on held-out seeds: some ten minutes on two cores.
+
+
+RUNS, FEW = 50, 20  # 1 kHz runs of 5 s are few: each is 5000 steps of every member
+EKF, ROBUST, UKF = (contender(name) for name in ("ekf", "ekf-robust", "ukf"))
+ENKF, ETKF = contender("enkf", ensemble_size=100), contender("etkf", ensemble_size=50)
+FILTERS = (EKF, ROBUST, UKF, ENKF, ETKF)
+MOTION = ("auv:motion", "auv:papers_20hz", "auv:dvl_outliers", "auv:wrong_drag")
+NAVIGATION = ("auv:navigation", "auv:dvl_dropout", "auv:current", "auv:usbl", "auv:no_dvl")
+HEADER = ("filter", "score", "over the EKF's", "NEES", "NIS")
+AXIAL_DRAG = {"x_uu": Unknown(std=1.5, walk_std=0.005)}
+"""The drag ahead [kg/m]: believed to within its own size at first, and slow to change."""
+
+DRAG = {**AXIAL_DRAG, "y_uv": Unknown(std=8.0, walk_std=0.03), "z_uw": Unknown(std=8.0, walk_std=0.03)}
+"""With it what the hull's and fins' lift does across, u v and u w [kg/m], to within a fifth."""
+
+
+def small(name: str, size: int = 50, **numbers: float) -> Contender:
+    """An ensemble of so many members."""
+    return contender(name, ensemble_size=size, **numbers)
+
+
+def restless(filter_: Contender, variance: float) -> Contender:
+    """The same with so much process noise of roll and pitch [rad^2] a step in its model."""
+
+    def choose(problem: Problem) -> Choice:
+        known = filter_.choose(problem)
+        cov = (*known.model["process_noise_cov"][:6], variance, variance)
+        return known._replace(model={**known.model, "process_noise_cov": cov})
+
+    return Contender(f"{filter_.label}, angles {variance:g} rad^2", choose)
+
+
+MEMBERS = [small("enkf", size) for size in (50, 100, 200, 300)]
+CURES = [
+    small("enkf"),
+    small("enkf", centred_perturbations=1),
+    small("enkf", inflation=1.02),
+    small("enkf", inflation=1.05),
+    small("enkf", relaxation=0.3),
+    small("enkf", relaxation=0.5),
+    small("enkf", inflation=1.05, relaxation=0.3),
+    restless(small("enkf"), 1e-7),
+    restless(small("enkf"), 1e-6),
+    small("etkf"),
+    small("etkf", rotations=1),
+    small("etkf", relaxation=0.3),
+    small("etkf", relaxation=0.45),
+    small("etkf", relaxation=0.45, rotations=1),
+    small("etkf", inflation=1.02, relaxation=0.3),
+    restless(small("etkf", relaxation=0.3), 1e-7),
+]
+FAST_CURES = [
+    *MEMBERS,
+    small("enkf", 1000),
+    small("enkf", inflation=1.02),
+    small("enkf", inflation=1.05),
+    small("enkf", relaxation=0.5),
+    restless(small("enkf"), 1e-8),
+    restless(small("enkf"), 1e-6),
+    small("etkf"),
+    small("etkf", rotations=1),
+    small("etkf", inflation=1.01),
+    small("etkf", inflation=1.02),
+    small("etkf", relaxation=0.4),
+    small("etkf", 300),
+    small("etkf", 300, relaxation=0.4),
+]
+
+
+def filters_motion() -> str:
+    """Filters of eight states, a row per scenario and filter."""
+    return by_scenario(MOTION, FILTERS)
+
+
+def filters_navigation() -> str:
+    """Filters of twelve states."""
+    return by_scenario(NAVIGATION, (EKF, ROBUST, UKF))
+
+
+def filters_members() -> str:
+    """How many members the papers' sensors ask for at 20 Hz, untuned."""
+    return of_rows(rows_of("auv:papers_20hz", [EKF, UKF, *MEMBERS], RUNS))
+
+
+def filters_cures() -> str:
+    """Settings with which 50 members suffice there."""
+    return of_rows(rows_of("auv:papers_20hz", [EKF, *CURES], RUNS))
+
+
+def filters_fast() -> str:
+    """The same at the papers' 1 kHz, where the spread collapses."""
+    return of_rows(rows_of("auv:papers", [EKF, *FAST_CURES], FEW))
+
+
+def filters_drag() -> str:
+    """Wrong drag: an EKF with more process noise, and EKFs with coefficients as further states."""
+    scaled = contender("ekf", knows="scaled")._replace(label="ekf, scaled default")
+    joint = [contender("ekf", unknown=unknown) for unknown in (AXIAL_DRAG, DRAG)]
+    return of_rows(rows_of("auv:wrong_drag", [EKF, scaled, *joint], RUNS))
+
+
+def filters_current() -> str:
+    """RMSE in a current, of a filter without the current and of one with two states for it."""
+    symbols = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
+    lines, units = [], {}
+    for name in ("auv:current", "auv:estimated_current"):
+        (row,) = rows_of(name, [EKF], RUNS)
+        evaluation = row.evaluation
+        errors = {state.symbol: error for state, error in zip(evaluation.states, evaluation.rmse, strict=True)}
+        units |= {state.symbol: state.unit for state in evaluation.states}
+        known = [digits(errors[symbol].value, 2) if symbol in errors else "" for symbol in symbols]
+        lines.append([f"`{name}`, {len(errors)} states", *known, f"{about(evaluation.nees)} of {len(errors)}"])
+    return markdown_table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in symbols), "NEES"], lines)
+
+
+def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -> list[Row]:
+    """Filters on a scenario's held-out seeds."""
+    problem = find_scenario(scenario) if isinstance(scenario, str) else scenario
+    (board,), interrupted = compare(filters, [problem], held_out_seeds(0, runs))
+    if interrupted:
+        raise KeyboardInterrupt
+    return board.rows
+
+
+def by_scenario(scenarios: Sequence[str], filters: Sequence[Contender], runs: int = RUNS) -> str:
+    """A table with the scenario in the first column."""
+    rows = [[f"`{name}`", *cells(row)] for name in scenarios for row in rows_of(name, filters, runs)]
+    return markdown_table(["scenario", *HEADER], rows)
+
+
+def of_rows(rows: Sequence[Row]) -> str:
+    """A table of one scenario."""
+    return markdown_table(HEADER, [cells(row) for row in rows])
+
+
+def cells(row: Row) -> list[str]:
+    """Score, paired ratio, NEES and NIS beside what is right."""
+    evaluation = row.evaluation
+    return [
+        row.label,
+        plain(evaluation.score.value),
+        about(row.score_ratio, 3),
+        f"{about(evaluation.nees)} of {len(evaluation.states)}",
+        f"{about(evaluation.nis)} of {digits(evaluation.expected_nis)}",
+    ]
+
+
+def about(value: Interval, decimals: int = 2) -> str:
+    """A value with half of its interval; large ones to three figures."""
+    half = (value.high - value.low) / 2
+    if abs(value.value) >= 100:
+        return f"{digits(value.value)} ± {digits(half, 2)}"
+    return f"{value.value:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def plain(value: float) -> str:
+    """A score to two decimals; large ones to three figures."""
+    return digits(value) if value >= 100 else f"{value:.2f}"
+
+
+FIGURES = {"auv_frame.png": frame}
+TABLES = by_name(
+    *(returns, filters_motion, filters_navigation, filters_current),
+    *(filters_members, filters_cures, filters_fast, filters_drag),
+)

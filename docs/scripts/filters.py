@@ -1,0 +1,396 @@
+"""The tables of docs/filters.md, and pictures of unknown noise, wrong models and missing measurements."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from docs.scripts import by_name, digits, legend_below, log_ticks, subplots
+from docs.scripts.filter_gaussian import (
+    FLOW,
+    FLOW_RMSE,
+    PUBLISHED_NOISE,
+    RUNS,
+    SEED,
+    STYLES,
+    Runs,
+    deviations,
+    errors_of,
+    fuzzy,
+    held_runs,
+    times,
+)
+from docs.scripts.filter_gaussian import PICTURES as GAUSSIAN
+from docs.scripts.filter_sampled import PICTURES as SAMPLED
+from docs.scripts.filter_sampled import SIGNLESS, signless_runs
+from filters import (
+    FILTERS,
+    ExtendedKalmanFilter,
+    SageHusaFilter,
+    StateSpaceModel,
+    Unknown,
+    VariationalBayesFilter,
+    augmented_model,
+    make_filter,
+    run,
+    thruster_model,
+)
+from filters.filter import Filter
+from filters.registry import filter_type
+from thruster_env.core.compiled import interpreted
+from thruster_env.core.plots import BLUE, DARK, MUSTARD, RUST, save_figure
+from thruster_env.core.text_tables import markdown_table
+
+QUIET, LOUD = 0.5, 2.0  # standard deviations [N] of a sensor whose noise changes
+OUTLIER = 10.0  # [N]
+
+
+def outliers(share: float) -> dict:
+    """Argument of a plant: so many of the measurements are off by a normal variate of 10 N."""
+    return {"sensors": {"thrust": [{"name": "outliers", "std": OUTLIER, "probability": share}]}}
+
+
+def noisy(runs: Runs, stds: np.ndarray) -> Runs:
+    """Runs with new measurement noise of standard deviations (K + 1,) [N]."""
+    thrust = thruster_model().output("T", runs.states)
+    draws = np.random.default_rng(SEED).normal(size=thrust.shape)
+    return runs._replace(measurements=(thrust + stds * draws)[..., None])
+
+
+def adaptive(path: Path) -> Path:
+    """Estimates of R after the sensor has changed, and errors over the share of outliers."""
+    model = thruster_model(measurement_noise_cov=QUIET**2)
+    stds = np.where(np.arange(501) < 200, QUIET, LOUD)
+    runs = noisy(held_runs(20), stds)
+    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
+    left.plot(times(501), stds, label="truth", **STYLES["truth"])
+    for filter_ in (VariationalBayesFilter(model=model), SageHusaFilter(model=model)):
+        learnt = np.sqrt([_learnt_noise(filter_, runs, run_) for run_ in range(len(runs.keys))])
+        left.plot(times(501), learnt.mean(axis=0), label=filter_.name, **STYLES[filter_.name])
+        left.fill_between(
+            times(501), *np.quantile(learnt, (0.1, 0.9), axis=0), alpha=0.2, color=STYLES[filter_.name]["color"]
+        )
+    left.set(xlabel="time [s]", ylabel="std of the sensor's noise [N]")
+    left.legend(fontsize=8, frameon=False, loc="upper left")
+    shares = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6)
+    for name in ("ekf", "sage-husa", "vb", "ekf-robust"):
+        errors = [
+            errors_of(make_filter(name, thruster_model()), held_runs(**outliers(share)))[1] for share in shares
+        ]
+        right.plot([100 * share for share in shares], errors, label=name, **STYLES[name])
+    right.set(xlabel="measurements that are off by 10 N [%]", ylabel=FLOW_RMSE, ylim=(0.04, 0.12))
+    right.legend(fontsize=8, frameon=False)
+    return save_figure(figure, path)
+
+
+def baselines(path: Path) -> Path:
+    """Baselines beside the extended filter, in still water and in a flow that nobody knows of."""
+    figure, axes = subplots((9.6, 3.8), 1, 2, sharey=True)
+    for axis, flow in zip(axes, (0.0, 1.0), strict=True):
+        runs, window = held_runs(1, ambient_velocity=flow), slice(100, 251)
+        for name in ("inversion", "low-pass", "open-loop", "ekf"):
+            estimate = run(make_filter(name, thruster_model()), *runs.arguments).means[0, window, 1]
+            axis.plot(times(501)[window], estimate, label=name, **STYLES[name])
+        axis.plot(times(501)[window], runs.states[0, window, 1], label="truth", **STYLES["truth"])
+        axis.set_title(f"ambient flow {flow:g} m/s, believed to be 0", fontsize=10)
+        axis.set_xlabel("time [s]")
+    axes[0].set_ylabel(FLOW)
+    legend_below(figure, axes[0], 5)
+    return save_figure(figure, path)
+
+
+def augmented(path: Path) -> Path:
+    """The ambient flow as a third state: where it is found, where not, and what that is worth."""
+    joint = augmented_model(thruster_model(), {"ambient_velocity": Unknown(std=0.5)})
+    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
+    examples = {
+        "levels within $\\pm$12 V": (12.0, {}, BLUE),
+        "0 V, from rest": (0.0, {"initial_state": [0.0, 0.0]}, RUST),
+    }
+    for label, (amplitude, start, colour) in examples.items():
+        runs = held_runs(1, amplitude, ambient_velocity=0.6, **start)
+        estimates = run(ExtendedKalmanFilter(model=joint), *runs.arguments)
+        mean, spread = estimates.means[0, :, 2], deviations(estimates, 2)[0]
+        left.plot(times(501), mean, color=colour, label=label)
+        left.fill_between(
+            times(501), mean - 1.96 * spread, mean + 1.96 * spread, color=colour, alpha=0.15, linewidth=0
+        )
+    left.axhline(0.6, label="truth", **STYLES["truth"])
+    left.set(xlabel="time [s]", ylabel="ambient flow and 95 % band [m/s]")
+    left.legend(fontsize=8, frameon=False, loc="lower right")
+    flows = np.linspace(-1.0, 1.0, 9)
+    errors = {"ignored": [], "a third state": [], "known": []}
+    for flow in flows:
+        runs = held_runs(20, ambient_velocity=flow)
+        models = (thruster_model(), joint, thruster_model(ambient_velocity=flow))
+        for values, model in zip(errors.values(), models, strict=True):
+            values.append(errors_of(ExtendedKalmanFilter(model=model), runs)[1])
+    for (label, values), look in zip(errors.items(), ((RUST, "--"), (BLUE, "-"), (DARK, ":")), strict=True):
+        right.plot(flows, values, color=look[0], linestyle=look[1], label=f"flow {label}")
+    right.set_ylim(bottom=0.03)
+    right.set_xticks(flows[::2])
+    right.set(xlabel="ambient flow [m/s]", ylabel=FLOW_RMSE)
+    right.legend(fontsize=8, frameon=False)
+    return save_figure(figure, path)
+
+
+def varying(path: Path) -> Path:
+    """R that is known step by step, and measurements that are missing or held."""
+    model, burst = thruster_model(), np.ones(501, dtype=bool)
+    burst[:200], burst[300:] = False, False
+    stds = np.where(burst, LOUD, QUIET)
+    runs = noisy(held_runs(RUNS), stds)
+    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
+    covs = (stds**2)[:, None, None]
+    known = run(ExtendedKalmanFilter(model=model), *runs.arguments, measurement_noise_covs=covs)
+    fixed = run(ExtendedKalmanFilter(model=model), *runs.arguments)
+    for label, estimates, colour, dashes in (("R of each step", known, BLUE, "-"), ("one R", fixed, RUST, "--")):
+        squares = ((estimates.means[..., 1] - runs.states[..., 1]) ** 2).mean(axis=0)
+        smooth = np.sqrt(np.convolve(squares, np.ones(10) / 10, "same"))
+        left.plot(times(501)[20:480], smooth[20:480], color=colour, linestyle=dashes, label=label)
+    left.axvspan(2.0, 2.99, color=DARK, alpha=0.1, linewidth=0, label="noise of 2 N, else 0.5 N")
+    left.set(xlabel="time [s]", ylabel="RMSE of $U_a$ over 10 steps [m/s]")
+    left.set_ylim(bottom=0.0)
+    left.legend(fontsize=8, frameon=False)
+    shares = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
+    errors = {"NaN, so left out": [], "held, as if measured": [], "open loop": []}
+    for share in shares:
+        dropout = [{"name": "dropout", "probability": share, "mean_length": 20.0}] if share else []
+        runs = held_runs(sensors={"thrust": dropout})
+        filled = runs._replace(measurements=_last_valid(runs.measurements))
+        cases = ((ExtendedKalmanFilter, runs), (ExtendedKalmanFilter, filled))
+        for values, (kind, data) in zip(errors.values(), cases, strict=False):
+            values.append(errors_of(kind(model=model), data)[1])
+        errors["open loop"].append(errors_of(make_filter("open-loop", model), runs)[1])
+    looks = ((BLUE, "-"), (RUST, "--"), (MUSTARD, ":"))
+    for (label, values), (colour, dashes) in zip(errors.items(), looks, strict=True):
+        right.plot([100 * share for share in shares], values, color=colour, linestyle=dashes, label=label)
+    log_ticks(right.yaxis, (0.05, 0.1, 0.2, 0.5, 1))
+    right.set(xlabel="measurements missing, in runs of 20 [%]", ylabel=FLOW_RMSE)
+    right.legend(fontsize=8, frameon=False)
+    return save_figure(figure, path)
+
+
+def _learnt_noise(filter_, runs: Runs, number: int) -> list[float]:
+    """R that a filter estimates after each measurement of a run."""
+    belief, noises = filter_.init(), []
+    inputs = [None, *runs.inputs[number]]
+    for u, z in zip(inputs, runs.measurements[number], strict=True):
+        belief, _ = filter_.update(belief if u is None else filter_.predict(belief, u), z)
+        noises.append(filter_.estimated_noise(belief)[0, 0])
+    return noises
+
+
+def _last_valid(measurements: np.ndarray) -> np.ndarray:
+    """Measurements (B, K + 1, 1) with the last valid one, 0 at first, where one is missing."""
+    measured = ~np.isnan(measurements)
+    last = np.maximum.accumulate(np.where(measured, np.arange(measurements.shape[1])[None, :, None], -1), axis=1)
+    values = np.take_along_axis(measurements, np.maximum(last, 0), axis=1)
+    return np.where(last < 0, 0.0, values)
+
+
+# Tables.
+
+
+class Words(NamedTuple):
+    """Properties of a filter that are not computed."""
+
+    assumes: str  # beyond known Q and R
+    belief: str
+    ratio: str  # time of a step in a batch over that of "ekf", rounded; `make bench` measures times
+    fails: str
+
+
+WORDS = {
+    "kf": Words("affine f and h, or nearly so around an operating point", "mean, P", "1", "away from that point"),
+    "kf-steady": Words("the same, and gaps are rare", "mean; P is for reports", "1", "as `kf`; start-up"),
+    "ekf": Words("f and h nearly linear within P", "mean, P", "1", "h nonlinear within P: badly overconfident"),
+    "iekf": Words("f nearly linear; one mode", "mean, P", "1", "two modes; full steps may overshoot"),
+    "ukf": Words(
+        "belief nearly Gaussian", "mean, P", "2", "strong nonlinearity: the gain is that of a wide average"
+    ),
+    "ckf": Words("belief nearly Gaussian", "mean, P", "1", "as `ukf`"),
+    "mhe": Words("one mode", "L steps, mean, P", "100", "two modes"),
+    "fading": Words(
+        "f and h nearly linear; the model drifts", "mean, P", "1", "a model that is right: it forgets too soon"
+    ),
+    "h-infinity": Words("bounded noise of any kind", "mean, P", "1", "random noise: larger errors than `ekf`"),
+    "schmidt": Words("some states are better not corrected", "mean, P", "1", "as `ekf`"),
+    "enkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident; sampling noise"),
+    "etkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident"),
+    "letkf": Words(
+        "as `etkf`; what is far is not correlated", "N members", "30", "a radius too small or too large"
+    ),
+    "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: overconfident"),
+    "denkf": Words("good models, poor measurements", "N members", "30", "accurate sensors: P too wide"),
+    "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong nonlinearity"),
+    "enkf-n": Words("as `etkf`; N is small", "N members", "30", "a wrong model, taken for sampling error"),
+    "rhf": Words("states follow what is measured linearly", "N members", "60", "few members; many channels: slow"),
+    "pf": Words("none on shape", "N weighted particles", "400", "few particles: one takes all the weight"),
+    "apf": Words("none on shape", "N weighted particles", "600", "as `pf`, later"),
+    "rbpf": Words(
+        "linear where the sampled states are known",
+        "N weighted Gaussians",
+        "200",
+        "few particles; others nonlinear",
+    ),
+    "gsf": Words(
+        "h nonlinear in one component of the state", "mean, P between updates", "20", "nonlinearity in others"
+    ),
+    "imm": Words("one of K models at a time", "K means and P, probabilities", "3", "a mode that no model has"),
+    "mmae": Words("one of K models, always", "K means and P, probabilities", "4", "a plant that switches"),
+    "fuzzy": Words("the state stays within a narrow range", "mean, P of 2^n rules", "3", "a wide range"),
+    "sage-husa": Words(
+        "R (and Q) unknown, steady", "mean, P, R, Q", "3", "where `ekf` fails: takes nonlinearity for noise"
+    ),
+    "vb": Words("R unknown, steady", "mean, P, distribution of R", "5", "R that changes faster than it forgets"),
+    "ekf-robust": Words("heavy-tailed v", "mean, P, last weight", "5", "a noisy sensor looks like many outliers"),
+    "open-loop": Words("a perfect model", "a point", "2", "any disturbance or wrong parameter"),
+    "low-pass": Words("slow signals", "a point", "60", "transients: it lags"),
+    "inversion": Words("h solvable for one component", "a point", "70", "noise, most where h is flat"),
+}
+
+
+class Situation(NamedTuple):
+    """A case of the decision list: runs, and filters to compare on them."""
+
+    name: str
+    runs: Callable[[], Runs]
+    filters: dict[str, Filter]
+
+
+def kinds() -> str:
+    """All filters: assumptions, belief, calls of the model in a step, and when they fail."""
+    header = ["name", "class", "assumes", "belief", "P", "likelihood", "f, h a step", "time", "fails"]
+    rows = []
+    for name, kind in FILTERS.items():
+        words = WORDS[name]
+        likelihood = "no" if not kind.has_covariance else "N(0, S)" if kind.gaussian_likelihood else "of a mixture"
+        row = [f"`{name}`", f"`{kind.__name__}`", words.assumes, words.belief]
+        row += ["yes" if kind.has_covariance else "no", likelihood, calls(name)]
+        rows.append([*row, words.ratio, words.fails])
+    return markdown_table(header, rows)
+
+
+def calls(name: str) -> str:
+    """How often a filter calls the model's f and h, or their Jacobians, in a step without substeps."""
+    members, count = 16, Counter()  # whole vector registers, so that no member is padding
+
+    def counted(letter: str, function: Callable) -> Callable:
+        def call(*arguments):
+            int(arguments[0][0])  # so that it cannot be traced: it is called
+            count[letter] += 1
+            return function(*arguments)
+
+        return call
+
+    model = thruster_model()
+    functions = {"f": ("transition", "transition_jacobian"), "h": ("observe", "observe_jacobian")}
+    fields = [(letter, field) for letter, both in functions.items() for field in both]
+    counting = {field: counted(letter, getattr(model, field)) for letter, field in fields}
+    sized = filter_type(name).has_ensemble
+    filter_ = make_filter(
+        name, model.replace(**counting, substeps=1), **({"ensemble_size": members} if sized else {})
+    )
+    with interpreted():
+        belief, _ = filter_.update(filter_.init(), [0.1])
+        for _ in range(getattr(filter_, "horizon", 0)):  # until its window is full
+            belief, _ = filter_.update(filter_.predict(belief, [12.0]), [0.1])
+        count.clear()
+        filter_.update(filter_.predict(belief, [12.0]), [0.1])
+    if not count:
+        return "none: matrices"
+    each = [count[letter] // (members if sized else 1) for letter in "fh"]
+    return ", ".join(("N" if times == 1 else f"{times} N") if sized else str(times) for times in each)
+
+
+def advice() -> str:
+    """The decision list as measured."""
+    rows = []
+    for situation in situations():
+        runs = situation.runs()
+        for number, (label, filter_) in enumerate(situation.filters.items()):
+            motor, flow, squares = errors_of(filter_, runs)
+            honesty = "" if np.isnan(squares) else digits(squares) if squares < 1000 else "> 1000"
+            rows.append(["" if number else situation.name, label, digits(motor), digits(flow), honesty])
+    return markdown_table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)
+
+
+def situations() -> list[Situation]:
+    """The cases of the decision list."""
+    plain, published, signless = thruster_model(), thruster_model(**PUBLISHED_NOISE), thruster_model(**SIGNLESS)
+    quiet, loud = plain, thruster_model(measurement_noise_cov=LOUD**2)
+    flow = augmented_model(plain, {"ambient_velocity": Unknown(std=0.5)})
+    wrong = thruster_model(parameter_factors={"voltage_gain": 0.95})
+    wrong_twice = thruster_model(parameter_factors={"voltage_gain": 0.95, "lift_coefficient": 1.15})
+    gain = {"voltage_gain": Unknown(std=0.1 * plain.constants.voltage_gain)}
+
+    def named(model: StateSpaceModel, *names: str) -> dict[str, Filter]:
+        return {f"`{name}`": make_filter(name, model) for name in names}
+
+    return [
+        Situation(
+            "levels from 11 to 13 V",
+            partial(held_runs, amplitude=1.0, centre=12.0, initial_state={"voltage": 12.0}),
+            named(thruster_model(initial_state={"voltage": 12.0}), "kf", "kf-steady", "ekf"),
+        ),
+        Situation(
+            "levels within 12 V of 0",
+            held_runs,
+            named(plain, "kf")
+            | {"`kf`, schedule of 9": make_filter("kf", plain, schedule=9)}
+            | named(plain, "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "pf", "gsf", "ekf-robust", "vb")
+            | named(plain, "open-loop", "inversion", "low-pass"),
+        ),
+        Situation(
+            "the same at the published noise",
+            partial(held_runs, **PUBLISHED_NOISE),
+            named(published, "ekf", "iekf", "ukf", "ckf", "enkf", "ienkf", "pf", "gsf", "vb", "sage-husa"),
+        ),
+        Situation(
+            "only the magnitude of the speed is measured, within 0.3 V of 0",
+            partial(signless_runs, 40),
+            named(signless, "ekf", "ukf", "enkf")
+            | {"`gsf`, component 0": make_filter("gsf", signless, component=0)}
+            | {f"`pf`, N = {size}": make_filter("pf", signless, ensemble_size=size) for size in (100, 5000)},
+        ),
+        Situation(
+            "one measurement in ten is off by 10 N",
+            partial(held_runs, **outliers(0.1)),
+            named(quiet, "ekf", "vb", "sage-husa", "ekf-robust", "imm"),
+        ),
+        Situation(
+            "R is 16 times the assumed one",
+            partial(held_runs, measurement_noise_cov=LOUD**2),
+            named(quiet, "ekf", "ekf-robust", "sage-husa", "vb") | {"`ekf`, right R": make_filter("ekf", loud)},
+        ),
+        Situation(
+            "flow of 0.6 m/s, unknown",
+            partial(held_runs, ambient_velocity=0.6),
+            named(plain, "ekf")
+            | {f"`{name}`, flow a state": make_filter(name, flow) for name in ("ekf", "enkf", "pf")},
+        ),
+        Situation(
+            "voltage gain assumed 5 % low",
+            held_runs,
+            named(wrong, "ekf") | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong, gain))},
+        ),
+        Situation(
+            "and lift assumed 15 % high",
+            held_runs,
+            named(wrong_twice, "ekf")
+            | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong_twice, gain))},
+        ),
+    ]
+
+
+FIGURES = {
+    **{f"filters_{name}.png": draw for name, draw in (GAUSSIAN | SAMPLED).items()},
+    **{f"filters_{draw.__name__}.png": draw for draw in (adaptive, baselines, augmented, varying)},
+}
+TABLES = by_name(kinds, advice, fuzzy)

@@ -1,0 +1,396 @@
+"""The picture of docs/tuning.md, and its tables on what tuning finds and gains."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import optuna
+from scipy.linalg import expm
+
+from docs.scripts import about, by_name, log_ticks, subplots
+from filters.augmented import Unknown, augmented_model
+from filters.consistency.intervals import Interval
+from filters.filter import Filter
+from filters.registry import make_filter
+from thruster_env.core.compiled import inlined
+from thruster_env.core.plots import BLUE, DARK, RUST, save_figure
+from thruster_env.core.sources import written_out
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.model.affine import affine_model
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.dynamics import Constants
+from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, scaled_default
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.experiments.benchmark import run_in_memory
+from tuning.likelihood.gradient import BAD_START, tune_by_gradient
+from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.problems.model_problem import ModelProblem
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND, SCORE, nis_violation, penalised
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.samplers import make_sampler
+from tuning.search.space import Choice, distributions, oracle_choice, parameters_of, suggest, trial_parameters
+from tuning.thruster.scenario import Scenario, find_scenario
+
+SEED, TRIALS = 0, 100
+BASELINES = SCALED, RULE, ORACLE
+COLUMNS = ["scenario", "filter", *(f"over {name}" for name in BASELINES), "N", "NEES", "NIS", "price of NIS"]
+FILTERS = ("kf", "ekf", "enkf")
+EARNING = ("mismatch", "ambient", "deadband", "outliers")  # where the true Q and R are not the best ones
+FACTORS = np.geomspace(1e-3, 1e3, 31)
+
+
+def ridge(path: Path) -> Path:
+    """Score and mean NIS of an EKF over common factors on Q and on R."""
+    scenario = find_scenario("nominal")
+    data = Plan("ekf", (scenario,), SEED).training_data()[0]
+
+    def scaled(q: float, r: float) -> tuple[float, float]:
+        q_scaled = tuple(q * v for v in scenario.process_noise_cov)
+        noise = {"process_noise_cov": q_scaled, "measurement_noise_cov": r * scenario.measurement_noise_cov}
+        evaluation = evaluate(Choice("ekf", noise, {}).filter(scenario), data, scenario.scale)
+        return evaluation.score.value, evaluation.nis.value
+
+    scores, ratios = np.array([[scaled(q, r) for q in FACTORS] for r in FACTORS]).transpose(2, 0, 1)
+    figure, (plane, line) = subplots((9.6, 4.0), 1, 2, width_ratios=(3, 2))
+    for axis in (plane.xaxis, plane.yaxis, line.xaxis, line.yaxis):
+        log_ticks(axis, (1e-3, 1e-2, 0.1, 1, 10, 100, 1000))
+    lines = plane.contour(FACTORS, FACTORS, scores, [1.005, 1.02, 1.1, 1.4, 2.0], colors=BLUE)
+    plane.clabel(lines, fmt="%g", fontsize=8)
+    plane.contourf(FACTORS, FACTORS, ratios, NIS_BAND, colors=RUST, alpha=0.3)
+    plane.plot(1, 1, "o", color=DARK, label="the plant's own Q and R")
+    plane.fill_between([], [], color=RUST, alpha=0.3, label="mean NIS between 0.8 and 1.25")
+    plane.plot([], [], color=BLUE, label="score over that of the bound")
+    plane.set(xlabel="factor on Q [-]", ylabel="factor on R [-]")
+    both = np.diag(scores), np.diag(ratios)
+    for values, colour, dashes, label in zip(both, (BLUE, RUST), ("-", "--"), ("score", "mean NIS"), strict=True):
+        line.plot(FACTORS, values, color=colour, linestyle=dashes, label=label)
+    line.set(xlabel="one factor on both, Q and R [-]", ylabel="score, mean NIS [-]")
+    plane.legend(loc="upper left", fontsize=8)
+    line.legend(frameon=False)
+    return save_figure(figure, path)
+
+
+def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
+    """What a study gains over the scaled default, the rule of thumb and the oracle."""
+    rows = []
+    for name in scenarios:
+        scenario = find_scenario(name)
+        for kind in FILTERS:
+            result = run_in_memory(Plan(kind, (scenario,), SEED), trials)
+            comparison = evaluate_held_out(result.choice, scenario, SEED)
+            ratios = [about(comparison.ratios[by]) if by in comparison.ratios else "none" for by in BASELINES]
+            size = f"{result.choice.numbers['ensemble_size']}" if result.sizes else ""
+            met = result.validation  # whose price decides between a mean NIS in its band and the log score
+            price = "" if met is None or met.price is None else f"{100 * met.price:.1f} %"
+            title = f"`{name}`" if kind == FILTERS[0] else ""
+            rows.append([title, f"`{kind}`", *ratios, size, *_consistency(comparison.tuned), price])
+    return markdown_table(COLUMNS, rows)
+
+
+def _consistency(evaluation: Evaluation) -> list[str]:
+    nees = evaluation.nees.value
+    return [f"{nees:.3g}" if nees < 1000 else "> 1000", f"{evaluation.nis.value:.2f}"]
+
+
+def recovered() -> str:
+    """Studies of a perfect linear model, from a bad start."""
+    rows = []
+    for name in ("published_tunnel", "published_open_bladed"):
+        scenario = find_scenario(name)
+        bad = bad_start("kf", scenario)
+        comparison = evaluate_held_out(
+            run_in_memory(Plan("kf", (scenario,), SEED), TRIALS, bad).choice, scenario, SEED
+        )
+        started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
+        ratios = (score_ratio(evaluation, comparison.true) for evaluation in (started, comparison.tuned))
+        rows.append([f"`{name}`", *(about(ratio, 4) for ratio in ratios)])
+    return markdown_table(["scenario", "start over oracle", "tuned over oracle"], rows)
+
+
+def maximum_likelihood() -> str:
+    """The maximum of the likelihood beside the true numbers."""
+    scenario = find_scenario("nominal")
+    result = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
+    true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
+    columns = zip(result.names, true, result.best.parameters, result.standard_errors, strict=True)
+    rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
+    return markdown_table(["", "true", "most likely", "standard error"], rows)
+
+
+def aims() -> str:
+    """Where the gradients of three objectives lead where the model is wrong, beside a study of the score."""
+    scenario = find_scenario("mismatch")
+    data = Plan("ekf", (scenario,), SEED).training_data()[0]
+    rows = []
+    for aim in (LIKELIHOOD, SCORE, MSE, LOG_SCORE):
+        result = tune_by_gradient("ekf", scenario, data, objective=aim)
+        rows.append(_proved(f"gradient of `{aim}`", result.choice, scenario, result.names, result.identified))
+    choice = run_in_memory(Plan("ekf", (scenario,), SEED), TRIALS).choice
+    rows.append(_proved(f"study of `score`, {TRIALS} trials", choice, scenario))
+    return markdown_table(["", "score over the scaled default", "NEES", "NIS", "not determined"], rows)
+
+
+def _proved(what: str, choice: Choice, scenario: Scenario, names=(), identified=()) -> list[str]:
+    comparison = evaluate_held_out(choice, scenario, SEED)
+    loose = ", ".join(name for name, known in zip(names, identified, strict=True) if not known)
+    ratio, tuned = comparison.ratios[SCALED], comparison.tuned
+    return [what, about(ratio), f"{tuned.nees.value:.3g}", f"{tuned.nis.value:.3g}", loose]
+
+
+# What a study finds again where the model is perfect.
+
+
+STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
+SEEDS = range(8)  # of studies
+EQUAL = 0.005  # a score this close to the true filter's is as good
+
+
+class Found(NamedTuple):
+    """What one study found."""
+
+    over_true: np.ndarray  # (p,), numbers over the true ones
+    score: Interval  # over that of the true filter, paired on held-out seeds
+    known: Identifiability
+
+
+def bad_start(kind: str, scenario: Scenario) -> Choice:
+    """The true filter with a hundredth of Q22 and a hundred times R."""
+    true = oracle_choice(kind, scenario)
+    q, r = np.array(true.model["process_noise_cov"]), true.model["measurement_noise_cov"]
+    bad = {"process_noise_cov": tuple((q * BAD_START[:2]).tolist()), "measurement_noise_cov": r * BAD_START[2]}
+    return true._replace(model=bad)
+
+
+@cache
+def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS) -> list[Found]:
+    """What studies with several seeds find from the bad start."""
+    scenario = find_scenario(name)
+    true, recovered = parameters_of(oracle_choice(kind, scenario)), []
+    for seed in seeds:
+        plan = Plan(kind, (scenario,), seed)
+        choice = run_in_memory(plan, trials, bad_start(kind, scenario)).choice
+        comparison = evaluate_held_out(choice, scenario, seed)
+        known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
+        ratios = known.tuned / [true[number] for number in known.names]
+        recovered.append(Found(ratios, score_ratio(comparison.tuned, comparison.true), known))
+    return recovered
+
+
+def numbers_found() -> str:
+    """Numbers over the true ones, and what the innovations determine."""
+    rows = []
+    for kind, name, trials in STUDIES:
+        recovered = found_again(kind, name, trials)
+        title = f"`{name}`, `{kind}`, {trials} trials"
+        for i, number in enumerate(recovered[0].known.names):
+            ratios = [study.over_true[i] for study in recovered]
+            factors = [study.known.factors[i] for study in recovered if study.known.identified[i]]
+            span, start = f"{min(ratios):.2g} to {max(ratios):.2g}", f"{BAD_START[i]:g}"
+            within = f"within a factor of {max(factors):.2f}" if factors else "no"
+            part = f" in {len(factors)} of {len(recovered)}" if 0 < len(factors) < len(recovered) else ""
+            rows.append(["" if i else title, number, start, span, within + part])
+    return markdown_table(["study", "", "start over true", "found over true", "determined"], rows)
+
+
+def scores_reached() -> str:
+    """Excess of the score over the true filter's."""
+    rows = []
+    for kind, name, trials in STUDIES:
+        scores = sorted(study.score for study in found_again(kind, name, trials))
+        median = np.median([score.value for score in scores])
+        excess = [f"{100 * (value - 1):.2f} %" for value in (median, scores[-1].value)]
+        worst = " to ".join(f"{100 * (end - 1):.2f}" for end in scores[-1][1:])
+        count = sum(score.high < 1 + EQUAL for score in scores)
+        title = f"`{name}`, `{kind}`, {trials} trials"
+        rows.append([title, excess[0], f"{excess[1]} ({worst})", f"{count} of {len(scores)}"])
+    return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
+
+
+# A chain of masses whose springs the filter has wrong: many numbers.
+
+
+MASSES, MEASURED, DT, STEPS = 5, (0, 2, 4), 0.1, 300
+STIFFNESS, DAMPING = 4.0, 0.2  # over the mass
+WRONG = 0.5  # relative errors of the springs, at most
+
+
+def masses() -> ModelProblem:
+    """Positions and speeds of masses between springs, of which the filter has the stiffness wrong."""
+    random, n = np.random.default_rng(1), MASSES
+    springs = STIFFNESS * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    motion = np.block([[np.zeros((n, n)), np.eye(n)], [-springs, -DAMPING * np.eye(n) - 0.02 * springs]])
+    q = np.concatenate([1e-5 * np.exp(random.normal(0, 1, n)), 1e-2 * np.exp(random.normal(0, 1.5, n))])
+    r = 1e-2 * np.exp(random.normal(0, 1, len(MEASURED)))
+    wrong = motion.copy()
+    wrong[n:, :n] *= 1.0 + WRONG * random.uniform(-1, 1, (n, n))
+
+    def model(of: np.ndarray, q: np.ndarray, r: np.ndarray):
+        return affine_model(
+            a=expm(of * DT),
+            b=np.zeros((2 * n, 1)),
+            c=np.eye(2 * n)[list(MEASURED)],
+            process_noise_cov=q,
+            measurement_noise_cov=r,
+            prior_mean=np.zeros(2 * n),
+            prior_cov=0.1 * np.eye(2 * n),
+        )
+
+    assumed = model(wrong, np.full(2 * n, 1e-3), np.full(len(MEASURED), 0.1))
+    return ModelProblem(model(motion, q, r), assumed, np.zeros((STEPS, 1)), name="masses")
+
+
+def many() -> str:
+    """The score of searches among many numbers, over that of the given Q and R."""
+    problem = masses()
+    plan = Plan("kf", (problem,))
+    data, study = plan.training_data(), run_in_memory(plan, TRIALS)
+    rows, choices = [], {f"study of diagonal Q and R, {TRIALS} trials": study.choice}
+    for name, options in (("diagonal", {}), ("full", {"full_q": True, "full_r": True})):
+        ended = tune_by_gradient("kf", problem, data, [1.0], "score", options)
+        choices[f"gradient of the score, {name} Q and R, {len(ended.free)} numbers"] = ended.choice
+    for name, choice in choices.items():
+        comparison = evaluate_held_out(choice, problem, plan.seed)
+        if not rows:
+            ratio = score_ratio(comparison.evaluations[NOISE], comparison.evaluations[GIVEN])
+            rows.append(["noise estimation", f"{ratio.value:.2f}"])
+        rows.append([name, f"{comparison.ratios[GIVEN].value:.2f}"])
+    return markdown_table(["", "score over the given one"], rows)
+
+
+# What tuning can buy where the model is wrong.
+
+
+SCENARIO = "mismatch"
+LIFT = "lift_factor"  # on the lift coefficient, which enters several constants of the model
+SLOPES = tuple(name for name in Constants._fields if name.startswith(("thrust_", "torque_")))
+LiftedConstants = namedtuple("LiftedConstants", (*Constants._fields, LIFT, *(f"slope_{name}" for name in SLOPES)))
+UNKNOWNS = {  # what a further state stands for, by how the table calls it
+    "the lift coefficient": (LIFT,),
+    "the voltage gain K2": ("voltage_gain",),
+    "the load gain K_h": ("load_gain",),
+    "lift and K2": (LIFT, "voltage_gain"),
+    "lift, K2 and K1": (LIFT, "voltage_gain", "motor_damping"),
+}
+SPREADS, WALKS = (0.01, 0.5), (1e-6, 0.1)  # of the prior and of a step's change, as parts of the constant
+START = 0.15, 1e-3
+BOUGHT = ["what is tuned", "over the scaled default", "omega_m [rad/s]", "U_a [m/s]", "NEES", "NIS"]
+RIGHT = "`ekf` with the right parameters, scaled default"
+OUTSIDE = 10.0  # what a mean NIS outside its band costs, by its logarithm
+
+
+def plans() -> dict[str, Plan]:
+    """Studies of the package, by how the table calls them."""
+    scenarios = (find_scenario(SCENARIO),)
+    kinds = {"`ekf`, Q and R": "ekf", "`ekf`, full Q": "ekf", "`enkf`, inflation and relaxation, too": "enkf"}
+    kinds |= {f"`{kind}`": kind for kind in ("sage-husa", "vb", "ekf-robust")}
+    return {name: Plan(kind, scenarios, SEED, full_q="full" in name) for name, kind in kinds.items()}
+
+
+def lifted(scenario: Scenario, **changes) -> StateSpaceModel:
+    """The model of a scenario with a factor on the lift among its constants; forces are linear in it."""
+    factors = dict(scenario.parameter_factors)
+    more = factors | {"lift_coefficient": 2.0 * factors.get("lift_coefficient", 1.0)}
+    model, double = (scenario.model(**{"parameter_factors": f, **changes}) for f in (factors, more))
+    slopes = [getattr(double.constants, name) - getattr(model.constants, name) for name in SLOPES]
+    values = [
+        f"c.{name} + (c.{LIFT} - 1.0) * c.slope_{name}" if name in SLOPES else f"c.{name}"
+        for name in Constants._fields
+    ]
+    fill = written_out("fill", "c", f"Constants({', '.join(values)})", Constants=Constants)
+    functions = {
+        name: written_out(name, f"{arguments}, c", f"plain({arguments}, fill(c))", fill=fill, plain=inlined(plain))
+        for name, arguments, plain in (
+            ("transition", "x, u", model.transition),
+            ("observe", "x", model.observe),
+            ("transition_jacobian", "x, u", model.transition_jacobian),
+            ("observe_jacobian", "x", model.observe_jacobian),
+        )
+    }
+    return model.replace(**functions, constants=LiftedConstants(*model.constants, 1.0, *slopes))
+
+
+def augmented(choice: Choice, scenario: Scenario, beliefs: Mapping[str, tuple[float, float]]) -> Filter:
+    """An EKF of a choice's Q and R that also estimates constants; beliefs are parts of them, (prior, step)."""
+    model = lifted(scenario, **choice.model)
+    unknown = {
+        name: Unknown(*(part * getattr(model.constants, name) for part in parts))
+        for name, parts in beliefs.items()
+    }
+    return make_filter("ekf", augmented_model(model, unknown))
+
+
+def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[Choice], trials: int) -> Filter:
+    """An EKF with constants as states: a study of Q, R, and of the prior and the walk of each constant.
+
+    Its first trials have the Q and R of `starts`. The value is the score, with a penalty where the mean NIS is
+    outside its band.
+    """
+    plan = Plan("ekf", (scenario,), SEED)
+    data = plan.training_data()[0]
+    space = distributions("ekf", scenario)
+
+    def filter_of(trial) -> Filter:
+        beliefs = {
+            name: (
+                trial.suggest_float(f"{name} prior", *SPREADS, log=True),
+                trial.suggest_float(f"{name} walk", *WALKS, log=True),
+            )
+            for name in names
+        }
+        return augmented(suggest(trial, "ekf", scenario, space), scenario, beliefs)
+
+    def value(trial) -> float:
+        evaluation = evaluate(filter_of(trial), data, scenario.scale)
+        return penalised(evaluation.score.value, evaluation) + OUTSIDE * max(0.0, nis_violation(evaluation))
+
+    study = optuna.create_study(sampler=make_sampler("tpe", SEED, 0, {}, first=plan.first_ranges()))
+    first = dict(zip(("prior", "walk"), START, strict=True))
+    beliefs = {f"{name} {part}": number for name in names for part, number in first.items()}
+    for start in starts:
+        study.enqueue_trial({**trial_parameters(start, space), **beliefs})
+    study.optimize(value, n_trials=trials)
+    return filter_of(optuna.trial.FixedTrial(study.best_params))
+
+
+def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int = HELD_OUT_SEEDS) -> str:
+    """What each way of tuning buys on held-out seeds, all against the scaled default of the EKF.
+
+    Args:
+        trials: of each study; twice as many where constants are states.
+        rows: of the table; all by default.
+        seeds: number of held-out ones.
+    """
+    scenario = find_scenario(SCENARIO)
+    held_out = scenario.data(scenario.held_out_seeds(SEED, seeds))
+    default = scaled_default("ekf", scenario, SEED).choice
+    known = scenario.replace(parameter_factors={})
+    filters: dict[str, Callable[[], Filter]] = {
+        name: lambda plan=plan: run_in_memory(plan, trials).choice.filter(scenario)
+        for name, plan in plans().items()
+    }
+    starts = run_in_memory(plans()["`ekf`, Q and R"], trials).choice, default
+    filters |= {
+        f"`ekf` + {name}": lambda names=names: tuned_augmented(scenario, names, starts, 2 * trials)
+        for name, names in UNKNOWNS.items()
+    }
+    filters[RIGHT] = lambda: scaled_default("ekf", known, SEED).choice.filter(known)
+    base = evaluate(default.filter(scenario), held_out, scenario.scale)
+    lines = [_line("`ekf`, scaled default", base, base)]
+    for name in rows if rows is not None else filters:
+        lines.append(_line(name, evaluate(filters[name](), held_out, scenario.scale), base))
+    return markdown_table(BOUGHT, lines)
+
+
+def _line(name: str, evaluation: Evaluation, base: Evaluation) -> list[str]:
+    ratio, (speed, flow) = score_ratio(evaluation, base), evaluation.rmse
+    return [name, about(ratio), f"{speed.value:.3f}", f"{flow.value:.4f}", *_consistency(evaluation)]
+
+
+FIGURES = {"tuning_ridge.png": ridge}
+TABLES = by_name(earned, recovered, maximum_likelihood, aims, numbers_found, scores_reached, many, bought)

@@ -1,0 +1,485 @@
+"""The tables of docs/tuning.md on objectives, pruning and wrong choices; each takes some minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from optuna.trial import TrialState
+from scipy.stats import t as student
+
+from docs.scripts import by_name
+from filters.consistency.intervals import Interval
+from thruster_env.core.text_tables import markdown_table
+from thruster_env.logs.log import Log
+from thruster_env.model.affine import affine_model
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.experiments.benchmark import run_in_memory
+from tuning.problems.log_parts import Block, parts_of
+from tuning.problems.log_problem import LogProblem
+from tuning.search.measures import Measured, Runs, over, signed_rank
+from tuning.search.objectives import LOG_SCORE, nees_ratio, nis_ratio
+from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
+from tuning.search.space import Choice, choice_of
+from tuning.search.trials import measure
+from tuning.search.validation import Choosing
+from tuning.thruster.scenario import find_scenario
+
+OBJECTIVE_SCENARIOS = "nominal", "published_tunnel", "outliers", "mismatch", "startup"
+OBJECTIVE_SEEDS, OBJECTIVE_TRIALS, FILTER = range(5), 40, "ekf"
+
+
+def by_objective(name: str, seed: int, trials: int = OBJECTIVE_TRIALS) -> list[Evaluation]:
+    """The filters that studies of the score, with the mean NIS in its band, and of the log score choose."""
+    plans = [Plan(FILTER, (find_scenario(name),), seed, (objective,)) for objective in ("score", LOG_SCORE)]
+    return [held_out(run_in_memory(plan, trials).choice, plan) for plan in plans]
+
+
+def held_out(choice: Choice, plan: Plan) -> Evaluation:
+    """A filter on the held-out seeds of a plan's scenario."""
+    (scenario,) = plan.scenarios
+    data = scenario.data(scenario.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
+    return evaluate(choice.filter(scenario), data, scenario.scale)
+
+
+def objectives() -> str:
+    """Score, NEES and NIS by either objective, a row a scenario: medians over studies, and all ratios."""
+    rows = []
+    for name in OBJECTIVE_SCENARIOS:
+        pairs = [by_objective(name, seed) for seed in OBJECTIVE_SEEDS]
+        ratios = [score_ratio(by_log_score, by_score).value for by_score, by_log_score in pairs]
+        cells = [f"{np.median(ratios):.3f}", f"{min(ratios):.3f} to {max(ratios):.3f}"]
+        for ratio in (nees_ratio, nis_ratio):
+            for index in range(2):
+                cells.append(f"{np.median([ratio(study_pair[index]) for study_pair in pairs]):.3g}")
+        rows.append([f"`{name}`", *cells])
+    heads = ["scenario", "score, log score over score", "single studies", "NEES, by score", "by log score"]
+    return markdown_table([*heads, "NIS, by score", "by log score"], rows)
+
+
+# Do studies with and without pruning end at the same score? Wilcoxon's test ranks the scores of single runs, the
+# objective pools the squares of all: where few runs carry the error, the two could disagree.
+
+
+PRUNING_CASES = (*product(("startup", "outliers"), ("ekf", "enkf")), ("mismatch", "ekf"))
+PRUNING_SEEDS, PRUNING_TRIALS = range(10), 60
+TOP_RUNS = 3  # of the training runs, whose part in the squares is told
+
+
+class PruningPair(NamedTuple):
+    """One study with pruning and the same without."""
+
+    ratio: float  # score of what the one chose over that of the other, on the same held-out seeds
+    pruned: int  # trials that ended early
+    missed: int  # of them, those whose score on all training seeds is below the best of their study
+    gain: float  # the lowest of those scores over that best; 1 where none is below
+    skipped: float  # share of the runs that pruning saved
+    concentration: float  # share of the best trial's squares in its worst runs, the larger of the states'
+
+
+def pruning_pair(kind: str, name: str, trials: int, seed: int) -> PruningPair:
+    """Run a study of a filter on a scenario with pruning and without, and score again what was pruned."""
+    scenario = find_scenario(name)
+    plans = [Plan(kind, (scenario,), seed, prune=prune) for prune in (True, False)]
+    pruned, unpruned = (run_in_memory(plan, trials) for plan in plans)
+    plan, training, best = plans[1], plans[1].training_data(), pruned.best_value
+    early = [trial for trial in pruned.trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
+    choices = [choice_of(kind, trial.params, scenario) for trial in early]
+    full_scores = [measure(choice, plan, training)[0].score.value for choice in choices]
+    (chosen,) = measure(pruned.choice, plan, training)
+    worst = np.sort(chosen.mean_squares, axis=0)[-TOP_RUNS:].sum(axis=0) / chosen.mean_squares.sum(axis=0)
+    return PruningPair(
+        score_ratio(held_out(pruned.choice, plan), held_out(unpruned.choice, plan)).value,
+        len(early),
+        sum(value < best for value in full_scores),
+        min([1.0, *(value / best for value in full_scores)]),
+        sum(TRAINING_SEEDS - len(trial.intermediate_values) for trial in early) / (TRAINING_SEEDS * trials),
+        float(worst.max()),
+    )
+
+
+def over_studies(ratios: Sequence[float]) -> Interval:
+    """Geometric mean of ratios of independent studies, with Student's 95 % interval of their logarithms."""
+    logs = np.log(ratios)
+    half = student.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / len(logs) ** 0.5
+    return Interval(*np.exp([logs.mean(), logs.mean() - half, logs.mean() + half]))
+
+
+def pruning() -> str:
+    """With pruning over without, a row per filter and scenario."""
+    rows = []
+    for name, kind in PRUNING_CASES:
+        pairs = [pruning_pair(kind, name, PRUNING_TRIALS, seed) for seed in PRUNING_SEEDS]
+        ratios, pruned, missed, gains, skipped, shares = zip(*pairs, strict=True)
+        ratio = over_studies(ratios)
+        cells = [
+            f"{100 * np.mean(shares):.0f} %",
+            f"{ratio.value:.4f} [{ratio.low:.4f}, {ratio.high:.4f}]",
+            f"{min(ratios):.3f} to {max(ratios):.3f}",
+            f"{sum(missed)} of {sum(pruned)}",
+            f"{100 * (1 - min(gains)):.2f} %",
+            f"{100 * np.mean(skipped):.0f} %",
+        ]
+        rows.append([f"`{name}`", f"`{kind}`", *cells])
+    header = ["scenario", "filter", f"squares in {TOP_RUNS} of {TRAINING_SEEDS} runs", "with over without"]
+    return markdown_table([*header, "single studies", "better ones pruned", "by at most", "runs saved"], rows)
+
+
+# How often is the choice wrong? A study here is a Kalman filter of x_{k+1} = 0.95 x_k + w, z = x + v, whose Q and
+# R come from a grid. The six grid points that are best on the training runs meet the given Q and R on validation
+# runs, and the choice is that of `tuning.search.validation`. It is wrong if the held-out 95 % interval, paired by
+# run, says so.
+
+
+A, Q, R = 0.95, 0.05, 0.3
+GRID = np.array([(q, r) for q in np.logspace(-2.6, 0.8, 12) for r in np.logspace(-1.3, 0.7, 8)])
+FINALISTS = 6
+ROWS, SHORT_ROWS, RUN_STEPS, LEAD_IN = 1500, 200, 60, 20
+STUDIES, TRUTH_STUDIES, SIZE_STUDIES = 200, 300, 2000
+CHUNK = 50  # studies that are simulated at once
+OLD_BLOCKS, EVERY_FOURTH = 8, 4  # of a log, and the share that was set aside, before there were 72 blocks
+GIVEN = "given"
+TIMES = (0, 60, 120, 240)  # time constants of scores [rows]
+
+NOISE = {"process_noise_cov": [Q], "measurement_noise_cov": [R]}
+MODEL = affine_model(a=[[A]], b=[[1.0]], c=[[1.0]], **NOISE, prior_mean=[0.0], prior_cov=[1.0])
+
+
+class Case(NamedTuple):
+    """Logs or runs, and the Q and R that the user had."""
+
+    about: str
+    user_factors: tuple[float, float] = (1.0, 1.0)  # on Q and R of the plant, or of the optimum on other logs
+    runs: Mapping[str, Any] = {}  # of `simulated`, for all logs
+    second: Mapping[str, Any] | None = None  # of the second of three logs, if it differs
+    rows: int = ROWS
+    from_optimum: bool = False
+
+
+BURST = {"burst": (30, 6.0, 1.0)}  # rows, and factors on the deviations of w and v
+CASES = (
+    Case("given: Q x 10", (10.0, 1.0)),
+    Case("given: Q x 2", (2.0, 1.0)),
+    Case("given = the plant's"),
+    Case("given = optimum of other logs, t noise of 2.5 degrees in w", runs={"w_degrees": 2.5}, from_optimum=True),
+    Case("the same, Q / 4", (0.25, 1.0), {"w_degrees": 2.5}, from_optimum=True),
+    Case("given = optimum of other logs, 1 % outliers of 10 sigma", runs={"outliers": 0.01}, from_optimum=True),
+    Case("the same, Q / 4", (0.25, 1.0), {"outliers": 0.01}, from_optimum=True),
+    Case("one log has 30 rows with 6 times the noise; given: Q / 5", (0.2, 1.0), second=BURST),
+    Case(
+        "one log has 30 rows with 10 times the sensor noise; given: R / 2.5",
+        (1.0, 0.4),
+        second={"burst": (30, 1, 10)},
+    ),
+    Case("the same, given = the plant's of the other rows", second={"burst": (30, 1.0, 10.0)}),
+    Case("one log has 4 times the noise; given = the plant's of the others", second={"q": 16.0 * Q}),
+    Case("one log has 2 times the noise; given: Q / 3", (1 / 3, 1.0), second={"q": 4.0 * Q}),
+    Case("logs of 200 rows; given: Q x 10", (10.0, 1.0), rows=SHORT_ROWS),
+    Case("logs of 200 rows; given = the plant's", rows=SHORT_ROWS),
+    Case(
+        "slow drift of the sensor, unmodelled; given = optimum of other logs",
+        runs={"drift": 1.0},
+        from_optimum=True,
+    ),
+)
+TRUTH_CASES = (
+    Case("given: Q x 3", (3.0, 1.0)),
+    Case("given: Q x 1.3", (1.3, 1.0)),
+    Case("given = the plant's"),
+    Case("1 % outliers of 10 sigma; given: Q x 3", (3.0, 1.0), {"outliers": 0.01}),
+    Case("1 % outliers of 10 sigma; given = the core's", (1.0, 1.0), {"outliers": 0.01}),
+    Case("3 % of runs have 30 times the noise in 10 rows; given: Q x 1.5", (1.5, 1.0), {"rare": (0.03, 10, 30.0)}),
+    Case("the same, given = the plant's of the other runs", (1.0, 1.0), {"rare": (0.03, 10, 30.0)}),
+)
+
+
+class Rates(NamedTuple):
+    """Shares of studies [%]."""
+
+    changed: float  # a trial is taken
+    false_keeps: float  # what was given is kept, and the best trial is significantly better held out
+    false_changes: float  # a trial is taken, and it is significantly worse held out
+
+
+def simulated(
+    generator: np.random.Generator,
+    runs: int,
+    rows: int,
+    *,
+    q: float = Q,
+    w_degrees: float = 0.0,
+    outliers: float = 0.0,
+    drift: float = 0.0,
+    burst: tuple[int, float, float] | None = None,
+    rare: tuple[float, int, float] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """States and measurements of the plant, (rows, runs) each.
+
+    Args:
+        generator: of random numbers.
+        runs: their number.
+        rows: of each.
+        q: variance of w.
+        w_degrees: degrees of freedom of w, Student's t of the same variance; 0 for a normal distribution.
+        outliers: share of measurements with ten times the noise.
+        drift: deviation of a sensor drift with a time constant of 300 rows, over that of v.
+        burst: rows in which w and v have so many times the deviation, anywhere after row 60.
+        rare: share of runs with a burst, its rows, and the factor on w.
+    """
+    w, v = generator.standard_normal((2, rows, runs))
+    if w_degrees:
+        w = generator.standard_t(w_degrees, (rows, runs)) * np.sqrt(1.0 - 2.0 / w_degrees)
+    v = np.where(generator.random((rows, runs)) < outliers, 10.0 * v, v)
+    if drift:
+        v += drift * _slow(generator.standard_normal((rows, runs)), 300.0)
+    if burst is not None or rare is not None:
+        length, of_w, of_v = burst if burst is not None else (*rare[1:], 1.0)
+        first = generator.integers(min(LEAD_IN, 60), rows - length, runs)
+        if rare is not None:
+            first = np.where(generator.random(runs) < rare[0], first, rows)
+        inside = (np.arange(rows)[:, None] >= first) & (np.arange(rows)[:, None] < first + length)
+        w, v = np.where(inside, of_w * w, w), np.where(inside, of_v * v, v)
+    states, x = np.empty((rows, runs)), np.zeros(runs)
+    for row in range(rows):
+        states[row] = x = A * x + np.sqrt(q) * w[row]
+    return states, states + np.sqrt(R) * v
+
+
+def _slow(noise: np.ndarray, time: float) -> np.ndarray:
+    """A first-order process of unit variance from white noise (rows, ...)."""
+    r, values = np.exp(-1.0 / time), noise.copy()
+    for row in range(1, len(noise)):
+        values[row] = r * values[row - 1] + np.sqrt(1.0 - r * r) * noise[row]
+    return values
+
+
+def scores(states: np.ndarray, measured: np.ndarray, grid: np.ndarray, truth: bool) -> np.ndarray:
+    """Square errors or negative log-likelihoods of Kalman filters, (rows, runs, grid)."""
+    q, r = grid.T
+    p, x = np.ones(len(q)), np.zeros((measured.shape[1], len(q)))
+    values = np.empty((*measured.shape, len(q)), np.float32)
+    for row in range(len(measured)):
+        p, x = A * A * p + q, A * x
+        s = p + r
+        innovation = measured[row, :, None] - x
+        x, p = x + p / s * innovation, p * r / s
+        values[row] = (
+            (states[row, :, None] - x) ** 2 if truth else 0.5 * (np.log(2.0 * np.pi * s) + innovation**2 / s)
+        )
+    return values
+
+
+def empty_logs(count: int, rows: int) -> list[Log]:
+    """Logs of zeros, for their blocks."""
+    channels = MODEL.input_quantities, MODEL.measurements
+    return [Log(f"run{i}", 1.0, np.zeros((rows - 1, 1)), np.zeros((rows, 1)), *channels) for i in range(count)]
+
+
+def blocks_of(logs: int, rows: int, old: bool = False) -> tuple[list[Block], list[Block], list[Block], int]:
+    """Training, validation and held-out blocks of logs, and their lead-in, now or as they were."""
+    blocks = min(OLD_BLOCKS, (rows - 50) // 25) if old else None
+    parts = parts_of(empty_logs(logs, rows), blocks=blocks, sizes=True)
+    training, validation, held_out = (
+        [parts.blocks[i] for i in numbers] for numbers in (parts.training, parts.sizes, parts.held_out)
+    )
+    if old:
+        both = sorted([*training, *validation])
+        validation = both[EVERY_FOURTH - 1 :: EVERY_FOURTH]
+        training = [block for block in both if block not in validation]
+    return training, validation, held_out, parts.lead
+
+
+def plan_of(truth: bool) -> Plan:
+    """A plan whose objective is the score or the likelihood, without a band on the NIS."""
+    problem = LogProblem(empty_logs(3, 400), MODEL, apart=False)
+    return Plan("kf", (problem,), objectives=("score" if truth else "likelihood",), consistent=False)
+
+
+def measured_of(values: np.ndarray, truth: bool, logs: np.ndarray | None = None) -> Measured:
+    """A filter by its values (B,) of each run: mean square errors, or negative log-likelihoods."""
+    count, total = len(values), values.sum()
+    root = np.sqrt if truth else np.asarray
+    left_out = root((total - values) / (count - 1))
+    ones = np.ones(count)
+    return Measured(
+        float(root(total / count)),
+        (left_out,),
+        0.0,
+        (1.0,),
+        runs=(Runs(values[:, None], ones, ones, logs),),
+        decisive=(0,),
+    )
+
+
+def is_significant(a: Measured, b: Measured, truth: bool) -> tuple[bool, bool]:
+    """Whether a filter is significantly better than another one, and whether significantly worse."""
+    ratio, equal = over(a, b, ratio=truth), float(truth)
+    return ratio.high < equal, ratio.low > equal
+
+
+def before(choosing: Choosing) -> str:
+    """The choice as it was: the best trial, if its interval says that it is better."""
+    return (
+        choosing.best if is_significant(_trial(choosing), choosing.baselines[GIVEN], choosing.ratio)[0] else GIVEN
+    )
+
+
+def after(choosing: Choosing) -> str:
+    """The choice of a study: the first trial in order that can be taken."""
+    return next((name for name in choosing.order() if choosing.wins(name)), GIVEN)
+
+
+def _trial(choosing: Choosing) -> Measured:
+    return choosing.trials[choosing.best]
+
+
+def case_rates(case: Case, truth: bool, studies: int = STUDIES, chunk: int = CHUNK) -> tuple[Rates, Rates]:
+    """Rates of wrong choices in a case, before and after.
+
+    Args:
+        case: what is simulated, and given.
+        truth: whether errors of runs are compared, and not likelihoods of blocks of three logs.
+        studies: their number.
+        chunk: studies that are simulated at once.
+    """
+    plan, counts = plan_of(truth), np.zeros((2, 3))
+    start = _optimum(case.runs) if case.from_optimum else np.array([Q, R])
+    grid = np.vstack([GRID, start * case.user_factors])
+    for first in range(0, studies, chunk):
+        generator = np.random.default_rng(first)
+        count = min(chunk, studies - first)
+        sets = _runs_of(case, grid, generator, count) if truth else _blocks_of(case, grid, generator, count)
+        for which, (training, validation, held_out, logs) in enumerate(sets):
+            for study in range(count):
+                counts[which] += _outcome(
+                    plan, truth, training[study], validation[study], held_out[study], logs, (before, after)[which]
+                )
+    return Rates(*(100.0 * counts[0] / studies)), Rates(*(100.0 * counts[1] / studies))
+
+
+def _outcome(plan, truth, training, validation, held_out, logs, choose) -> np.ndarray:
+    """Whether one study takes a trial, keeps wrongly and changes wrongly."""
+    finalists = np.argsort(training.sum(axis=0)[:-1])[:FINALISTS].tolist()
+    trials = {str(i): measured_of(validation[:, i], truth, logs) for i in finalists}
+    choosing = Choosing(plan, {GIVEN: measured_of(validation[:, -1], truth, logs)}, trials)
+    chosen = choose(choosing)
+    tested = {name: measured_of(held_out[:, int(name)], truth) for name in {choosing.best, chosen} - {GIVEN}}
+    baseline = measured_of(held_out[:, -1], truth)
+    if chosen == GIVEN:
+        return np.array([False, is_significant(tested[choosing.best], baseline, truth)[0], False])
+    return np.array([True, False, is_significant(tested[chosen], baseline, truth)[1]])
+
+
+def _optimum(runs: Mapping[str, Any]) -> np.ndarray:
+    """The most likely Q and R of the grid on other, long logs."""
+    values = scores(*simulated(np.random.default_rng(999), 8, 4000, **runs), GRID, False)
+    return GRID[values.sum(axis=(0, 1)).argmin()]
+
+
+def _blocks_of(case: Case, grid: np.ndarray, generator: np.random.Generator, studies: int):
+    """Sums of negative log-likelihoods over blocks, (studies, blocks, grid), by old and by new blocks."""
+    sums = []
+    for log in range(3):
+        options = case.second if log == 1 and case.second is not None else case.runs
+        values = scores(*simulated(generator, studies, case.rows, **options), grid, False)
+        sums.append(np.cumsum(np.concatenate([np.zeros_like(values[:1]), values]), axis=0, dtype=np.float64))
+    held_out = blocks_of(3, case.rows)[2]
+    for old in (True, False):
+        training, validation, _, lead = blocks_of(3, case.rows, old)
+        arrays = [
+            np.stack(
+                [
+                    sums[block.run][block.first + block.rows] - sums[block.run][block.first + lead]
+                    for block in blocks
+                ],
+                axis=1,
+            )
+            for blocks in (training, validation, held_out)
+        ]
+        yield *arrays, None if old else np.array([block.run for block in validation])
+
+
+def _runs_of(case: Case, grid: np.ndarray, generator: np.random.Generator, studies: int):
+    """Mean square errors of training, validation and held-out runs, (studies, runs, grid), twice."""
+    arrays = []
+    for count in (TRAINING_SEEDS, VALIDATION_SEEDS, HELD_OUT_SEEDS):
+        states, measured = simulated(generator, studies * count, RUN_STEPS, **case.runs)
+        values = scores(states, measured, grid, True)[LEAD_IN:].mean(axis=0, dtype=np.float64)
+        arrays.append(values.reshape(studies, count, -1))
+    for _ in range(2):
+        yield *arrays, None
+
+
+def choice_size(time: float, heavy: bool, studies: int = SIZE_STUDIES) -> tuple[float, float, float, float]:
+    """Shares [%] of studies that take a trial which is as good as what was given, if scores are autocorrelated.
+
+    Differences of scores have the mean zero and a time constant. Blocks as of three logs of 1500 rows.
+
+    Returns:
+        By Student's interval over all blocks of the two logs, one after the other; over those that are set aside,
+        every third; by signed ranks of these; by the choice, which takes either, with the effective number.
+    """
+    generator, length, count = np.random.default_rng(5), 60, 24
+    noise = (
+        generator.standard_t(2.5, (2, length * count, studies))
+        if heavy
+        else generator.standard_normal((2, length * count, studies))
+    )
+    rows = [_slow(log, time) if time else log for log in noise]
+    blocks = np.concatenate([log.reshape(count, length, studies).sum(axis=1) for log in rows])
+    logs, plan, accepted = np.repeat([0, 1], count), plan_of(False), np.zeros(4)
+    for values in blocks.T:
+        zero = np.zeros_like(values)
+        all_blocks = [measured_of(part, False) for part in (values, zero)]
+        apart = [measured_of(part[2::3], False) for part in (values, zero)]
+        trial, baseline = (measured_of(part[2::3], False, logs[2::3]) for part in (values, zero))
+        choosing = Choosing(plan, {GIVEN: baseline}, {"0": trial})
+        accepted += [
+            is_significant(*all_blocks, False)[0],
+            is_significant(*apart, False)[0],
+            signed_rank(*apart, ratio=False) < 0.025 and apart[0].value < 0.0,
+            choosing.wins("0"),
+        ]
+    return tuple((100.0 * accepted / studies).tolist())
+
+
+def _table(cases: Sequence[Case], truth: bool, studies: int) -> str:
+    rows = []
+    for case in cases:
+        rates = case_rates(case, truth, studies)
+        rows.append([case.about, *(f"{share:.1f}" for part in rates for share in part)])
+    parts = "changed", "false keeps", "false changes"
+    return markdown_table(["case", *(f"{part}, {when} [%]" for when in ("before", "now") for part in parts)], rows)
+
+
+def log_choices(studies: int = STUDIES) -> str:
+    """Wrong choices on logs, a row a case."""
+    return _table(CASES, False, studies)
+
+
+def truth_choices(studies: int = TRUTH_STUDIES) -> str:
+    """Wrong choices on seeds with true states, a row a case."""
+    return _table(TRUTH_CASES, True, studies)
+
+
+def choice_sizes(studies: int = SIZE_STUDIES) -> str:
+    """Sizes of the tests under autocorrelated scores, a row a time constant."""
+    rows = []
+    for heavy in (False, True):
+        for time in TIMES:
+            shares = choice_size(time, heavy, studies)
+            rows.append(
+                ["t, 2.5 degrees" if heavy else "normal", str(time), *(f"{share:.1f}" for share in shares)]
+            )
+    heads = (
+        "all blocks, Student [%]",
+        "every third, Student [%]",
+        "every third, signed ranks [%]",
+        "the choice [%]",
+    )
+    return markdown_table(["scores", "time constant [rows]", *heads], rows)
+
+
+TABLES = by_name(objectives, pruning, log_choices, truth_choices, choice_sizes)

@@ -1,1 +1,0 @@
-"""Tuning on problems as users have them: whether a tuned filter is ever worse than what they had before."""
