@@ -15,95 +15,29 @@ and torch tensors and compiles with numba.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 from thruster_env.core.compiled import inlined
 
+Constants = namedtuple(
+    "Constants",
+    "heaviness righting nose_weight "  # W - B [N], z_G W [N m], x_G W [N m]
+    "x_u x_uu x_wq x_qq x_vr x_rr x_pr "
+    "y_v y_vv y_uv y_r y_rr y_ur y_qr y_wp y_pq y_uudr "
+    "z_w z_ww z_uw z_q z_qq z_uq z_q2 z_p2 z_vp z_rp z_uuds "  # z_q2 of q^2, z_qq of q |q|
+    "k_p k_pp k_up k_wp k_ur k_qr "
+    "m_w m_ww m_uw m_q m_qq m_uq m_wq m_vr m_vp m_rp m_uuds "
+    "n_v n_vv n_uv n_r n_rr n_ur n_wp n_pq n_uudr "
+    "u_of_X u_of_Z u_of_M v_of_Y v_of_K v_of_N w_of_X w_of_Z w_of_M "
+    "p_of_Y p_of_K p_of_N q_of_X q_of_Z q_of_M r_of_Y r_of_K r_of_N "
+    "propeller_torque "  # K_prop over X_prop [m], where that is no input
+    "substep",  # time step of one integration step [s]
+)
+"""The constants of the equations; `parameters.derive_constants` computes them from a vehicle.
 
-class Constants(NamedTuple):
-    """The constants of the equations; `parameters.derive_constants` computes them from a vehicle.
-
-    `y_ur` is the factor of u r in the sway force, the rigid body's m u r included; `u_of_X` is an entry of the
-    inverse mass matrix, the surge acceleration by a unit of surge force.
-    """
-
-    heaviness: float  # W - B [N]
-    righting: float  # z_G W [N m]
-    nose_weight: float  # x_G W [N m]
-    x_u: float
-    x_uu: float
-    x_wq: float
-    x_qq: float
-    x_vr: float
-    x_rr: float
-    x_pr: float
-    y_v: float
-    y_vv: float
-    y_uv: float
-    y_r: float
-    y_rr: float
-    y_ur: float
-    y_qr: float
-    y_wp: float
-    y_pq: float
-    y_uudr: float
-    z_w: float
-    z_ww: float
-    z_uw: float
-    z_q: float
-    z_qq: float
-    z_uq: float
-    z_q2: float  # of q^2, where z_qq is that of q |q|
-    z_p2: float
-    z_vp: float
-    z_rp: float
-    z_uuds: float
-    k_p: float
-    k_pp: float
-    k_up: float
-    k_wp: float
-    k_ur: float
-    k_qr: float
-    m_w: float
-    m_ww: float
-    m_uw: float
-    m_q: float
-    m_qq: float
-    m_uq: float
-    m_wq: float
-    m_vr: float
-    m_vp: float
-    m_rp: float
-    m_uuds: float
-    n_v: float
-    n_vv: float
-    n_uv: float
-    n_r: float
-    n_rr: float
-    n_ur: float
-    n_wp: float
-    n_pq: float
-    n_uudr: float
-    u_of_X: float
-    u_of_Z: float
-    u_of_M: float
-    v_of_Y: float
-    v_of_K: float
-    v_of_N: float
-    w_of_X: float
-    w_of_Z: float
-    w_of_M: float
-    p_of_Y: float
-    p_of_K: float
-    p_of_N: float
-    q_of_X: float
-    q_of_Z: float
-    q_of_M: float
-    r_of_Y: float
-    r_of_K: float
-    r_of_N: float
-    propeller_torque: float  # K_prop over X_prop [m], where that is no input
-    substep: float  # time step of one integration step [s]
+`y_ur` is the factor of u r in the sway force, the rigid body's m u r included; `u_of_X` is an entry of the inverse
+mass matrix, the surge acceleration by a unit of surge force.
+"""
 
 
 @inlined
