@@ -17,10 +17,8 @@ from thruster_env.core.memory import set_row
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
 from thruster_env.core.threads import cores, spread
 from thruster_env.thruster.dynamics import substep
-from thruster_env.thruster.engine.copies import Copies
-from thruster_env.thruster.engine.memory import COMMAND, SUBSTEPS, VOLTAGE
-from thruster_env.thruster.engine.simulation import move_thruster
 from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import COMMAND, SUBSTEPS, VOLTAGE, Copies, move_thruster
 from thruster_env.thruster.task import Task
 
 COPIES, STEPS = 8192, 200

@@ -17,8 +17,8 @@ from benchmarks.vectors import vector_steps
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
-from thruster_env.auv.engine.simulation import read_constants
 from thruster_env.auv.plant import make_plant
+from thruster_env.auv.simulation import read_constants
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import cores

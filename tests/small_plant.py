@@ -11,7 +11,6 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv.engine.encoding import noise_adder
 from thruster_env.core.checks import arguments_of, covariance_root, positive, takes_arguments_of, vector
 from thruster_env.core.checks import options as checked_options
 from thruster_env.core.compiled import inlined
@@ -19,7 +18,7 @@ from thruster_env.core.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMIN
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
 from thruster_env.effects.effects import Context, chain_of, dropping_channels, encoded
 from thruster_env.effects.sensors import SENSOR_EFFECTS
-from thruster_env.env.copies import Channel, PlantCopies, machine_code_of, reader_of
+from thruster_env.env.copies import BLOCK, Channel, PlantCopies, add_noise, machine_code_of, reader_of
 from thruster_env.env.env import PlantEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv
 from thruster_env.env.vector_env import PlantVectorEnv
@@ -37,7 +36,8 @@ KINDS = tuple(SENSOR_EFFECTS.effects.values())
 Q, P_0 = np.diag([1e-6, 1e-4, 4e-4]), np.diag([0.1, 0.01, 0.01])
 
 X = len(FRONT)  # three states, then readings, whether they are valid, and what is not reported
-READINGS, VALID, REPORTED, COMMAND, ROWS = X + 3, X + 5, X + 7, X + 7, X + 9
+READINGS, VALID, REPORTED, COMMAND, SCRATCH = X + 3, X + 5, X + 7, X + 7, X + 9
+ROWS = SCRATCH + BLOCK
 A, B, MEAN, P_ROOT, Q_ROOT, R_ROOT, CODES, DT, COUNT, EFFECTS = np.cumsum([0, 9, 6, 3, 9, 9, 4, 2, 1, 1]).tolist()
 
 
@@ -94,8 +94,6 @@ def of_copy(read):
 
 read = reader_of(tuple(CHANNELS.values()), of_copy, "memory, b, j")
 sense = chain_of(KINDS, COUNT)
-draw_state, disturb = noise_adder(3, X, P_ROOT, INITIAL), noise_adder(3, X, Q_ROOT, PROCESS)
-spoil = noise_adder(2, READINGS, R_ROOT, MEASUREMENT)
 
 
 @inlined
@@ -113,9 +111,9 @@ def step(first, last, memory, numbers, out, begin):
     for b in range(first, last):
         move(memory, b, numbers, begin)
         if begin:
-            draw_state(memory, b, numbers)
+            add_noise(memory, b, numbers, 3, X, P_ROOT, INITIAL, SCRATCH)
         else:
-            disturb(memory, b, numbers)
+            add_noise(memory, b, numbers, 3, X, Q_ROOT, PROCESS, SCRATCH)
         for j in range(memory.shape[2]):
             for i in range(2):
                 memory[b, READINGS + i, j] = read(numbers[CODES + i], memory, b, j)
@@ -123,7 +121,7 @@ def step(first, last, memory, numbers, out, begin):
             memory[b, REWARD, j] = 0.0 if begin else -memory[b, X, j] * memory[b, X, j]
             memory[b, TERMINATED, j] = 1.0 if abs(memory[b, X, j]) > 0.8 else 0.0
             memory[b, TIME, j] = memory[b, STEP, j] * numbers[DT]
-        spoil(memory, b, numbers)
+        add_noise(memory, b, numbers, 2, READINGS, R_ROOT, MEASUREMENT, SCRATCH)
         sense(memory, b, numbers, EFFECTS, begin)
         for i in range(FIRST_REPORTED, REPORTED):
             for j in range(memory.shape[2]):
@@ -133,7 +131,7 @@ def step(first, last, memory, numbers, out, begin):
 class Carts(PlantCopies):
     commands, reported = (COMMAND, COMMAND + 1), REPORTED
 
-    def __init__(self, cart: Cart, count: int):
+    def encode(self, cart: Cart):
         self.context, program, rows = Context(cart.dt, VALID - READINGS), [], 0
         for i, effects in enumerate(cart.sensors.values()):
             code, taken = encoded(effects, KINDS, READINGS + i, ROWS + rows, 64 * i, self.context)
@@ -149,7 +147,7 @@ class Carts(PlantCopies):
             [cart.dt, length],
             program,
         ]
-        super().__init__(count, np.concatenate(fixed).astype(np.float64), ROWS + rows)
+        return np.concatenate(fixed).astype(np.float64), ROWS + rows
 
     def machine_code(self):
         return machine_code_of(step)
@@ -185,7 +183,7 @@ class CartEnv(ModelledCart, PlantEnv):
         self._set_up(space, ReportRows(readings, valid, dropping, (X + 2,), info), render_mode)
 
     def copies_of(self, count):
-        return Carts(self.plant, count)
+        return Carts(self.plant, None, count)
 
 
 class CartVectorEnv(ModelledCart, PlantVectorEnv):

@@ -17,10 +17,7 @@ from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.commands import ObserveStateVector
 from thruster_env.thruster.control.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS
-from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.engine.copies import Copies, simulate
-from thruster_env.thruster.engine.memory import AMBIENT, FIXED_ROWS, READINGS, REFERENCE, THRUST, VALID, VOLTAGE
+from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, FLOW_SIGNALS, REFERENCE_SIGNALS
 from thruster_env.thruster.linear.analysis import (
     jacobians,
     required_substeps,
@@ -35,6 +32,17 @@ from thruster_env.thruster.plant import (
     DEFAULT_MEASUREMENT_NOISE,
     Plant,
     make_plant,
+)
+from thruster_env.thruster.simulation import (
+    AMBIENT,
+    FIXED_ROWS,
+    READINGS,
+    REFERENCE,
+    THRUST,
+    VALID,
+    VOLTAGE,
+    Copies,
+    simulate,
 )
 from thruster_env.thruster.task import Task
 

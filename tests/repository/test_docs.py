@@ -21,9 +21,7 @@ from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS
-from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.effects.uncertainty import DISTRIBUTIONS
+from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, DISTRIBUTIONS, FLOW_SIGNALS, REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterEnv, BowThrusterLinearEnv, BowThrusterVectorEnv
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import PRESETS

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 from thruster_env.core.checks import finite, short_repr, within
 from thruster_env.core.compiled import inlined
-from thruster_env.effects.effects import Context, Effect, Registry, set_field
-from thruster_env.effects.missing import hold_missing
-from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.effects.effects import Context, Effect, Registry
+from thruster_env.effects.sensors import SENSOR_EFFECTS, hold_missing
 from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
 
 # The current that a vehicle goes in: signals to the north, to the east and down [m/s], the same everywhere.
@@ -21,15 +20,16 @@ from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, Rec
 
 DIRECTIONS = ("north", "east", "down")
 FASTEST = 100.0  # [m/s]: beyond it there is no water
-CURRENT_SIGNALS = Registry("current")
-for _current_name, _signal in {
-    "constant": ConstantSignal,
-    "gauss-markov": GaussMarkov,
-    "sinusoid": Sinusoid,
-    "gusts": Gusts,
-    "recorded": RecordedSignal,
-}.items():
-    CURRENT_SIGNALS.register(_current_name)(_signal)
+CURRENT_SIGNALS = Registry(
+    "current",
+    {
+        "constant": ConstantSignal,
+        "gauss-markov": GaussMarkov,
+        "sinusoid": Sinusoid,
+        "gusts": Gusts,
+        "recorded": RecordedSignal,
+    },
+)
 
 Current = dict[str, tuple[Effect, ...]]
 
@@ -81,9 +81,7 @@ class VehicleContext(Context):
 # What spoils a vehicle's measurements: the effects that every plant has, and being below the surface.
 
 
-VEHICLE_SENSOR_EFFECTS = Registry("sensors")
-for _name, _effect in SENSOR_EFFECTS.effects.items():
-    VEHICLE_SENSOR_EFFECTS.register(_name)(_effect)
+VEHICLE_SENSOR_EFFECTS = Registry("sensors", SENSOR_EFFECTS.effects)
 
 
 @inlined
@@ -101,16 +99,10 @@ class NearSurface(Effect):
 
     depth: float = 1.0
     act = staticmethod(near_surface)
+    checks = {"depth": finite}
+    row_count = 1  # the last measurement that was not missing
     loses = True
-
-    def __post_init__(self):
-        """Check the argument."""
-        set_field(self, "depth", finite("depth", self.depth))
 
     def parameters(self, context: VehicleContext) -> list[float]:
         """The depth [m], where validity stands, the row of the true depth."""
         return [self.depth, context.valid_offset, context.depth_row]
-
-    def rows(self, context: VehicleContext) -> int:
-        """The last measurement that was not missing."""
-        return 1

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv.engine import encoding as at
-from thruster_env.auv.engine.simulation import Copies
+from thruster_env.auv import simulation as at
 from thruster_env.auv.plant import Plant, make_plant
 from thruster_env.auv.rendering.renderer import Moment, Renderer
+from thruster_env.auv.simulation import Copies
 from thruster_env.auv.task import make_depth_task, make_task
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
@@ -172,7 +172,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
     lags, `current` (3,) to the north, to the east and down [m/s], `path_errors` (2,) to starboard of the path and
     below it [m], `path_piece`, the number of the straight piece of the path that the vehicle has got to,
     `reckoned` (4,) north, east, down [m] and yaw [rad] by the vehicle's own reckoning (see
-    `engine.guidance`), `time` [s]; where a channel may be missing also `measurement_valid` (m,).
+    `thruster_env.auv.simulation`), `time` [s]; where a channel may be missing also `measurement_valid` (m,).
 
     ## Episode
     Starts about a cruise at 1 m/s, N(mean, diag) with 0.05 m/s in u, 0.02 m/s and rad/s in the other velocities,

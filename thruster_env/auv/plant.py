@@ -27,7 +27,7 @@ from thruster_env.auv.parameters import VehicleParameters, derive_constants
 from thruster_env.auv.presets import PRESETS, preset_parameters
 from thruster_env.core.checks import at_least, between, covariance, finite, one_of, positive, short_repr, vector
 from thruster_env.effects.effects import Effect, dropping_channels
-from thruster_env.effects.missing import SampleEvery
+from thruster_env.effects.sensors import SampleEvery
 from thruster_env.env.plant_data import Entries, check_same, mappings
 from thruster_env.model.quantities import Quantity
 

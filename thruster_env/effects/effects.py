@@ -15,12 +15,13 @@ Effects are called, not inlined: each loops over all copies of a block, and a pl
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from thruster_env.core.checks import short_repr
+from thruster_env.core.checks import positive, short_repr, within
 from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.memory import KEY_0, KEY_1, STEP
 from thruster_env.core.sources import written_out
@@ -30,6 +31,7 @@ from thruster_env.core.streams import CHANCE, DISTURBANCE, normal_block, uniform
 EFFECT_KIND, EFFECT_TARGET, EFFECT_ROWS, EFFECT_NUMBER, EFFECT_PARAMETERS = range(1, 6)
 MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
 LONGEST = 1e9  # [s], and in steps: what an effect may hold
+SPACING = 64  # effects of each chain have numbers of their own, whatever the other chains hold
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,15 +51,22 @@ class Effect:
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]  # every effect is a dataclass
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
+    checks: ClassVar[Mapping[str, Callable]] = {}  # `check(name, value)` of an argument returns its stored value
+    row_count: ClassVar[int] = 0  # states that a copy keeps for this effect
     loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
+
+    def __post_init__(self):
+        """Check the arguments."""
+        for name, check in self.checks.items():
+            set_field(self, name, check(name, getattr(self, name)))
 
     def parameters(self, context: Any) -> list[float]:
         """Parameters that `act` reads from `numbers[at]` on: the fields in order, unless overridden."""
         return [float(value) for value in dataclasses.astuple(self)]
 
     def rows(self, context: Any) -> int:
-        """Number of states that a copy keeps for this effect."""
-        return 0
+        """Number of states that a copy keeps for this effect: `row_count`, unless overridden."""
+        return self.row_count
 
     def largest(self) -> float:
         """Largest magnitude of a signal, at four standard deviations of its random part."""
@@ -73,16 +82,28 @@ def dropping_channels(sensors: Mapping[str, tuple[Effect, ...]]) -> tuple[int, .
     return tuple(i for i, chain in enumerate(sensors.values()) if any(effect.loses for effect in chain))
 
 
+not_negative = partial(positive, zero_allowed=True)
+
+
+def checked_probability(name: str, value) -> float:
+    """Return value as a float; raise ValueError unless it lies within 0 and 1."""
+    if within(name, value, 1.0) < 0:
+        raise ValueError(f"{name} must be at least 0 and at most 1, but got {value!r}")
+    return float(value)
+
+
 Kind = TypeVar("Kind", bound=Effect)
 
 
 class Registry:
     """Effects of one kind by name, and how to make them from mappings."""
 
-    def __init__(self, argument: str):
-        """Name the env's argument for which this registry makes effects."""
+    def __init__(self, argument: str, effects: Mapping[str, type[Effect]] | None = None):
+        """Name the env's argument for which this registry makes effects, and the first of them."""
         self.argument = argument
         self.effects: dict[str, type[Effect]] = {}
+        for name, effect in (effects or {}).items():
+            self.register(name)(effect)
 
     def register(self, name: str) -> Callable[[type[Kind]], type[Kind]]:
         """Return a class decorator that makes a frozen dataclass an effect of this name."""
@@ -165,6 +186,30 @@ def encoded(
         numbers += [*header, *parameters]
         rows += effect.rows(context)
     return numbers, rows
+
+
+def encoded_chains(
+    chains: Iterable[tuple[int, Sequence[Effect], int, int, int | None]],
+    kinds: tuple[tuple[type[Effect], ...], ...],
+    first_row: int,
+    context: Context,
+) -> tuple[list[float], list[int], int]:
+    """Numbers of a plant's effects in the order in which they act, their count by section, and the rows they take.
+
+    Args:
+        chains: section, effects, target row, first number and `lost_with` (see `encoded`) of each chain.
+        kinds: the known types of effects of each section.
+        first_row: the first row of the memory that effects may have.
+        context: of the plant.
+    """
+    program: list[float] = []
+    counts, rows = [0] * len(kinds), 0
+    for section, effects, target, number, lost_with in chains:
+        code, row_count = encoded(effects, kinds[section], target, first_row + rows, number, context, lost_with)
+        program += code
+        counts[section] += len(effects)
+        rows += row_count
+    return program, counts, rows
 
 
 def _representable(effect: Effect, parameters: list[float]) -> list[float]:

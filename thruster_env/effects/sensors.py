@@ -2,6 +2,7 @@
 
 A channel measures a quantity plus Gaussian noise of covariance R (`measurement_noise_cov`). A list of effects may
 follow; each acts on the result of the one before. All amounts are in the channel's unit.
+A missing measurement repeats the last valid one (0 before the first) and is marked as not valid.
 """
 
 from __future__ import annotations
@@ -14,10 +15,19 @@ import numpy as np
 from thruster_env.core.checks import at_least, finite, positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import STEP
-from thruster_env.effects.effects import Context, Effect, Registry, normals, set_field, uniforms
-from thruster_env.effects.missing import Dropout, SampleEvery, probability
+from thruster_env.effects.effects import (
+    Context,
+    Effect,
+    Registry,
+    checked_probability,
+    normals,
+    not_negative,
+    set_field,
+    uniforms,
+)
 
 SENSOR_EFFECTS = Registry("sensors")
+LONGEST_INTERVAL = 1_000_000  # steps between two samples
 LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's memory
 
 
@@ -86,6 +96,49 @@ def delay(memory, b, target, rows, number, numbers, at, begin):
         memory[b, slot + steps, j] = now_valid
 
 
+@inlined
+def hold_missing(memory, b, j, target, last, valid, missing, begin):
+    """If copy j's measurement is missing, repeat the last one, stored in row `last`, and mark it as not valid."""
+    if begin:
+        memory[b, last, j] = 0.0
+    if missing:
+        memory[b, target, j] = memory[b, last, j]
+        memory[b, valid, j] = 0.0
+    memory[b, last, j] = memory[b, target, j]
+
+
+@inlined
+def dropout(memory, b, target, rows, number, numbers, at, begin):
+    """Lose measurements in runs (a two-state Markov chain); a lost one repeats the last and is not valid."""
+    begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
+    last, lost = rows, rows + 1
+    for j in range(memory.shape[2]):
+        u, _, _, _ = uniforms(memory, b, j, number)
+        if begin:
+            memory[b, lost, j] = 0.0
+        if memory[b, lost, j] > 0.0:
+            memory[b, lost, j] = 0.0 if u < ends else 1.0
+        else:
+            memory[b, lost, j] = 1.0 if u < begins else 0.0
+        hold_missing(memory, b, j, target, last, valid, memory[b, lost, j] > 0.0, begin)
+
+
+@inlined
+def sample_every(memory, b, target, rows, number, numbers, at, begin):
+    """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
+    steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
+    for j in range(memory.shape[2]):
+        between = (int(memory[b, STEP, j]) - first) % steps != 0
+        hold_missing(memory, b, j, target, rows, valid, between, begin)
+
+
+def _degrees(name: str, value) -> float:
+    degrees = finite(name, value)
+    if degrees < 1:
+        raise ValueError(f"degrees must be at least 1, but got {value!r}")
+    return degrees
+
+
 @SENSOR_EFFECTS.register("student-t")
 @dataclass(frozen=True)
 class StudentT(Effect):
@@ -99,14 +152,7 @@ class StudentT(Effect):
     scale: float
     degrees: float = 3.0
     act = staticmethod(student_t)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "scale", positive("scale", self.scale, zero_allowed=True))
-        degrees = finite("degrees", self.degrees)
-        if degrees < 1:
-            raise ValueError(f"degrees must be at least 1, but got {self.degrees!r}")
-        set_field(self, "degrees", degrees)
+    checks = {"scale": not_negative, "degrees": _degrees}
 
     def parameters(self, context: Context) -> list[float]:
         """Degrees of freedom and scale."""
@@ -121,11 +167,7 @@ class Outliers(Effect):
     std: float
     probability: float = 0.05
     act = staticmethod(outliers)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "std", positive("std", self.std, zero_allowed=True))
-        set_field(self, "probability", probability("probability", self.probability))
+    checks = {"std": not_negative, "probability": checked_probability}
 
     def parameters(self, context: Context) -> list[float]:
         """Probability and standard deviation."""
@@ -141,16 +183,8 @@ class Bias(Effect):
     std: float = 0.0
     drift: float = 0.0
     act = staticmethod(bias)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "value", finite("value", self.value))
-        set_field(self, "std", positive("std", self.std, zero_allowed=True))
-        set_field(self, "drift", positive("drift", self.drift, zero_allowed=True))
-
-    def rows(self, context: Context) -> int:
-        """The bias."""
-        return 1
+    checks = {"value": finite, "std": not_negative, "drift": not_negative}
+    row_count = 1  # the bias
 
 
 @SENSOR_EFFECTS.register("quantisation")
@@ -160,10 +194,7 @@ class Quantisation(Effect):
 
     step: float
     act = staticmethod(quantisation)
-
-    def __post_init__(self):
-        """Check the argument."""
-        set_field(self, "step", positive("step", self.step))
+    checks = {"step": positive}
 
 
 @SENSOR_EFFECTS.register("saturation")
@@ -184,7 +215,49 @@ class SensorSaturation(Effect):
         set_field(self, "high", high)
 
 
-SENSOR_EFFECTS.register("dropout")(Dropout)
+@SENSOR_EFFECTS.register("dropout")
+@dataclass(frozen=True)
+class Dropout(Effect):
+    """Missing measurements, in runs of random length.
+
+    The observation then repeats the last valid value (0 at first), a validity flag of the channel is appended to
+    it, and `info["measurement_valid"]` holds the same flag.
+
+    Args:
+        probability: fraction of the measurements that are missing in the long run.
+        mean_length: mean number of missing measurements in a row; 1/(1 - probability) is independent dropout.
+    """
+
+    probability: float = 0.1
+    mean_length: float | None = None
+    act = staticmethod(dropout)
+    row_count = 2  # the last valid measurement, and whether one is missing
+    loses = True
+
+    def __post_init__(self):
+        """Check the arguments."""
+        share = checked_probability("probability", self.probability)
+        if share == 1.0:
+            raise ValueError("probability must be less than 1, but got 1.0")
+        shortest = max(1.0, share / (1.0 - share))  # else a run would have to begin with a probability above 1
+        length = 1.0 / (1.0 - share) if self.mean_length is None else finite("mean_length", self.mean_length)
+        if length < shortest:
+            raise ValueError(f"mean_length must be at least {shortest:g}, but got {self.mean_length!r}")
+        set_field(self, "probability", share)
+        set_field(self, "mean_length", length)
+
+    def parameters(self, context: Context) -> list[float]:
+        """Probabilities that a run of missing measurements begins and ends; offset of the validity flag."""
+        assert self.mean_length is not None  # it is set when the effect is made
+        begins = self.probability / (1.0 - self.probability) / self.mean_length
+        return [begins, 1.0 / self.mean_length, context.valid_offset]
+
+
+def _delay_steps(name: str, value) -> int:
+    steps = at_least(name, value, 1)
+    if steps > LONGEST_DELAY:
+        raise ValueError(f"steps must be at most {LONGEST_DELAY}, but got {value!r}")
+    return steps
 
 
 @SENSOR_EFFECTS.register("delay")
@@ -194,13 +267,7 @@ class Delay(Effect):
 
     steps: int = 1
     act = staticmethod(delay)
-
-    def __post_init__(self):
-        """Check the argument."""
-        steps = at_least("steps", self.steps, 1)
-        if steps > LONGEST_DELAY:
-            raise ValueError(f"steps must be at most {LONGEST_DELAY}, but got {self.steps!r}")
-        set_field(self, "steps", steps)
+    checks = {"steps": _delay_steps}
 
     def parameters(self, context: Context) -> list[float]:
         """Steps, and offset of the validity flag."""
@@ -211,4 +278,27 @@ class Delay(Effect):
         return 2 * self.steps
 
 
-SENSOR_EFFECTS.register("sample-every")(SampleEvery)
+@SENSOR_EFFECTS.register("sample-every")
+@dataclass(frozen=True)
+class SampleEvery(Effect):
+    """A sensor slower than the plant: a sample every `steps` steps, from step number `first` on.
+
+    Between two samples the measurement is missing, as with `Dropout`. A sensor of 5 Hz on a plant with a step of
+    0.05 s has a sample every 4 steps.
+    """
+
+    steps: int
+    first: int = 0
+    act = staticmethod(sample_every)
+    row_count = 1  # the last sample
+    loses = True
+
+    def __post_init__(self):
+        """Check the arguments."""
+        steps = at_least("steps", self.steps, 1, LONGEST_INTERVAL)
+        set_field(self, "steps", steps)
+        set_field(self, "first", at_least("first", self.first, 0, LONGEST_INTERVAL) % steps)
+
+    def parameters(self, context: Context) -> list[float]:
+        """Steps between two samples, number of the first one, and offset of the validity flag."""
+        return [self.steps, self.first, context.valid_offset]

@@ -6,14 +6,17 @@ that it has (`Registry.register`).
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
-from thruster_env.core.checks import finite, positive
+import numpy as np
+
+from thruster_env.core.checks import finite, positive, short_repr, vector
 from thruster_env.core.compiled import inlined
 from thruster_env.core.memory import STEP
-from thruster_env.effects.effects import Context, Effect, normals, set_field, uniforms
-from thruster_env.effects.missing import RecordedSeries, recorded_value
+from thruster_env.effects.effects import Context, Effect, normals, not_negative, set_field, uniforms
 
 
 @inlined
@@ -63,6 +66,23 @@ def gusts(memory, b, target, rows, number, numbers, at, begin):
 
 
 @inlined
+def recorded_value(time, numbers, at):
+    """Value of a series at a time [s], linear between samples; numbers: sample time, repeat, count, values."""
+    sample_time, repeat, count = numbers[at], numbers[at + 1], int(numbers[at + 2])
+    position = max(time / sample_time, 0.0)
+    if repeat > 0.0:
+        position = position % count
+    else:
+        position = min(position, count - 1.0)
+    before = min(int(position), count - 1)
+    after = before + 1
+    if after >= count:
+        after = 0 if repeat > 0.0 else before
+    share = position - before
+    return (1.0 - share) * numbers[at + 3 + before] + share * numbers[at + 3 + after]
+
+
+@inlined
 def recorded(memory, b, target, rows, number, numbers, at, begin):
     """Add a recorded series."""
     for j in range(memory.shape[2]):
@@ -76,10 +96,7 @@ class ConstantSignal(Effect):
 
     value: float
     act = staticmethod(constant)
-
-    def __post_init__(self):
-        """Check the argument."""
-        set_field(self, "value", finite("value", self.value))
+    checks = {"value": finite}
 
     def largest(self) -> float:
         """Its magnitude."""
@@ -94,12 +111,7 @@ class Sinusoid(Effect):
     period: float = 4.0
     phase: float = 0.0
     act = staticmethod(sinusoid)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "amplitude", finite("amplitude", self.amplitude))
-        set_field(self, "period", positive("period", self.period))
-        set_field(self, "phase", finite("phase", self.phase))
+    checks = {"amplitude": finite, "period": positive, "phase": finite}
 
     def largest(self) -> float:
         """The amplitude."""
@@ -117,11 +129,8 @@ class GaussMarkov(Effect):
     std: float
     time_constant: float = 1.0
     act = staticmethod(gauss_markov)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "std", positive("std", self.std, zero_allowed=True))
-        set_field(self, "time_constant", positive("time_constant", self.time_constant))
+    checks = {"std": not_negative, "time_constant": positive}
+    row_count = 1  # the process
 
     def largest(self) -> float:
         """Four standard deviations."""
@@ -130,10 +139,6 @@ class GaussMarkov(Effect):
     def parameters(self, context: Context) -> list[float]:
         """Standard deviation and the correlation of neighbouring steps."""
         return [self.std, math.exp(-context.dt / self.time_constant)]
-
-    def rows(self, context: Context) -> int:
-        """The process."""
-        return 1
 
 
 @dataclass(frozen=True)
@@ -150,12 +155,8 @@ class Gusts(Effect):
     rate: float = 0.5
     duration: float = 0.5
     act = staticmethod(gusts)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "std", positive("std", self.std, zero_allowed=True))
-        set_field(self, "rate", positive("rate", self.rate, zero_allowed=True))
-        set_field(self, "duration", positive("duration", self.duration))
+    checks = {"std": not_negative, "rate": not_negative, "duration": positive}
+    row_count = 2  # time since the gust began, and its height
 
     def largest(self) -> float:
         """Four standard deviations of the height [m/s]."""
@@ -165,9 +166,69 @@ class Gusts(Effect):
         """Probability that one begins in a calm step, standard deviation, duration [s], sample time [s]."""
         return [1.0 - math.exp(-self.rate * context.dt), self.std, self.duration, context.dt]
 
-    def rows(self, context: Context) -> int:
-        """Time since the gust began and its height."""
-        return 2
+
+@dataclass(frozen=True)
+class RecordedSeries(Effect):
+    """A series given by its `values`, or by a `file` that holds them in a column, one every `sample_time`.
+
+    Args:
+        values: numbers in SI units.
+        sample_time: between two values [s].
+        repeat: start again after the last value; otherwise the last one stays.
+        file: a CSV file with a header line, read when the effect is made; instead of `values`.
+        column: name of the column in it.
+    """
+
+    values: tuple[float, ...] | None = None
+    sample_time: float = 0.01
+    repeat: bool = False
+    file: str | None = None
+    column: str | None = None
+
+    def __post_init__(self):
+        """Read the file, if there is one, and check the arguments."""
+        if (self.values is None) == (self.file is None):
+            raise ValueError(f"either values or file must be given, but got {self.values!r} and {self.file!r}")
+        values = self.values if self.file is None else _column(self.file, self.column)
+        set_field(self, "values", tuple(vector("values", values).tolist()))
+        set_field(self, "sample_time", positive("sample_time", self.sample_time))
+        set_field(self, "repeat", bool(self.repeat))
+
+    @property
+    def _series(self) -> tuple[float, ...]:
+        return self.values or ()  # never None once it is made
+
+    def as_mapping(self) -> dict:
+        """Name and arguments; a file stays a file."""
+        mapping = super().as_mapping()
+        mapping["values"] = None if self.file is not None else list(self._series)
+        return mapping
+
+    def largest(self) -> float:
+        """Largest magnitude in the series."""
+        return max(map(abs, self._series))
+
+    def parameters(self, context: Context) -> list[float]:
+        """The plant's sample time [s], and the parameters of `recorded_value`."""
+        return [context.dt, self.sample_time, float(self.repeat), float(len(self._series)), *self._series]
+
+
+def _column(file: str, column: str | None) -> np.ndarray:
+    path = Path(file)
+    if not path.is_file() or not path.stat().st_size:
+        raise ValueError(f"file must be a CSV file that exists and is not empty, but got {short_repr(file)}")
+    with path.open(newline="", encoding="utf-8-sig") as lines:
+        names, *rows = ([entry.strip() for entry in row] for row in csv.reader(lines) if row)
+    names[0] = names[0].removeprefix("#").strip()  # headers are comments to some programs
+    if column not in names:
+        raise ValueError(f"column must be one of {', '.join(names)}, but got {column!r}")
+    if any(len(row) != len(names) for row in rows):
+        raise ValueError(f"file must be a CSV file with a header line over equally long rows, but {file!r} is not")
+    entries = [row[names.index(column)] for row in rows]
+    try:
+        return np.array(entries, dtype=np.float64)
+    except ValueError:
+        raise ValueError(f"values must be some finite numbers, but got {short_repr(entries)}") from None
 
 
 @dataclass(frozen=True)
@@ -175,7 +236,3 @@ class RecordedSignal(RecordedSeries):
     """A recorded signal."""
 
     act = staticmethod(recorded)
-
-    def parameters(self, context: Context) -> list[float]:
-        """The plant's sample time [s], and the parameters of `recorded_value`."""
-        return [context.dt, *super().parameters(context)]

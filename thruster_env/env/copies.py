@@ -8,23 +8,37 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.checks import options as checked_options
+from thruster_env.core.checks import short_repr, vector
 from thruster_env.core.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
-from thruster_env.core.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
+from thruster_env.core.memory import KEY_0, KEY_1, STEP, gathered, new_memory, scatter, set_row
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.core.streams import normal_block
 from thruster_env.core.threads import in_parts, worker_threads
 from thruster_env.model.quantities import Quantity
 
 THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
 
 
-class PlantCopies:
-    """N copies of a plant, each with its own key; a report of them is an array (reported, N).
+LARGEST_STATE = 1e50  # in SI units: beyond it floating point may overflow; its square of a variance
 
-    A plant's class defines the rows of commands and reports, packs its parameters and finds its compiled step,
-    `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin` it starts an
-    episode of every copy from the keys in its memory and takes the first measurement; otherwise it applies the
-    commands for one sample time. It writes its report to out (reported, blocks, width).
+
+def checked_state(name: str, value, count: int) -> np.ndarray:
+    """Return a state (count,); raise ValueError unless it is so many numbers from which finite ones can follow."""
+    entries = vector(name, value, count)
+    if np.abs(entries).max() > LARGEST_STATE:
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
+    return entries
+
+
+class PlantCopies:
+    """N copies of a plant with a task, each with its own key; a report of them is an array (reported, N).
+
+    A plant's class defines the rows of commands and reports, packs its parameters (`encode`) and finds its
+    compiled step, `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin`
+    it starts an episode of every copy from the keys in its memory and takes the first measurement; otherwise it
+    applies the commands for one sample time. It writes its report to out (reported, blocks, width).
 
     Attributes:
         commands: rows of the memory that hold the inputs of the next step.
@@ -35,28 +49,35 @@ class PlantCopies:
     reported: ClassVar[int]
     advance: Callable
 
-    def __init__(self, count: int, numbers: np.ndarray, rows: int):
-        """Allocate the memory of `count` copies, each of `rows` rows; call `begin` next.
-
-        Args:
-            count: number of copies.
-            numbers: packed parameters of the plant, which the compiled step reads.
-            rows: of the memory, those in front (`thruster_env.core.memory.FRONT`) included.
-        """
-        self.count, self.numbers = count, numbers
+    def __init__(self, plant: Any, task: Any, count: int):
+        """Allocate the memory of `count` copies; call `begin` next."""
+        self.plant, self.task, self.count = plant, task, count
+        self.numbers, rows = self.encode(plant)
         self.memory = new_memory(count, rows)
         self._find_machine_code()
+
+    def encode(self, plant: Any) -> tuple[np.ndarray, int]:
+        """Packed parameters of a plant with the task, which the compiled step reads, and a copy's rows of memory.
+
+        The rows in front (`thruster_env.core.memory.FRONT`) are included.
+        """
+        raise NotImplementedError
 
     def machine_code(self) -> tuple[Callable, CompiledOrPython]:
         """The compiled step, and the same for several threads, from `machine_code_of`."""
         raise NotImplementedError
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
-        """Numbers for `begin` with the initial state that a reset's options fix, or None.
+        """Numbers for `begin` with the initial state that a reset's options fix in "state", or None.
 
         Raises ValueError for other options.
         """
-        raise NotImplementedError
+        start = checked_options(options).get("state")
+        if start is None:
+            return None
+        n = len(self.plant.initial_mean)
+        state = checked_state("the state of options", start, n)
+        return self.encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((n, n))))[0]
 
     def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
         """Write further initial values of episodes with keys (count, 2), such as random parameters."""
@@ -133,6 +154,31 @@ def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, Comp
         step(first, last, memory, numbers, out, begin)
 
     return compiled(advance), in_parts(step)
+
+
+BLOCK = 4  # normals of one draw
+
+
+@inlined
+def add_noise(memory, b, numbers, size, first, root, stream, scratch):
+    """Add w ~ N(0, L L') to rows first ... first + size - 1 of every copy.
+
+    The lower triangular L (size, size) lies at numbers[root], by rows; its zeros cost nothing. The draws are those
+    of `thruster_env.model.simulate` with the same keys; `stream` is the purpose of the noise, from
+    `thruster_env.core.streams`. For initial states the row STEP must be 0. Draws are written into the rows from
+    `scratch` on, `size` rounded up to a multiple of BLOCK.
+    """
+    for block in range((size + BLOCK - 1) // BLOCK):
+        at = scratch + BLOCK * block
+        for j in range(memory.shape[2]):
+            w = normal_block(block, memory[b, STEP, j], stream, memory[b, KEY_0, j], memory[b, KEY_1, j])
+            memory[b, at, j], memory[b, at + 1, j], memory[b, at + 2, j], memory[b, at + 3, j] = w
+    for i in range(size):
+        for k in range(i + 1):
+            factor = numbers[root + i * size + k]
+            if factor != 0.0:
+                for j in range(memory.shape[2]):
+                    memory[b, first + i, j] += factor * memory[b, scratch + k, j]
 
 
 # Channels: a sensor's measurement of a plant, defined once for the plant's step and for a filter's model.

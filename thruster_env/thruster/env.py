@@ -15,10 +15,13 @@ from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv
 from thruster_env.env.vector_env import PlantVectorEnv
 from thruster_env.render.renderer import MODES
-from thruster_env.thruster.effects.reference import Constant
-from thruster_env.thruster.effects.uncertainty import drawn_parameters
-from thruster_env.thruster.engine.copies import Copies
-from thruster_env.thruster.engine.memory import (
+from thruster_env.thruster.effects import Constant, drawn_parameters
+from thruster_env.thruster.linear.analysis import state_range
+from thruster_env.thruster.linear.published import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
+from thruster_env.thruster.plant import Plant, make_plant
+from thruster_env.thruster.rendering.renderer import Moment, Renderer
+from thruster_env.thruster.simulation import (
     AMBIENT,
     COMMAND,
     FLOW,
@@ -28,12 +31,8 @@ from thruster_env.thruster.engine.memory import (
     REFERENCE,
     THRUST,
     VALID,
+    Copies,
 )
-from thruster_env.thruster.linear.analysis import state_range
-from thruster_env.thruster.linear.published import PUBLISHED_NOISE, make_linear_plant
-from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
-from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.rendering.renderer import Moment, Renderer
 from thruster_env.thruster.task import half_thrust, make_task, thrust_scale
 
 # What every bow thruster env and vector env offers to filters.
@@ -235,7 +234,7 @@ class BowThrusterTrackingEnv(BowThrusterEnv):
     ## Reward
     That of step k compares T with r of time k + 1, the one that the action saw.
 
-    ## Arguments `reference` is a list of signals of `effects.reference.REFERENCE_SIGNALS`, which are added, each a
+    ## Arguments `reference` is a list of signals of `effects.REFERENCE_SIGNALS`, which are added, each a
     mapping with its `name` ("constant", "steps", "ramps", "prbs", "multi-sine", "band-limited-noise", "recorded");
     levels are fractions of the steady thrust at max_voltage. By default steps between 0.1 and 0.8, held for 1 s.
     """

@@ -27,7 +27,7 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import MAX_CHANNELS
 from thruster_env.thruster.dynamics import Constants, rates, substep, substep_jacobian
-from thruster_env.thruster.effects.amplifier import outside
+from thruster_env.thruster.effects import outside
 from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.model import channel_functions, model_of_plant, thrust_of
 from thruster_env.thruster.parameters import THRUST

@@ -26,8 +26,15 @@ from thruster_env.env import plant_data as data_of_plants
 from thruster_env.env.plant_data import Entries, mappings
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import Constants
-from thruster_env.thruster.effects.amplifier import AMPLIFIER_EFFECTS, FLOW_SIGNALS, dead_band_of
-from thruster_env.thruster.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
+from thruster_env.thruster.effects import (
+    AMPLIFIER_EFFECTS,
+    FLOW_SIGNALS,
+    LogNormal,
+    Uniform,
+    dead_band_of,
+    extreme_parameters,
+    make_uncertainty,
+)
 from thruster_env.thruster.linear.analysis import LinearModel, required_substeps_of_all, steady_state
 from thruster_env.thruster.parameters import (
     LARGEST_VOLTAGE,
@@ -123,8 +130,8 @@ def make_plant(
             {"voltage": V} for the steady state of V volts, {"mean": [..], "cov": [..]} for a distribution.
         sensors: None for the thrust alone, a list of channels of `channels.CHANNELS`, or a mapping from
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
-        flow: signals of `flow.FLOW_SIGNALS` that add to ambient_velocity.
-        amplifier: effects of `amplifier.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
+        flow: signals of `effects.FLOW_SIGNALS` that add to ambient_velocity.
+        amplifier: effects of `effects.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
         substeps: Runge-Kutta steps per sample time; None for the fewest that reach `linear.ONE_STEP_ACCURACY`.
         uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
 

@@ -9,7 +9,7 @@ import numpy as np
 from thruster_env.core.checks import positive, within
 from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect
-from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
+from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.linear.analysis import equilibrium, state_range, steady_state
 from thruster_env.thruster.plant import Plant
 
@@ -43,7 +43,7 @@ def make_task(
     """Make a task from plain arguments, the same ones that the env takes.
 
     Args:
-        reference: signals of `reference.REFERENCE_SIGNALS`, which are added; none if None. (Each env has its own
+        reference: signals of `effects.REFERENCE_SIGNALS`, which are added; none if None. (Each env has its own
             default; `BowThruster-v0` takes a thrust [N].)
         tracking_weight: of the squared thrust error over T_max.
         energy_weight: of the squared voltage over max_voltage.

@@ -16,8 +16,7 @@ import numpy as np
 
 from thruster_env.core.checks import at_least, finite, positive, vector
 from thruster_env.core.streams import EXCITATION, uniform_block
-from thruster_env.effects.effects import LONGEST, Effect, Registry, set_field
-from thruster_env.effects.missing import probability
+from thruster_env.effects.effects import LONGEST, Effect, Registry, checked_probability, set_field
 
 EXCITATIONS = Registry("excitation")
 MOST_STEPS = int(LONGEST)  # for which a level is held
@@ -171,7 +170,7 @@ class Dwells(Excitation):
         set_field(self, "amplitude", levels("amplitude", self.amplitude))
         set_field(self, "ramp", at_least("ramp", self.ramp, 1, MOST_STEPS))
         set_field(self, "dwell", at_least("dwell", self.dwell, 0, MOST_STEPS))
-        set_field(self, "zeros", probability("zeros", self.zeros))
+        set_field(self, "zeros", checked_probability("zeros", self.zeros))
 
     def limits(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest input, each (count,)."""

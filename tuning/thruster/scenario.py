@@ -28,9 +28,7 @@ from thruster_env.effects.effects import Effect, set_field
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.control.controllers import PIController, lambda_gains
-from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.engine.copies import Copies, simulate
-from thruster_env.thruster.engine.memory import NEXT_REFERENCE, READINGS
+from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.linear.analysis import equilibrium, jacobians, state_range, steady_state
 from thruster_env.thruster.linear.operating import operating_points
 from thruster_env.thruster.linear.published import make_linear_plant
@@ -45,6 +43,7 @@ from thruster_env.thruster.plant import (
     plant_data,
 )
 from thruster_env.thruster.preset_file import is_file, preset_mapping
+from thruster_env.thruster.simulation import NEXT_REFERENCE, READINGS, Copies, simulate
 from thruster_env.thruster.task import Task
 from tuning.problems.check import average_bound
 from tuning.problems.data import Data

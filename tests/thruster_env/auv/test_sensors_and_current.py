@@ -8,8 +8,8 @@ import pytest
 
 from thruster_env.auv.channels import CHANNELS, INSTRUMENTS, SUITES
 from thruster_env.auv.effects import VEHICLE_SENSOR_EFFECTS, make_current
-from thruster_env.auv.engine.simulation import simulate
 from thruster_env.auv.plant import make_plant
+from thruster_env.auv.simulation import simulate
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 
 pytestmark = pytest.mark.usefixtures("as_python")

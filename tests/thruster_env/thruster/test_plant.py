@@ -10,11 +10,10 @@ from thruster_env.core.checks import at_least, covariance, covariance_root, fini
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.memory import row
 from thruster_env.core.streams import draw_key, episode_keys
-from thruster_env.thruster.engine.copies import Copies, simulate
-from thruster_env.thruster.engine.memory import COMMAND, FLOW, OMEGA, READINGS, THRUST
 from thruster_env.thruster.linear.analysis import run_substeps, steady_state
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, checked
 from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import COMMAND, FLOW, OMEGA, READINGS, THRUST, Copies, simulate
 from thruster_env.thruster.task import Task
 
 MAPPING = TUNNEL._asdict()

@@ -9,13 +9,12 @@ from scipy import signal, stats
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
-from thruster_env.thruster.effects.reference import REFERENCE_SIGNALS
-from thruster_env.thruster.engine.copies import Copies
-from thruster_env.thruster.engine.memory import NEXT_REFERENCE, REFERENCE
+from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
 from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import NEXT_REFERENCE, REFERENCE, Copies
 from thruster_env.thruster.task import Task, make_task
 
 T_MAX = steady_state(TUNNEL, 24.0).thrust

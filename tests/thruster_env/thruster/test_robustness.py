@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import thruster_env
 from thruster_env.core.compiled import interpreted
-from thruster_env.thruster.effects.uncertainty import UNCERTAIN
+from thruster_env.thruster.effects import UNCERTAIN
 from thruster_env.thruster.env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 from thruster_env.thruster.parameters import PRESETS
 

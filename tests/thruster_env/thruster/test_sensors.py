@@ -12,9 +12,9 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.sensors import Bias, Quantisation
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.engine.copies import simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import simulate
 
 NOTHING = {"name": "bias"}  # adds zero, and makes the same machine code run
 EVERY_EFFECT = [

@@ -12,7 +12,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.dynamics import Constants, rates, thrust_and_torque
-from thruster_env.thruster.effects.uncertainty import (
+from thruster_env.thruster.effects import (
     UNCERTAIN,
     LogNormal,
     Uniform,
@@ -20,8 +20,6 @@ from thruster_env.thruster.effects.uncertainty import (
     extreme_parameters,
     make_uncertainty,
 )
-from thruster_env.thruster.engine.copies import Copies, simulate
-from thruster_env.thruster.engine.memory import CONSTANT_ROWS
 from thruster_env.thruster.env import BowThrusterVectorEnv
 from thruster_env.thruster.linear.analysis import (
     required_substeps,
@@ -32,6 +30,7 @@ from thruster_env.thruster.linear.analysis import (
 )
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.simulation import CONSTANT_ROWS, Copies, simulate
 from thruster_env.thruster.task import Task
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds

@@ -6,58 +6,145 @@ F integrates the equations of motion over one sample time; h are the channels. A
 same seed gives the same numbers on every path. One step: amplifier, flow, motion, process noise, measurement,
 sensor effects, next reference, reward.
 
-The equations of motion are those of `dynamics`; here they meet the memory. Everything works on `memory[b]`, see
-`thruster_env.thruster.engine.memory`.
+The equations of motion are those of `dynamics`; here they meet the memory. Everything works on `memory[b]`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from thruster_env.core.checks import covariance_root
 from thruster_env.core.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
-from thruster_env.core.memory import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
+from thruster_env.core.matrices import zero_order_hold
+from thruster_env.core.memory import (
+    FIRST_REPORTED,
+    FRONT,
+    KEY_0,
+    KEY_1,
+    REWARD,
+    STEP,
+    TERMINATED,
+    TIME,
+    set_row,
+)
 from thruster_env.core.sources import vector_reader, written_out
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS, normal_block
 from thruster_env.core.threads import in_parts
-from thruster_env.effects.effects import chain_of
-from thruster_env.env.copies import Channel, reader_of
+from thruster_env.effects.effects import SPACING, Effect, chain_of, encoded_chains
+from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.env.copies import Channel, PlantCopies, reader_of
+from thruster_env.env.record import check_finite, record
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
-from thruster_env.thruster.engine.memory import (
-    AMBIENT,
-    CHANNEL_CODES,
-    CHANNEL_COUNT,
-    COMMAND,
-    CONSTANT_COUNT,
-    CONSTANT_ROWS,
-    FIRST_EFFECT,
-    FLOW,
-    LAST_COMMAND,
-    LIMITS,
-    LINEAR,
-    LINEAR_MODEL,
-    NEXT_REFERENCE,
-    OMEGA,
-    PRIOR_MEAN,
-    PRIOR_ROOT,
-    Q_ROOT,
-    R_ROOT,
-    READINGS,
-    REFERENCE,
-    REPORTED,
-    REWARD_WEIGHTS,
-    SAMPLE_TIME,
-    SECTIONS,
-    SUBSTEPS,
-    THRUST,
-    THRUST_SCALE,
-    TOP_VOLTAGE,
-    VALID,
-    VOLTAGE,
+from thruster_env.thruster.effects import (
+    AMPLIFIER_EFFECTS,
+    FLOW_SIGNALS,
+    REFERENCE_SIGNALS,
+    Constant,
+    ThrusterContext,
+    drawn_parameters,
 )
-from thruster_env.thruster.task import step_cost
+from thruster_env.thruster.linear.analysis import LinearModel
+from thruster_env.thruster.parameters import derive_constants
+from thruster_env.thruster.plant import Plant
+from thruster_env.thruster.task import Task, state_limits, step_cost, thrust_scale
+
+# Where things lie: rows of the memory of many thrusters, and offsets in the row of numbers of compiled code.
+
+# Behind the rows that all plants have in front, those that every step reports, ...
+OMEGA, FLOW, THRUST, AMBIENT, REFERENCE, NEXT_REFERENCE = range(len(FRONT), len(FRONT) + 6)
+READINGS = NEXT_REFERENCE + 1  # a row for each channel, ...
+VALID = READINGS + MAX_CHANNELS  # ... and whether it is valid
+REPORTED = VALID + MAX_CHANNELS  # where they end
+# ... and those that it keeps to itself. Rows of disturbances, then of drawn constants, follow.
+COMMAND, LAST_COMMAND, VOLTAGE = range(REPORTED, REPORTED + 3)
+FIXED_ROWS = REPORTED + 3
+
+CONSTANT_COUNT = len(Constants._fields)
+
+# Places in the row of numbers; the constants of the equations of motion come first.
+SUBSTEPS, TOP_VOLTAGE, SAMPLE_TIME, CONSTANT_ROWS, LINEAR = range(CONSTANT_COUNT, CONSTANT_COUNT + 5)
+Q_ROOT = LINEAR + 1  # lower triangle of 2 x 2, by rows
+PRIOR_MEAN, PRIOR_ROOT = Q_ROOT + 3, Q_ROOT + 5
+CHANNEL_COUNT = PRIOR_ROOT + 3
+CHANNEL_CODES = CHANNEL_COUNT + 1
+R_ROOT = CHANNEL_CODES + MAX_CHANNELS  # 4 x 4 by rows
+LINEAR_MODEL = R_ROOT + MAX_CHANNELS * MAX_CHANNELS  # A_d (2, 2), B_d (2, 2), C (2,) by rows
+REWARD_WEIGHTS = LINEAR_MODEL + 10  # tracking, energy, voltage rate
+THRUST_SCALE = REWARD_WEIGHTS + 3
+LIMITS = THRUST_SCALE + 1  # of |omega_m| and |U_a|
+SECTIONS = LIMITS + 2  # number of effects on amplifier, flow, sensors and reference
+FIRST_EFFECT = SECTIONS + 4
+
+
+REGISTRIES = (AMPLIFIER_EFFECTS, FLOW_SIGNALS, SENSOR_EFFECTS, REFERENCE_SIGNALS)  # in the order of a step
+
+
+def is_plain(plant: Plant, task: Task) -> bool:
+    """Whether nothing disturbs the thrust measurement of a nominal thruster and the reference is constant.
+
+    That is the frequent case, for which compiled code is smaller.
+    """
+    disturbed = plant.amplifier or plant.flow or plant.uncertainty or any(plant.sensors.values())
+    other = plant.linear is not None or plant.channels != ("thrust",)
+    return not disturbed and not other and {type(signal) for signal in task.reference} <= {Constant}
+
+
+def known_effects(plant: Plant, task: Task) -> tuple[tuple[type[Effect], ...], ...]:
+    """Effects, a tuple for each registry, that compiled code has to know: all, or of a plain plant hardly any."""
+    if is_plain(plant, task):
+        return (), (), (), (Constant,)
+    return tuple(tuple(registry.effects.values()) for registry in REGISTRIES)
+
+
+def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
+    """Numbers of a plant and a task, the form that compiled steps read, and the rows of a copy's memory."""
+    p = plant.parameters
+    scale = thrust_scale(plant)
+    context = ThrusterContext(plant.dt, MAX_CHANNELS, scale, p.motor_damping / p.voltage_gain, OMEGA)
+    numbers = np.zeros(FIRST_EFFECT)
+    numbers[:CONSTANT_COUNT] = plant.constants
+    numbers[SUBSTEPS] = plant.substeps
+    numbers[TOP_VOLTAGE] = plant.max_voltage
+    numbers[SAMPLE_TIME] = plant.dt
+    lower = np.tril_indices(2)
+    numbers[Q_ROOT : Q_ROOT + 3] = covariance_root(plant.process_noise_cov)[lower]
+    numbers[PRIOR_MEAN : PRIOR_MEAN + 2] = plant.initial_mean
+    numbers[PRIOR_ROOT : PRIOR_ROOT + 3] = covariance_root(plant.initial_cov)[lower]
+    m = len(plant.channels)
+    numbers[CHANNEL_COUNT] = m
+    numbers[CHANNEL_CODES : CHANNEL_CODES + m] = [CHANNELS[channel].code for channel in plant.channels]
+    r_root = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
+    r_root[:m, :m] = covariance_root(plant.measurement_noise_cov)
+    numbers[R_ROOT : R_ROOT + r_root.size] = r_root.ravel()
+    if plant.linear is not None:
+        numbers[LINEAR] = 1.0
+        numbers[LINEAR_MODEL : LINEAR_MODEL + 10] = _discrete(plant.linear, plant.dt)
+    numbers[REWARD_WEIGHTS : REWARD_WEIGHTS + 3] = task.weights
+    numbers[THRUST_SCALE] = scale
+    numbers[LIMITS : LIMITS + 2] = state_limits(plant)
+    program, numbers[SECTIONS : SECTIONS + 4], rows = _program(plant, task, context)
+    numbers[CONSTANT_ROWS] = FIXED_ROWS + rows if plant.uncertainty else 0.0
+    return np.concatenate([numbers, program]), FIXED_ROWS + rows + (CONSTANT_COUNT if plant.uncertainty else 0)
+
+
+def _discrete(linear: LinearModel, dt: float) -> np.ndarray:
+    a_d, b_d = zero_order_hold(linear.a, linear.b, dt)
+    return np.concatenate([a_d.ravel(), b_d.ravel(), linear.c.ravel()])
+
+
+def _program(plant: Plant, task: Task, context: ThrusterContext) -> tuple[list[float], list[int], int]:
+    chains: list[tuple] = [(0, plant.amplifier, VOLTAGE), (1, plant.flow, AMBIENT)]
+    chains += [(2, effects, READINGS + i) for i, effects in enumerate(plant.sensors.values())]
+    numbered = [(*chain, index * SPACING, None) for index, chain in enumerate(chains)]
+    # The reference draws from a stream of its own, so it begins with number 0 whatever disturbs the plant.
+    numbered.append((3, task.reference, NEXT_REFERENCE, 0, None))
+    return encoded_chains(numbered, known_effects(plant, task), FIXED_ROWS, context)
+
 
 # How a block of copies moves in one sample time: amplifier's input, state, noise and thrust.
 
@@ -253,7 +340,7 @@ def advance(known_effects, plain: bool) -> Callable:
     out (REPORTED, blocks, width).
 
     Args:
-        known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
+        known_effects: a tuple of effects for each registry, as `known_effects` gives them.
         plain: know only a nominal thruster whose thrust is measured; compiles and runs faster.
     """
     return _build(compiled, known_effects, _known_channels(plain), plain, is_interpreting())
@@ -316,3 +403,64 @@ def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: 
                     out[i, b, j] = memory[b, i, j]
 
     return maker(step)
+
+
+# Many copies of a thruster, stepped in place by envs and by `simulate`.
+
+
+class Copies(PlantCopies):
+    """N copies of a thruster with a task; rows of their reports are above."""
+
+    commands, reported = (COMMAND,), REPORTED
+
+    def encode(self, plant: Plant) -> tuple[np.ndarray, int]:
+        """See `encode`."""
+        return encode(plant, self.task)
+
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
+        """The compiled step of this plant and task."""
+        effects = known_effects(self.plant, self.task), is_plain(self.plant, self.task)
+        return advance(*effects), advance_in_parts(*effects)
+
+    def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
+        """Draw uncertain parameters for episodes with keys (count, 2)."""
+        plant = self.plant
+        if not plant.uncertainty:
+            return
+        parameters = drawn_parameters(plant.parameters, plant.uncertainty, keys)
+        constants = derive_constants(parameters, plant.ambient_velocity, plant.dt / plant.substeps)
+        first = int(self.numbers[CONSTANT_ROWS])
+        for i, values in enumerate(constants):
+            set_row(memory, first + i, np.broadcast_to(values, len(keys)))
+
+
+# Trajectories of a plant, without an env around it.
+
+
+class Simulation(NamedTuple):
+    """Trajectories of a batch of B plants over K steps."""
+
+    states: np.ndarray  # (B, K + 1, 2)
+    thrusts: np.ndarray  # (B, K + 1) [N]
+    measurements: np.ndarray  # (B, K + 1, m)
+    valid: np.ndarray  # (B, K + 1, m), false where a measurement is missing and the last one repeated
+
+    def checked(self, what: str = "a simulation") -> Simulation:
+        """The same; ValueError that names the first step at which a number is not finite."""
+        check_finite(what, self.states, self.thrusts[..., None], self.measurements)
+        return self
+
+
+def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation:
+    """Run a plant from its initial state for every key (B, 2) under voltages (B, K) [V].
+
+    The same key and voltages give the same numbers as an env that is stepped through Gymnasium.
+
+    Raises:
+        ValueError: if shapes do not fit or a number is not finite.
+    """
+    reports = record(lambda count: Copies(plant, Task(), count), keys, voltages, "voltages", 1)
+    m = len(plant.channels)
+    readings = reports[..., READINGS : READINGS + m]
+    valid = reports[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
+    return Simulation(reports[..., OMEGA : FLOW + 1], reports[..., THRUST], readings, valid)

@@ -1,1 +1,0 @@
-"""Disturbances of a thruster: amplifier, ambient flow, reference signals and uncertain parameters."""
