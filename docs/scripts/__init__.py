@@ -36,7 +36,7 @@ PAGES: Mapping[str, tuple[str, ...]] = {  # and the modules that make their tabl
     "readme": ("docs.scripts.pictures",),
     "real_data": ("tuning.experiments.recordings.tables",),
     "tuning": ("docs.scripts.tuning", "docs.scripts.tuning_choice", "tuning.experiments.users"),
-    "ways": ("tuning.experiments.lidar",),
+    "methods": ("tuning.experiments.lidar",),
     "workers": ("docs.scripts.workers",),
 }
 

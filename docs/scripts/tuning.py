@@ -359,7 +359,7 @@ def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[C
 
 
 def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int = HELD_OUT_SEEDS) -> str:
-    """What each way of tuning buys on held-out seeds, all against the scaled default of the EKF.
+    """The gain of each method of tuning on held-out seeds, all against the scaled default of the EKF.
 
     Args:
         trials: of each study; twice as many where constants are states.

@@ -48,7 +48,7 @@ def ctrl_c_in_the_last_moments(rng: np.random.Generator, seconds: float) -> str:
     deadline, tried, interrupted = time.monotonic() + seconds, 0, 0
     outputs: dict[str, list[bytes]] = {}
     while time.monotonic() < deadline or not tried:
-        command = str(rng.choice(["filters", "filters --json -", "ways", "filters --help"]))
+        command = str(rng.choice(["filters", "filters --json -", "methods", "filters --help"]))
         at_output, wait = bool(rng.integers(2)), float(rng.uniform(0.0, 0.2))
         what = f"{command!r} interrupted {wait} s after its {'first output' if at_output else 'packages'}"
         line, pipe = [sys.executable, "-c", READY, *command.split()], subprocess.PIPE

@@ -280,7 +280,10 @@ def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(mo
     [
         ({"budget": None}, "'auto' must have a budget of microseconds a step .* or the objective 'cost'"),
         ({"budget": 0.0}, "budget must be positive, but got 0.0"),
-        ({"sampler": "grid"}, "a sampler that chooses among filters must be one of tpe, .*, but got 'grid'"),
+        (
+            {"sampler": "grid"},
+            r"a method \(--method\) that chooses among filters must be one of tpe, .*, but got 'grid'",
+        ),
         ({"filter": "low-pass", "full_q": True}, "a full Q needs a filter with a covariance, but got 'low-pass'"),
     ],
 )
@@ -341,11 +344,11 @@ def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(price
     assert "Filters that were tried" in (tmp_path / f"out/{name}.html").read_text()
 
 
-@pytest.mark.parametrize("method", ["optuna", "gradient"])
+@pytest.mark.parametrize("method", ["tpe", "gradient"])
 def test_the_tuned_file_says_what_made_the_choice(tmp_path, method):
     plan, path = Plan("ekf", (MISMATCH,)), tmp_path / "t.json"
     result = studied(plan, 1)
     write_tuned(path, plan, result, [evaluate_held_out(result.choice, MISMATCH, 0, 2)], "s", method)
     study = json.loads(path.read_text())["study"]
     assert study["method"] == method
-    assert study["best_training_value"] == (result.best_value if method == "optuna" else None)
+    assert study["best_training_value"] == (result.best_value if method == "tpe" else None)

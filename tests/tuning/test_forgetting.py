@@ -231,8 +231,8 @@ def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_
     assert f"Here the {names} have a larger Q, to forget within 0.1 s (--forget); those of the tables may " in said
 
 
-@pytest.mark.parametrize("options", ({"way": "likelihood"}, {"method": "gradient"}, {"way": "noise-estimation"}))
-def test_it_holds_on_other_ways_of_tuning(options, problem):
+@pytest.mark.parametrize("options", [{"method": name} for name in ("likelihood", "gradient", "noise-estimation")])
+def test_it_holds_on_other_methods_of_tuning(options, problem):
     found = tuning.tune(problem, "kf", trials=2, forget=FORGET, progress=False, **options)
     assert DT * found.held_out.evaluation.time_constants.steps[0] <= FORGET
 

@@ -117,7 +117,7 @@ def test_a_consistent_twin_has_the_same_correlation():
 
 def test_the_gradient_refuses_a_budget_with_one_clear_line(tmp_path):
     with pytest.raises(ValueError, match="must come without a budget, but got budget"):
-        tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", by_gradient="likelihood")
+        tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", method="gradient")
 
 
 @pytest.mark.parametrize("correlations", [[0.3, -0.6, 0.7, 0.0, 0.98, -0.2], [0.0] * 6])

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.tuning.ways.problems import linear, task_of
+from tests.tuning.methods.problems import linear, task_of
 from tuning.cli.app import app
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
+from tuning.methods.registry import find_method
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
@@ -17,7 +18,6 @@ from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
 from tuning.search.workers import run_in_workers
 from tuning.thruster.scenario import find_scenario
-from tuning.ways.registry import find_way
 
 TIED = ("Q22 = 4 Q11", "R22 = 0.1", "Q11 = 1e-3..10")
 
@@ -73,21 +73,21 @@ def test_gradients_end_where_the_relation_is_true_of_the_plant():
     assert q[1] == pytest.approx(4 * q[0]) and q[0] == pytest.approx(0.05, rel=0.1)
 
 
-@pytest.mark.parametrize("way", ["likelihood", "nelder-mead", "random", "posterior"])
-def test_ways_keep_them(way):
+@pytest.mark.parametrize("method", ["likelihood", "nelder-mead", "random-only", "posterior"])
+def test_methods_keep_them(method):
     task = task_of(linear(), options={"where": TIED})
     task.budget = task.budget._replace(runs=2000)
-    find_way(way).run(way, task)
+    find_method(method).run(method, task)
     assert len(task.kept) > 1
     for one in task.kept[1:]:
         q, r = one.choice.model["process_noise_cov"], one.choice.model["measurement_noise_cov"]
         assert q[1] == pytest.approx(4 * q[0], rel=1e-12) and r[1] == 0.1
 
 
-def test_a_way_that_finds_whole_matrices_knows_none():
+def test_a_method_that_finds_whole_matrices_knows_none():
     task = task_of(linear(), options={"where": TIED})
-    with pytest.raises(ValueError, match="way 'em' must come without where"):
-        find_way("em").run("em", task)
+    with pytest.raises(ValueError, match="method 'em' must come without where"):
+        find_method("em").run("em", task)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from filters.tuned_file import NOISE
 from tests.linear_problem import LinearProblem
-from tests.tuning.ways.problems import drawn, linear
+from tests.tuning.methods.problems import drawn, linear
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.regression import log_densities

@@ -200,7 +200,7 @@ FILTER_PROPOSAL = 24  # behind the spawn keys
 # Spawn keys: what a generator of a seed is for. An env's own is that without one, `default_rng(seed)`, and so is
 # that of the list [seed, 0]. They go on where streams end, for the keys of filters have the number of theirs.
 RANDOM_ACTIONS, ACTION_SPACE, POLICY, GLOBAL_GENERATORS, HELD_GENERATORS = range(15, 20)
-START_POINTS, COMPARISON_STUDY, LOCAL_TRIALS, WAY_OF_TUNING = range(20, 24)
+START_POINTS, COMPARISON_STUDY, LOCAL_TRIALS, METHOD_OF_TUNING = range(20, 24)
 SPAWN_KEYS = {
     "filter": FILTER_PRIOR,
     "random actions": RANDOM_ACTIONS,
@@ -211,7 +211,7 @@ SPAWN_KEYS = {
     "start points": START_POINTS,
     "comparison study": COMPARISON_STUDY,
     "local trials": LOCAL_TRIALS,
-    "way of tuning": WAY_OF_TUNING,
+    "method of tuning": METHOD_OF_TUNING,
 }
 
 GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks

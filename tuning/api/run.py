@@ -16,7 +16,7 @@ from rich.console import Console
 
 from filters.estimators.find import label_of
 from filters.registry import filter_type
-from thruster_env.core.checks import at_least, one_of, short_repr
+from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.baselines import noise_estimated, same_filter
@@ -26,6 +26,8 @@ from tuning.evaluation.worth import all_warnings
 from tuning.likelihood.family import check_gradient
 from tuning.likelihood.gradient import OF_STATES, GradientResult, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
+from tuning.methods.task import Budget, Refused, Task
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.augmented import within
 from tuning.problems.data import Data
@@ -64,59 +66,65 @@ from tuning.search.study import (
 from tuning.search.trials import run_trial
 from tuning.search.validation import as_data
 from tuning.search.workers import run_in_workers
-from tuning.ways.registry import WAYS, find_way
-from tuning.ways.task import Budget, Refused, Task
 
-# A way of tuning as a study: the values on its path are the trials, and its result is the choice.
+# A method that runs alone, stored as a study: the values on its path are the trials, and its answer is the choice.
 
 
-ANSWER = "answer of the way"  # attribute of a study
+ANSWER = "answer of the method"  # attribute of a study
+OLD_ANSWER, OLD_NAME = "answer of the way", "-way-"  # the same, and a part of its name, in journals until 2026
 
 
-class Followed(NamedTuple):
-    """The result of a way, and its cost."""
+class MethodAnswer(NamedTuple):
+    """The answer of a method that ran alone, and its cost."""
 
     name: str
     choice: Choice
     runs: float  # passes of the filter over one run each
     seconds: float  # of processor time, without compilation
-    refused: Refused | None = None  # where the choice is what the way was given
+    refused: Refused | None = None  # where the choice is what the method was given
 
 
-def check_way(plan: Plan, name: str, workers: int) -> None:
-    """Raise ValueError for an unknown way, or a plan that ways do not support."""
-    find_way(name)
+def check_method(plan: Plan, name: str, workers: int) -> None:
+    """Raise ValueError for an unknown method, or a plan that it does not support."""
+    method, word = find_method(name), f"method={name!r} (--method)"
+    if method.is_study and name != GRADIENT_METHOD:
+        return
     if plan.worst:
-        raise ValueError("a way (--way) must minimise the mean over problems, but got worst (--worst)")
+        raise ValueError(f"{word} must minimise the mean over problems, but got worst (--worst)")
+    if name == GRADIENT_METHOD:
+        check_gradient(plan.filter, "a filter whose likelihood has a gradient")
+        if plan.budget is not None:
+            raise ValueError(f"{word} must come without a budget, but got budget (--budget)")
+        return
     if plan.budget is not None or plan.filter == AUTO:
-        raise ValueError("a way (--way) must have one filter, and no budget of microseconds per step")
+        raise ValueError(f"{word} must have one filter, and no budget of microseconds per step")
     if len(plan.objectives) > 1:
-        raise ValueError(f"a way (--way) must have one objective, but got {list(plan.objectives)}")
+        raise ValueError(f"{word} must have one objective, but got {list(plan.objectives)}")
     if workers > 1:
-        raise ValueError(f"workers (--workers) must be 1 with a way (--way), but got {workers}")
+        raise ValueError(f"workers (--workers) must be 1 with {word}, but got {workers}")
 
 
-def follow(
+def run_alone(
     study: optuna.Study, plan: Plan, data: Sequence[Data], trials: int, on_trial: OnTrial, *, name: str
 ) -> bool:
-    """Run a way to its end, or one that samples trials for as many as a study has: `run` of `run_study`.
+    """Run a method to its end, or one that samples trials for as many as a study has: `run` of `run_study`.
 
     Returns:
         Whether Ctrl-C ended it; its results so far are kept.
 
     Raises:
-        ValueError: if the plan lacks what the way needs.
+        ValueError: if the plan lacks what the method needs.
     """
-    if ANSWER in study.user_attrs:
+    if _answer_in(study) is not None:
         return False
     options = plan.options if filter_type(plan.filter).has_covariance else {}
     with stop_on_interrupt() as interrupted:
         arguments: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
         passes = sum(len(runs.seeds) for runs in data)
-        arguments["budget"] = Budget(trials * passes) if find_way(name).by_trials else Budget()
+        arguments["budget"] = Budget(trials * passes) if find_method(name).by_trials else Budget()
         task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), given=_given(plan), **arguments)
         task.seed, task.stop = plan.seed, interrupted
-        find_way(name).run(name, task)
+        find_method(name).run(name, task)
         stopped = interrupted()
     space = plan.space()
     path = task.kept[1:] if task.refused is None else task.kept[1:-1]
@@ -136,7 +144,7 @@ def follow(
 def _start(plan: Plan, name: str) -> Choice | None:
     """Noise estimation where gradients of an error follow full matrices; None for the rule of thumb.
 
-    From a start far off these often end elsewhere, and from there they do not (docs/ways.md, groups C and D).
+    From a start far off these often end elsewhere, and from there they do not (docs/methods.md, groups C and D).
     """
     if name not in OF_STATES or not plan.full_q:
         return None
@@ -161,9 +169,17 @@ def _given(plan: Plan) -> Choice | None:
     return model_choice
 
 
-def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
-    """The result of a study by a way, with its answer instead of the best trial, and the way's cost."""
-    answer = study.user_attrs[ANSWER]
+def _answer_in(study: optuna.Study) -> dict[str, Any] | None:
+    """The answer of a method that is stored in a study; None before it is there."""
+    attributes = study.user_attrs
+    answer: dict[str, Any] | None = attributes.get(ANSWER, attributes.get(OLD_ANSWER))
+    return answer
+
+
+def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, MethodAnswer]:
+    """The result of a study with the answer of a method instead of the best trial, and the method's cost."""
+    answer = _answer_in(study)
+    assert answer is not None
     stored, refused = answer["choice"], answer.get("refused")
     choice = plan.forgetting(Choice(stored["name"], _tuples(stored["model"]), _tuples(stored["numbers"])))
     choice = plan.forgetting(choice, exact=True)
@@ -179,22 +195,22 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     }
     return (
         result._replace(choice=choice, best_value=value, **nothing),
-        Followed(name, choice, answer["runs"], answer["seconds"], refused and Refused(*refused)),
+        MethodAnswer(name, choice, answer["runs"], answer["seconds"], refused and Refused(*refused)),
     )
 
 
-def way_sentence(followed: Followed, word: str, objective: str) -> str:
+def method_sentence(answer: MethodAnswer, word: str, objective: str) -> str:
     """How the parameters were found, and the cost."""
-    way = WAYS[followed.name]
-    took = f"It took {followed.seconds:.2g} s, as long as {followed.runs:.0f} runs of the filter over one of the"
+    method = METHODS[answer.name]
+    took = f"It took {answer.seconds:.2g} s, as long as {answer.runs:.0f} runs of the filter over one of the"
     worse = ""
-    if followed.refused is not None:
-        given_value, answer = (reported(objective, value) for value in followed.refused)
+    if answer.refused is not None:
+        given_value, value = (reported(objective, value) for value in answer.refused)
         worse = (
-            f" On these its answer has a {reported_name(objective)} of {answer:.4g} and the given filter "
+            f" On these its answer has a {reported_name(objective)} of {value:.4g} and the given filter "
             f"{given_value:.4g}, so that one is returned."
         )
-    return f"Way {followed.name}: {way.about} ({way.source}). {took} training {word}.{worse}"
+    return f"Method {answer.name}: {method.about} ({method.source}). {took} training {word}.{worse}"
 
 
 def _some(choices: Sequence[Choice], count: int) -> list[Choice]:
@@ -215,7 +231,6 @@ def _tuples(content: Any) -> Any:
 MOST_TRIALS = 1_000_000
 MOST_WORKERS = 1000
 DIGITS = 6  # of a digest in the name of a study
-METHODS = ("optuna", "gradient")
 DEFAULT_BUDGET = 2.5  # us/step of one core over the square of the number of states
 FEWEST_A_TYPE = 5  # trials of a study among filter types, over the number of types
 OPTIMUM = "optimum of the {}"  # the gradient's answer among those that meet, by its objective
@@ -231,9 +246,9 @@ class Tuning(NamedTuple):
     comparisons: tuple[Comparison, ...]  # one for each scenario
     file: Path | None  # the tuned file, where one was written
     gradient: GradientResult | None = None  # where the choice is the optimum that gradients lead to ...
-    rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
+    rival: Comparison | None = None  # ... and what the study in its stead would have chosen
     known: Identifiability | None = None  # what the innovations determine; None without a covariance
-    way: Followed | None = None  # where the choice is the answer of a way
+    answer: MethodAnswer | None = None  # where the choice is that of a method that ran alone
 
     @property
     def scenario(self) -> Problem:
@@ -249,8 +264,8 @@ class Tuning(NamedTuple):
     def chosen(self) -> tuple[str, ...]:
         """Which trial was chosen and what it replaced, in sentences, and what to beware of in the result."""
         warned = self.warnings
-        if self.way is not None:
-            return (way_sentence(self.way, self.scenario.seed_word, self.plan.objectives[0]), *warned)
+        if self.answer is not None:
+            return (method_sentence(self.answer, self.scenario.seed_word, self.plan.objectives[0]), *warned)
         return (*choice_sentences(as_data(self.result.validation), self.plan), *warned)
 
     @property
@@ -259,10 +274,16 @@ class Tuning(NamedTuple):
         messages = all_warnings(self.comparisons, self.plan.scenarios, self.plan.forget)
         return (*messages, *range_warning(self.result.choice, self.plan))
 
+    @property
+    def method(self) -> str:
+        """Name of the method, one of METHODS."""
+        if self.answer is not None:
+            return self.answer.name
+        return self.plan.sampler if self.gradient is None else GRADIENT_METHOD
+
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
-        method = METHODS[self.gradient is not None] if self.way is None else self.way.name
-        write_tuned(file, self.plan, self.result, self.comparisons, self.study, method)
+        write_tuned(file, self.plan, self.result, self.comparisons, self.study, self.method)
 
 
 def run_tuning(
@@ -273,8 +294,8 @@ def run_tuning(
     name: str | None = None,
     out: Path | None = None,
     *,
-    by_gradient: str | None = None,
-    way: str | None = None,
+    method: str | None = None,
+    aim: str = LIKELIHOOD,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and, if requested, write the tuned file.
@@ -286,9 +307,9 @@ def run_tuning(
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        by_gradient: the objective whose gradient determines the choice, beside a study, if no baseline is as good;
-            None if the study does.
-        way: the way of tuning that determines the choice, one of `tuning.ways.registry.WAYS`; None for a study.
+        method: determines the choice, one of `tuning.methods.registry.METHODS`; None for a study by the plan's
+            sampler.
+        aim: the objective of the method "gradient", as of `aim_of`.
         workers: processes that share the study.
 
     Raises:
@@ -296,11 +317,9 @@ def run_tuning(
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
     trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
-    _check_method(plan, by_gradient)
-    if way is not None:
-        if by_gradient is not None:
-            raise ValueError("a way (--way) must come without method='gradient' (--method)")
-        check_way(plan, way, workers)
+    method = plan.sampler if method is None else method
+    check_method(plan, method, workers)
+    alone = not find_method(method).is_study
     if workers > 1 and storage is None:
         raise ValueError(
             f"workers must be 1 without a storage that they share, such as "
@@ -312,7 +331,7 @@ def run_tuning(
             "file is faster on one host, and several hosts need a server (docs/workers.md)",
             stacklevel=2,
         )
-    name = name or name_of(plan, by_gradient, way)
+    name = name or name_of(plan, method, aim)
     if not isinstance(name, str) or "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {short_repr(name)}")
     if out is not None:
@@ -321,30 +340,33 @@ def run_tuning(
         plan = checked(plan)  # before there is a journal
         warn_of_few_trials(plan, trials)
         _draw_first(plan, console)
-        study = open_study(name, plan, None if storage is None else open_storage(storage))
+        opened = None if storage is None else open_storage(storage)
+        if alone and opened is not None:
+            name = _stored_name(opened, name, method)
+        study = open_study(name, plan, opened)
         already = finished_trials(study)
         before = [trial for trial in study.get_trials(deepcopy=False) if trial.state in FINISHED]
         if already:
             console.print(f"study {name!r} continues after {already} finished trials")
         with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
-            if way is None and workers == 1 and not already and len(plan.filter_types) > 1:
+            if not alone and workers == 1 and not already and len(plan.filter_types) > 1:
                 compile_filters(plan, plan.filter_types[:trials], lambda name: show_kinds([f"compiling {name}"]))
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)
-            if way is not None:
-                run = partial(follow, name=way)
+            if alone:
+                run = partial(run_alone, name=method)
             result = run_study(study, plan, trials, advance, run)
-    gradient = rival = followed = None
-    if way is not None:
-        result, followed = answered(study, result, plan, way)
-    if by_gradient is not None:
-        with working(f"following the gradient of the {by_gradient}", console):
+    gradient = rival = answer = None
+    if alone:
+        result, answer = answered(study, result, plan, method)
+    if method == GRADIENT_METHOD:
+        with working(f"following the gradient of the {aim}", console):
             data, options = plan.training_data(), plan.options
-            gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=by_gradient, options=options)
+            gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=aim, options=options)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
         with working(f"comparing it with the baselines on validation {plan.scenarios[0].seed_word}", console):
-            result = answered_by(result, plan, OPTIMUM.format(by_gradient), plan.forgetting(gradient.choice))
+            result = answered_by(result, plan, OPTIMUM.format(aim), plan.forgetting(gradient.choice))
     try:
         with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
             comparisons = tuple(
@@ -356,7 +378,7 @@ def run_tuning(
                 f"study {name!r} keeps its trials: the same command continues with the held-out evaluation"
             )
         raise
-    tuning = Tuning(name, plan, result, comparisons, out, gradient, rival, way=followed)
+    tuning = Tuning(name, plan, result, comparisons, out, gradient, rival, answer=answer)
     if out is not None:
         tuning.write(out)
     if gradient is not None:
@@ -401,27 +423,17 @@ def _draw_first(plan: Plan, console: Console) -> None:
                 problem.data(problem.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
 
 
-def aim_of(method: str, asked: Sequence[str] | None) -> str | None:
-    """The objective whose gradient a method follows: the requested one if it has a gradient, or the likelihood."""
-    if one_of("method", method, METHODS) == METHODS[0]:
-        return None
+def aim_of(asked: Sequence[str] | None) -> str:
+    """The objective of the method "gradient": the requested one if it has a gradient, or the likelihood."""
     return asked[0] if asked and asked[0] in OF_STATES else LIKELIHOOD
 
 
-def _check_method(plan: Plan, by_gradient: str | None) -> None:
-    """Raise ValueError for a plan that the gradient method cannot serve."""
-    if by_gradient is None:
-        return
-    check_gradient(plan.filter, "a filter whose likelihood has a gradient")
-    if plan.worst:
-        raise ValueError(
-            "method='gradient' (--method) must minimise the mean over problems, but got worst (--worst)"
-        )
-    if plan.budget is not None:
-        raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
+def sampler_of(method: str) -> str:
+    """The sampler of a plan: that of a study; the default, which is not used, of a method that runs alone."""
+    return find_method(method).sampler or DEFAULT
 
 
-def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) -> str:
+def name_of(plan: Plan, method: str = DEFAULT, aim: str = LIKELIHOOD) -> str:
     """A name for a study of a plan, with everything that differs from the default.
 
     Of a user's problem or logs it has the beginning of their digest: another model makes another study.
@@ -438,9 +450,19 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += [] if plan.forget is None else [f"forget{plan.forget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
-    parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]
-    parts += [] if way is None else ["way", way]
+    if method == GRADIENT_METHOD:
+        parts.append("gradient-score" if aim == SCORE else "gradient")
+    elif not find_method(method).is_study:
+        parts += ["method", method]
     return "-".join(parts)
+
+
+def _stored_name(storage: optuna.storages.BaseStorage, name: str, method: str) -> str:
+    """The name of the study of a method that runs alone: the former one if only that is in the storage."""
+    base = name.removesuffix(f"-method-{method}")
+    former = name if base == name else base + OLD_NAME + method.removesuffix(ONLY)
+    names = optuna.get_all_study_names(storage)
+    return former if former in names and name not in names else name
 
 
 def _name_and_digest(problem: Problem) -> str:

@@ -20,7 +20,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.held_out import HeldOut
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
-from tuning.api.run import Tuning, aim_of, run_tuning, with_budget
+from tuning.api.run import Tuning, aim_of, run_tuning, sampler_of, with_budget
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import tuning_effect
@@ -259,10 +259,8 @@ def tune(
     forget: float | None = None,
     augment: Sequence[str] | Mapping[str, Any] = (),
     budget: float | None = None,
-    sampler: str = "tpe",
     prune: bool = True,
-    method: str = "optuna",
-    way: str | None = None,
+    method: str = "tpe",
     workers: int = 1,
     storage: str | Path | None = None,
     name: str | None = None,
@@ -317,12 +315,10 @@ def tune(
             whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
         budget: time limit of a step of the filter [microseconds of one core]; for "auto" by default 2.5 times the
             square of the number of states.
-        sampler: Optuna's sampler: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for Kalman filters except kf-steady, gsf, imm, mmae, mhe, fuzzy: maximum
-            likelihood, or the best "score", "mse" or "log-score" if that is the objective.
-        way: another way of tuning instead of a study, such as "em", as `thruster ways` lists them: a sampler ends
-            after `trials` trials, the others by their own criterion.
+        method: one of `thruster methods`: a study by a sampler of Optuna, by default "tpe"; "gradient", a study
+            and the optimum that gradients lead to, with standard errors; or a method that runs alone, such as
+            "noise-estimation" or "em", to its own end or, if it samples, for `trials` trials.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.
@@ -349,7 +345,7 @@ def tune(
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
     asked = [objective] if isinstance(objective, str) else objective
-    aim = aim_of(method, None if asked is None else list(asked))
+    sampler, aim = sampler_of(method), aim_of(None if asked is None else list(asked))
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
@@ -380,7 +376,7 @@ def tune(
     plan = with_budget(plan)
     journal = None if storage is None else storage_text(storage)
     console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, journal, name, by_gradient=aim, way=way, workers=workers))
+    return Study(run_tuning(plan, trials, console, journal, name, method=method, aim=aim, workers=workers))
 
 
 # A user's own parameters as a choice: those of a filter, or of a model with its own Q and R.

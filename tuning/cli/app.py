@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import sys
-from collections.abc import MutableMapping
+from collections.abc import Iterable, MutableMapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -18,7 +18,16 @@ from tuning.cli.printing import printed_whole
 
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
-    "Tune and evaluate a filter": ("tune", "explore", "ways", "evaluate", "report", "verify", "export", "compare"),
+    "Tune and evaluate a filter": (
+        "tune",
+        "explore",
+        "methods",
+        "evaluate",
+        "report",
+        "verify",
+        "export",
+        "compare",
+    ),
     "Recorded logs": ("log", "identify", "estimate"),
     "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
     "Published results and long studies": ("reproduce", "study"),
@@ -26,10 +35,29 @@ PANELS = {
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
+RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods"}
+
+
+def with_todays_name(error: Exception, known: Iterable[str]) -> Exception:
+    """The error about an unknown option or command, which names today's if it had another name before."""
+    message = str(getattr(error, "message", ""))
+    for former, today in RENAMED.items():
+        unknown = getattr(error, "option_name", None) == former or f"'{former}'" in message
+        if unknown and today in known:
+            error.message = f"{message.rstrip('.')}. Did you mean {today if former[0] == '-' else repr(today)}?"  # type: ignore[attr-defined]
+            error.possibilities = None  # type: ignore[attr-defined]  # similar names
+    return error
 
 
 class Command(TyperCommand):
     """A command whose help Ctrl-C does not cut."""
+
+    def parse_args(self, ctx, args: list[str]) -> list[str]:
+        """Read the arguments."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.TyperException as error:
+            raise with_todays_name(error, [name for parameter in self.params for name in parameter.opts]) from None
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""
@@ -39,6 +67,13 @@ class Command(TyperCommand):
 
 class Group(TyperGroup):
     """A group of commands whose help Ctrl-C does not cut."""
+
+    def resolve_command(self, ctx, args: list[str]):
+        """The command that the first argument names."""
+        try:
+            return super().resolve_command(ctx, args)
+        except typer.TyperException as error:
+            raise with_todays_name(error, self.list_commands(ctx)) from None
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""

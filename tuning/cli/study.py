@@ -16,7 +16,7 @@ from rich.progress import (
 )
 
 from thruster_env.core.text_tables import table
-from tuning.cli import recordings, users, ways_study
+from tuning.cli import methods_study, recordings, users
 from tuning.cli.app import Command, Group
 from tuning.cli.options import OUTPUT, RUNS, JsonOption
 from tuning.cli.output import announce_compilation, emit, progress_console
@@ -33,7 +33,7 @@ def _callback() -> None:
 
 app.command("recordings", cls=Command)(recordings.command)
 app.command("users", cls=Command)(users.command)
-app.command("ways", cls=Command)(ways_study.command)
+app.command("methods", cls=Command)(methods_study.command)
 
 
 @app.command("policies", cls=Command)

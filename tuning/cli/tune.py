@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.api.run import Tuning, aim_of, name_of, run_tuning, with_budget
+from tuning.api.run import Tuning, aim_of, name_of, run_tuning, sampler_of, with_budget
 from tuning.cli.log_options import BlockOptions, GridOptions, problems_of, with_groups
 from tuning.cli.options import (
     FILTER,
@@ -26,11 +26,10 @@ from tuning.cli.output import announce_compilation, check_targets, emit, progres
 from tuning.cli.problems import PROBLEMS
 from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.tuned import check_keepable
+from tuning.methods.registry import DEFAULT, METHODS
 from tuning.problems.augmented import augmented, unknowns_of
-from tuning.search.objectives import OBJECTIVES
+from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
-from tuning.search.samplers import SAMPLERS
-from tuning.ways.registry import WAYS
 
 DEFAULT_STORAGE = "out/studies.journal"
 NONE_CONSISTENT = 3  # exit code
@@ -114,9 +113,6 @@ def command(
             rich_help_panel=FILTER,
         ),
     ] = None,
-    sampler: Annotated[
-        str, typer.Option(help=", ".join(SAMPLERS), callback=spelt(SAMPLERS), rich_help_panel=SEARCH)
-    ] = "tpe",
     no_pruning: Annotated[
         bool,
         typer.Option(
@@ -128,20 +124,12 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="optuna, or gradient for Kalman filters except kf-steady, gsf, imm, mmae and fuzzy: maximum "
-            "likelihood, or the best score, mse or log-score if that is the --objective; optuna runs "
-            "for comparison.",
+            help="A study by a sampler (tpe, gp, cma-es, nsga-ii, random, grid), gradient for Kalman filters, or "
+            "a published method; `thruster methods` lists them and when to use which.",
+            callback=spelt(METHODS),
             rich_help_panel=SEARCH,
         ),
-    ] = "optuna",
-    way: Annotated[
-        str | None,
-        typer.Option(
-            help="Another way of tuning instead of a study; `thruster ways` lists them and when to use which.",
-            callback=spelt(WAYS),
-            rich_help_panel=SEARCH,
-        ),
-    ] = None,
+    ] = DEFAULT,
     workers: Annotated[
         int, typer.Option(help="Processes on this host that share the study.", rich_help_panel=RUNS)
     ] = 1,
@@ -184,12 +172,12 @@ def command(
     states it chooses the trial with the best log score among those within 5 % of the least error. If no trial is
     in the band, the report and the file say so, and the exit code is 3.
 
-    --way selects a published method instead; its samplers end after --trials trials, the other methods by their
-    own criterion. With a right model and true states use noise-estimation. With true states use log-score if the
-    covariance matters, mse if only the estimate does. Without true states use likelihood, or als for a linear
-    model on long runs, which accepts --full-q and --full-r. For an ensemble use this study, or desroziers without
-    true states. With true states and a wrong model, or a dead band, add --full-q (and --full-r) to mse or
-    log-score. `thruster ways` lists all methods.
+    --method also selects another sampler, gradients, or a published method, which runs alone: samplers end after
+    --trials trials, the others by their own criterion. With a right model and true states use noise-estimation.
+    With true states use log-score if the covariance matters, mse if only the estimate does. Without true states
+    use likelihood, or als for a linear model on long runs, which accepts --full-q and --full-r. For an ensemble
+    use the default, or desroziers without true states. With true states and a wrong model, or a dead band, add
+    --full-q (and --full-r) to mse or log-score. `thruster methods` lists all methods.
 
     With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
     negative log-likelihood of the innovations, unless the logs contain the true states.
@@ -198,13 +186,13 @@ def command(
 
     Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
 
-    Example: thruster tune --filter ekf --way log-score --scenario mismatch
+    Example: thruster tune --filter ekf --method log-score --scenario mismatch
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
 
     Example: thruster tune --filter ekf --augment voltage_gain --scenario mismatch
     """
-    aim = aim_of(method, objective)
+    sampler = sampler_of(method)
     check_keepable(filter_name)
     unknown = unknowns_of(augment or ())
     scenarios = tuple(augmented(problem, unknown) for problem in problems_of(scenario, logs, reading, "mismatch"))
@@ -229,7 +217,7 @@ def command(
         forget=forget,
     )
     plan = with_budget(plan)
-    tuning = tune(plan, trials, storage, study, out, by_gradient=aim, way=way, workers=workers)
+    tuning = tune(plan, trials, storage, study, out, method=method, aim=aim_of(objective), workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
         sys.exit(130)
@@ -244,13 +232,13 @@ def tune(
     study_name: str | None = None,
     out: Path | None = None,
     *,
-    by_gradient: str | None = None,
-    way: str | None = None,
+    method: str = DEFAULT,
+    aim: str = LIKELIHOOD,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and write the tuned file."""
-    name = study_name or name_of(plan, by_gradient, way)
+    name = study_name or name_of(plan, method, aim)
     file = out or Path("out") / f"{name}.json"
     announce_compilation()
-    options: dict[str, Any] = {"by_gradient": by_gradient, "way": way, "workers": workers}
+    options: dict[str, Any] = {"method": method, "aim": aim, "workers": workers}
     return run_tuning(plan, trials, progress_console, storage, name, file, **options)

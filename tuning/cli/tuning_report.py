@@ -106,11 +106,10 @@ def way_out(tuning: Tuning) -> list[str]:
             f"That is the price of forgetting within {tuning.plan.forget:g} s (--forget): the baselines in the "
             "table may remember longer."
         ]
-    if tuning.gradient is not None or tuning.way is not None:
-        option = "--way" if tuning.way is not None else "--method gradient"
+    if tuning.gradient is not None or tuning.answer is not None:
         return [
             f"What to take: the {called(better[0])}{_noise_words(tuning, better[0])}. The same command without "
-            f"{option} runs a study, which ends with the best baseline if no trial is better."
+            f"--method {tuning.method} runs a study, which ends with the best baseline if no trial is better."
         ]
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
     pruning += ", or maximum likelihood (--method gradient)" if has_gradient(tuning.plan.filter) else ""
@@ -139,7 +138,9 @@ def _noise_words(tuning: Tuning, name: str) -> str:
     values = parameters_of(choices[name]) if name in choices else {}
     if not 0 < len(values) <= MOST_VALUES:
         return (
-            ", whose Q and R --way noise-estimation saves" if name == NOISE else ", whose Q and R are in the table"
+            ", whose Q and R --method noise-estimation saves"
+            if name == NOISE
+            else ", whose Q and R are in the table"
         )
     return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
 
@@ -316,9 +317,12 @@ def as_json(tuning: Tuning) -> dict:
         "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],
         "held_out": held_out,
         "file": str(tuning.file),
+        "method": {
+            "name": tuning.method,
+            "runs": None if tuning.answer is None else tuning.answer.runs,
+            "seconds": None if tuning.answer is None else tuning.answer.seconds,
+        },
     }
-    if tuning.way is not None:
-        data["way"] = {"name": tuning.way.name, "runs": tuning.way.runs, "seconds": tuning.way.seconds}
     if tuning.known is not None:
         data["innovations_alone"] = as_data(tuning.known)
     if tuning.gradient is not None and tuning.rival is not None:

@@ -57,7 +57,7 @@ def write_tuned(
     result: StudyResult,
     comparisons: Sequence[Comparison],
     study_name: str,
-    method: str = "optuna",
+    method: str | None = None,
 ) -> None:
     """Write a tuned file, completely or not at all.
 
@@ -67,7 +67,7 @@ def write_tuned(
         result: its result, with the choice.
         comparisons: held-out evaluations, one for each scenario.
         study_name: name of the study.
-        method: how the choice was made, "optuna", "gradient", "by hand", or the name of a way.
+        method: name of the method that made the choice, or "by hand"; the plan's sampler if None.
 
     Raises:
         ValueError: if the folder cannot be written, or the filter is an estimator, which is code.
@@ -97,9 +97,9 @@ def write_tuned(
         "study": {
             "name": study_name,
             **plan.identity,
-            "method": method,
+            "method": plan.sampler if method is None else method,
             "trials": result.finished,
-            "best_training_value": result.best_value if method == "optuna" else None,
+            "best_training_value": result.best_value if method in (None, plan.sampler) else None,
             "microseconds_a_step": result.microseconds,
             **consistency(result),
         },

@@ -27,10 +27,10 @@ from filters.consistency.intervals import Interval
 from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
+from tuning.methods.registry import find_method
+from tuning.methods.task import Task
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.space import Choice, untuned_choice
-from tuning.ways.registry import find_way
-from tuning.ways.task import Task
 
 RANGE, BEARING = 2.0, np.deg2rad(1.5)  # deviations [m, rad]
 FIELD, SPEEDS = 600.0, (30.0, 90.0)  # [m], [m/s]
@@ -107,7 +107,7 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
     )
 
 
-# OKF's lidar: our ways of tuning beside the package that the example is from, in its own filter, on equal data.
+# OKF's lidar: our methods of tuning beside the package that the example is from, in its own filter, on equal data.
 
 
 LEARN, TEST = 700, 300  # runs of a draw
@@ -115,9 +115,9 @@ DRAWS = 3
 FULL = {"full_q": True, "full_r": True}
 OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
 IN_A_FIFTH = "the same in a fifth of OKF's time"
-WAYS: Mapping[str, tuple[str, Mapping[str, bool]]] = {  # names of rows, with the way and its options
+METHODS: Mapping[str, tuple[str, Mapping[str, bool]]] = {  # names of rows, with the method and its options
     NOISE: ("noise-estimation", FULL),
-    "ours, the way okf": ("okf", FULL),
+    "ours, the method okf": ("okf", FULL),
     GRADIENT: ("mse", FULL),
     "-log p(z) by its gradient": ("likelihood", FULL),
     "EM": ("em", FULL),
@@ -129,7 +129,7 @@ RESAMPLES = 2000
 
 
 class Row(NamedTuple):
-    """A way on the runs that are held out, of D draws with B runs each."""
+    """A method on the runs that are held out, of D draws with B runs each."""
 
     name: str
     choices: tuple[Choice, ...]  # of each draw
@@ -155,7 +155,7 @@ class Row(NamedTuple):
 
     @classmethod
     def pooled(cls, rows: Sequence[Row]) -> Row:
-        """One way on all draws: means of what is not of a run."""
+        """One method on all draws: means of what is not of a run."""
         columns = zip(*rows, strict=True)
         names, choices, seconds, squares, steps, *means = (list(column) for column in columns)
         joined = np.concatenate(squares), np.concatenate(steps)
@@ -167,15 +167,15 @@ def compared(
     learn: int = LEARN,
     test: int = TEST,
     draws: int = DRAWS,
-    ways: Mapping[str, tuple[str, Mapping[str, bool]]] = WAYS,
+    methods: Mapping[str, tuple[str, Mapping[str, bool]]] = METHODS,
 ) -> list[Row]:
-    """All ways, and OKF itself where it is installed, on the same runs of some draws."""
-    by_draw = [of_draw(learn, test, seed, ways) for seed in range(draws)]
+    """All methods, and OKF itself where it is installed, on the same runs of some draws."""
+    by_draw = [of_draw(learn, test, seed, methods) for seed in range(draws)]
     return [Row.pooled(rows) for rows in zip(*by_draw, strict=True)]
 
 
-def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapping[str, bool]]]) -> list[Row]:
-    """All ways on the runs of one seed."""
+def of_draw(learn: int, test: int, seed: int, methods: Mapping[str, tuple[str, Mapping[str, bool]]]) -> list[Row]:
+    """All methods on the runs of one seed."""
     runs = drawn(learn + test, seed)
     problem, rows = lidar_problem(runs, test), []
     data, held_out = problem.data(range(learn)), problem.data(range(learn, learn + test))
@@ -185,9 +185,9 @@ def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapp
         q, r = okf_itself(runs[:learn], seed)
         choice = with_covariances(untuned_choice("kf", problem), q, r)
         rows.append(row_of(OKF, choice, time.process_time() - begin, problem, held_out))
-    for name, (way, options) in ways.items():
+    for name, (method, options) in methods.items():
         task = Task("kf", problem, data, options=options)
-        find_way(way).run(way, task, guarded=False)
+        find_method(method).run(method, task, guarded=False)
         rows.append(row_of(name, task.best, task.seconds, problem, held_out))
         if name == GRADIENT and rows[0].name == OKF:
             fifth = rows[0].seconds / 5.0
@@ -233,7 +233,7 @@ def okf_itself(runs: list[Run], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def markdown(rows: list[Row]) -> str:
     """The table, with ratios to OKF or, without it, to noise estimation."""
     first = next((row for row in rows if row.name == OKF), rows[0])
-    heads = ["way", "seconds", "MSE [m^2]", f"over {first.name}", "NIS", "NEES", "log p(z) of a run"]
+    heads = ["method", "seconds", "MSE [m^2]", f"over {first.name}", "NIS", "NEES", "log p(z) of a run"]
     cells = []
     for row in rows:
         ratio = row.over(first)

@@ -176,7 +176,7 @@ def make_sampler(
         raise ValueError(f"the sampler {name!r} needs {package}, which is not installed: {to_install(extra)}")
     if name in WITHOUT_FILTER_TYPES and FILTER_TYPE in distributions:
         able = ", ".join(sampler for sampler in SAMPLERS if sampler not in WITHOUT_FILTER_TYPES)
-        raise ValueError(f"a sampler that chooses among filters must be one of {able}, but got {name!r}")
+        raise ValueError(f"a method (--method) that chooses among filters must be one of {able}, but got {name!r}")
     if name == "grid":  # its order, and so its seed, has to be the same in every process
         values = {key: _grid(distribution) for key, distribution in distributions.items()}
         return optuna.samplers.GridSampler(values, seed=seed)

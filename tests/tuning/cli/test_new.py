@@ -193,9 +193,9 @@ def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # 
 
 
 @pytest.mark.slow
-def test_gradients_and_ways_tune_a_users_filter(new):
+def test_gradients_and_methods_tune_a_users_filter(new):
     name = f"{new('filter', 'a_new_way')}:ANewWay"
-    study = tuning.tune("nominal", name, way="likelihood", progress=False)
+    study = tuning.tune("nominal", name, method="likelihood", progress=False)
     evaluated = study.held_out
     assert evaluated is not None and study.choice.numbers["bandwidth"] == 3.0
     found = tune_by_gradient(name, find_problem("nominal"), find_problem("nominal").data(range(8)))

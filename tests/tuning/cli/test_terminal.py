@@ -59,8 +59,8 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
-    assert without == {"inspect", "filters", "new", "ways", "report", "verify", "export", "log"}
-    writing, studies = set(COMMANDS) - {"study", *WITHOUT_JSON}, ("policies", "recordings", "users", "ways")
+    assert without == {"inspect", "filters", "new", "methods", "report", "verify", "export", "log"}
+    writing, studies = set(COMMANDS) - {"study", *WITHOUT_JSON}, ("policies", "recordings", "users", "methods")
     for name in (*writing, *(f"study {one}" for one in studies)):
         assert "--json " in thruster(*name.split(), "--help").stdout
 
@@ -166,7 +166,7 @@ def test_a_word_stands_there_while_a_command_is_imported(monkeypatch, capsys):
 
 
 def test_a_refused_study_leaves_no_journal(thruster, tmp_path):  # noqa: F811
-    for arguments in (("--sampler", "none"), ("--objective", "none"), ("--filter", "none")):
+    for arguments in (("--method", "none"), ("--objective", "none"), ("--filter", "none")):
         assert thruster("tune", "--filter", "ekf", *arguments).returncode == 2
     assert not list(tmp_path.rglob("*.journal"))
 
@@ -198,7 +198,8 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
         tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
     )
     tuning = SimpleNamespace(
-        way=None,
+        answer=None,
+        method="tpe",
         comparisons=[comparison],
         gradient=None,
         plan=SimpleNamespace(prune=True, filter="enkf", forget=None),
@@ -208,19 +209,23 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
     problem = LinearProblem()
     result, plan = SimpleNamespace(choice=rule_of_thumb("kf", problem)), Plan("kf", (problem,))
-    by_way = SimpleNamespace(**{**vars(tuning), "way": "likelihood", "plan": plan, "result": result})
-    (said,) = way_out(by_way)
-    assert said.startswith("What to take: the scaled default (Q11 = ") and "without --way runs a study" in said
+    alone = {"answer": ..., "method": "likelihood", "plan": plan, "result": result}
+    by_method = SimpleNamespace(**{**vars(tuning), **alone})
+    (said,) = way_out(by_method)
+    assert (
+        said.startswith("What to take: the scaled default (Q11 = ")
+        and "without --method likelihood runs a study" in said
+    )
     logs = SimpleNamespace(tuned=SimpleNamespace(has_truth=False))
     logs.likelihood_gains = {
         "given": Interval(-20, -30, -10),
         RULE: Interval(-50, -60, -40),
         ORACLE: Interval(-99, -99, -99),
     }
-    (said,) = way_out(SimpleNamespace(**{**vars(by_way), "comparisons": [logs]}))
+    (said,) = way_out(SimpleNamespace(**{**vars(by_method), "comparisons": [logs]}))
     assert said.startswith("What to take: the rule of thumb (Q11 = ")
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
-    assert way_out(tuning) == way_out(by_way) == []
+    assert way_out(tuning) == way_out(by_method) == []
 
 
 def test_a_study_that_is_done_shows_its_best_and_no_time_left():
@@ -247,7 +252,7 @@ def test_a_table_whose_words_fit_is_never_wider_than_the_terminal(monkeypatch):
     words = "a covariance of innovations " * 3
     rows = [["expectation-maximisation", words, words, "true states, a gradient"]]
     monkeypatch.setattr("thruster_env.core.text_tables.console", Console(width=80))
-    lines = plain_text([table("", ["way", "what it does", "use it", "needs"], rows)], 80).splitlines()
+    lines = plain_text([table("", ["method", "what it does", "use it", "needs"], rows)], 80).splitlines()
     assert max(map(len, lines)) <= 80 and all(
         word in " ".join(lines).split() for word in "gradient states,".split()
     )

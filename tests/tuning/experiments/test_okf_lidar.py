@@ -8,10 +8,10 @@ from tuning.experiments.lidar import (
     BEARING,
     GRADIENT,
     IN_A_FIFTH,
+    METHODS,
     NOISE,
     OKF,
     RANGE,
-    WAYS,
     compared,
     drawn,
     is_installed,
@@ -66,7 +66,7 @@ def test_the_package_begins_at_noise_estimation_and_leaves_it():
 
 @pytest.mark.slow
 def test_the_table_in_its_quick_form():
-    rows = compared(24, 12, 1, ways={name: one for name, one in WAYS.items() if name != "EM"})
+    rows = compared(24, 12, 1, methods={name: one for name, one in METHODS.items() if name != "EM"})
     names = [row.name for row in rows]
     assert names[0] == (OKF if is_installed() else NOISE) and len(set(names)) == len(names)
     found = {row.name: row for row in rows}

@@ -1,21 +1,17 @@
-"""Ways whose answers are known: closed forms, published figures, integrals on a grid."""
+"""Methods whose answers are known: closed forms, published figures, integrals on a grid."""
 
 import numpy as np
 import pytest
 
 from filters import affine_model
 from tests.slow import slow_but
-from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
+from tests.tuning.methods.problems import A, Q, R, at, linear, task_of
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
-from tuning.experiments.ways.problems import ring
+from tuning.experiments.methods.problems import ring
 from tuning.likelihood.family import symmetric_units
-from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
-from tuning.problems.runs_problem import RunsProblem
-from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.adaptive import updated
-from tuning.ways.correlations import (
+from tuning.methods.adaptive import updated
+from tuning.methods.correlations import (
     Noise,
     autocovariances,
     lagged,
@@ -24,8 +20,12 @@ from tuning.ways.correlations import (
     stationary,
     steady_gain,
 )
-from tuning.ways.registry import find_way
-from tuning.ways.task import Budget, Task
+from tuning.methods.registry import find_method
+from tuning.methods.task import Budget, Task
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.parameter import Parameter
+from tuning.problems.runs_problem import RunsProblem
+from tuning.search.objectives import LIKELIHOOD
 
 # Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space
 # methods", 2nd ed., where Q is 1469.1 and R 15099 (section 2.10).
@@ -52,10 +52,10 @@ def nile():
     return RunsProblem(runs, level(), held_out=[2, 3], name="the Nile")
 
 
-@pytest.mark.parametrize("way", slow_but(["likelihood", "em", "squarem", "scoring"], ["likelihood", "em"]))
-def test_the_nile_has_the_variances_that_durbin_and_koopman_print(way):
+@pytest.mark.parametrize("method", slow_but(["likelihood", "em", "squarem", "scoring"], ["likelihood", "em"]))
+def test_the_nile_has_the_variances_that_durbin_and_koopman_print(method):
     task = task_of(nile(), 1)
-    find_way(way).run(way, task)
+    find_method(method).run(method, task)
     found = task.best.model
     assert found["process_noise_cov"][0] == pytest.approx(1469.1, rel=2e-3)
     assert found["measurement_noise_cov"] == pytest.approx(15099, rel=2e-3)
@@ -64,7 +64,7 @@ def test_the_nile_has_the_variances_that_durbin_and_koopman_print(way):
 def test_noise_estimation_is_the_covariance_of_what_the_equations_leave():
     problem = linear(runs=8, steps=200)
     task = task_of(problem, 8)
-    find_way("noise-estimation").run("noise-estimation", task)
+    find_method("noise-estimation").run("noise-estimation", task)
     data, model = task.data[0], problem.model()
     a, _, _, c, _ = model.matrices()
     w = (data.states[:, 1:] - data.states[:, :-1] @ a.T).reshape(-1, 2)
@@ -90,7 +90,7 @@ def test_map_of_noise_of_a_known_state_is_the_mode_of_an_inverse_wishart_distrib
     z = 1.3 * np.random.default_rng(0).standard_normal((4, 12))
     problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
     task = Task("kf", problem, problem.data([0]))
-    find_way("map").run("map", task)
+    find_method("map").run("map", task)
     scale = task.start.model["measurement_noise_cov"]  # nu = 3: density r^(-5/2) exp(-scale / 2 r)
     expected = (scale + (z[0] ** 2).sum()) / (z[0].size + 5)
     assert task.best.model["measurement_noise_cov"] == pytest.approx(expected, rel=1e-5)
@@ -101,7 +101,7 @@ def test_map_of_a_full_q_that_is_seen_is_the_mode_of_an_inverse_wishart_distribu
     q = np.array([[0.5, 0.2], [0.2, 0.3]])
     problem = linear(a=a, c=c, q=q, r=r, p0=np.eye(2), steps=20)
     task = task_of(problem, options={"full_q": True, "hold_r": True})
-    find_way("map").run("map", task)
+    find_method("map").run("map", task)
     z = task.data[0].measurements
     w = (z[:, 1:] - z[:, :-1] @ a.T).reshape(-1, 2)
     centre = task.model(task.start).process_noise_cov
@@ -109,9 +109,9 @@ def test_map_of_a_full_q_that_is_seen_is_the_mode_of_an_inverse_wishart_distribu
     np.testing.assert_allclose(task.best.model["process_noise_cov"], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("way", ["posterior", "nuts"])
-def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(way):
-    if way == "nuts":
+@pytest.mark.parametrize("method", ["posterior", "nuts"])
+def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(method):
+    if method == "nuts":
         pytest.importorskip("nutpie")
     still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [0.0]}
     one = np.eye(1)
@@ -120,7 +120,7 @@ def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(way):
     problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
     task = Task("kf", problem, problem.data([0]), start=None)
     assert [parameter.name for parameter in task.free] == ["R"]
-    find_way(way).run(way, task)
+    find_method(method).run(method, task)
     grid = np.linspace(-8.0, 8.0, 4001)
     log = -0.5 * (z[0].size * grid + (z[0] ** 2).sum() * np.exp(-grid))
     log -= 0.5 * ((grid - np.log(2.0)) / np.log(10.0)) ** 2
@@ -134,15 +134,15 @@ def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(way):
 def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budget():
     pytest.importorskip("nutpie")
     problem, found = linear(runs=4), {}
-    for way in ("posterior", "nuts"):
+    for method in ("posterior", "nuts"):
         task = task_of(problem, 4)
-        find_way(way).run(way, task)
-        found[way] = np.log(task.values_of(task.best, task.free))
+        find_method(method).run(method, task)
+        found[method] = np.log(task.values_of(task.best, task.free))
     np.testing.assert_allclose(found["nuts"], found["posterior"], atol=0.12)
     few = []
     for runs in (1, 300, 300):
         task = task_of(problem, 4, budget=Budget(runs=runs))
-        find_way("nuts").run("nuts", task)
+        find_method("nuts").run("nuts", task)
         assert task.runs <= runs + 4 * task._prices[LIKELIHOOD] and (len(task.kept) > 1) == (runs > 1)
         few.append(task.values_of(task.best, task.free))
     np.testing.assert_array_equal(few[1], few[2])
@@ -150,8 +150,8 @@ def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budg
 
 def test_without_nutpie_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="way 'nuts' needs nutpie, which is not installed: pip install nutpie"):
-        find_way("nuts").run("nuts", task_of(linear()))
+    with pytest.raises(ValueError, match="method 'nuts' needs nutpie, which is not installed: pip install nutpie"):
+        find_method("nuts").run("nuts", task_of(linear()))
 
 
 MOTIVATING = {  # of the ALS toolbox: Odelson, Rajamani, Rawlings
@@ -183,7 +183,7 @@ def test_als_has_the_scatter_of_the_toolboxs_example():
     found = []
     for repetition in range(30):
         task = Task("kf", problem, problem.data([repetition]))
-        find_way("als").run("als", task)
+        find_method("als").run("als", task)
         found.append([task.kept[1].choice.model[name] for name in ("q", "r")])  # with the gain of the example
     means, deviations = np.mean(found, axis=0), np.std(found, axis=0)
     errors = np.array([0.135, 0.033]) / np.sqrt(30)
@@ -224,14 +224,14 @@ def test_mehra_scatters_more_than_als():
     problem, found = linear(a=A, steps=400, runs=40), {"mehra": [], "als": []}
     truth = np.array([Q[0, 0], Q[1, 1], R[0, 0], R[1, 1]])
     for place in range(40):
-        for way, values in found.items():
+        for method, values in found.items():
             task = Task("kf", problem, problem.data([place]))
-            find_way(way).run(way, task)
+            find_method(method).run(method, task)
             values.append(task.values_of(task.best, task.free))
-    means = {way: np.mean(values, axis=0) for way, values in found.items()}
-    errors = {way: np.std(values, axis=0) for way, values in found.items()}
-    for way in found:
-        assert (abs(means[way] - truth) < 4 * errors[way] / np.sqrt(40)).all(), (way, means[way])
+    means = {method: np.mean(values, axis=0) for method, values in found.items()}
+    errors = {method: np.std(values, axis=0) for method, values in found.items()}
+    for method in found:
+        assert (abs(means[method] - truth) < 4 * errors[method] / np.sqrt(40)).all(), (method, means[method])
     ratios = errors["mehra"] / errors["als"]
     assert ratios.max() > 1.3 and ratios.min() > 0.9, ratios
 
@@ -273,7 +273,7 @@ def test_als_finds_full_matrices_of_long_runs():
     problem = linear(q=FULL_Q, r=FULL_R, steps=4000, runs=8)
     task = task_of(problem, 8, options={"full_q": True, "full_r": True})
     task.start = at(task, np.diag(OTHER[0]), np.diag(OTHER[1]))
-    find_way("als").run("als", task)
+    find_method("als").run("als", task)
     np.testing.assert_allclose(task.best.model["process_noise_cov"], FULL_Q, rtol=0.1)
     np.testing.assert_allclose(task.best.model["measurement_noise_cov"], FULL_R, rtol=0.1)
     assert task.runs == 3 * 8
@@ -282,9 +282,9 @@ def test_als_finds_full_matrices_of_long_runs():
 @pytest.mark.slow
 def test_fisher_scoring_ends_where_l_bfgs_ends():
     problem = linear(runs=4, steps=80)
-    tasks = {way: task_of(problem, 4, options={"full_q": True}) for way in ("scoring", "likelihood")}
-    for way, task in tasks.items():
-        find_way(way).run(way, task)
+    tasks = {method: task_of(problem, 4, options={"full_q": True}) for method in ("scoring", "likelihood")}
+    for method, task in tasks.items():
+        find_method(method).run(method, task)
     by_scoring, by_l_bfgs = (task.value(task.best, LIKELIHOOD) for task in tasks.values())
     assert by_scoring == pytest.approx(by_l_bfgs, rel=1e-8)
     assert len(tasks["scoring"].kept) < len(tasks["likelihood"].kept)
@@ -295,31 +295,31 @@ def test_als_refuses_what_it_cannot_do():
 
     problem = find_scenario("nominal")
     task = Task("ekf", problem, problem.data(range(2)))
-    with pytest.raises(ValueError, match="way 'als' needs a linear model"):
-        find_way("als").run("als", task)
-    for way, option in (("als", "prior"), ("mehra", "full_q")):
-        with pytest.raises(ValueError, match=f"way '{way}' must come without {option}"):
-            find_way(way).run(way, task_of(linear(), options={option: True}))
+    with pytest.raises(ValueError, match="method 'als' needs a linear model"):
+        find_method("als").run("als", task)
+    for method, option in (("als", "prior"), ("mehra", "full_q")):
+        with pytest.raises(ValueError, match=f"method '{method}' must come without {option}"):
+            find_method(method).run(method, task_of(linear(), options={option: True}))
 
 
-def test_what_ways_need_is_said_in_a_line():
+def test_what_methods_need_is_said_in_a_line():
     blind = task_of(linear(truth=False))
     assert blind.objective == LIKELIHOOD
-    with pytest.raises(ValueError, match="way 'mse' needs true states, but a linear model has none"):
-        find_way("mse").run("mse", blind)
-    with pytest.raises(ValueError, match="way must be one of .*, but got 'magic'"):
-        find_way("magic")
+    with pytest.raises(ValueError, match="method 'mse' needs true states, but a linear model has none"):
+        find_method("mse").run("mse", blind)
+    with pytest.raises(ValueError, match="method must be one of .*, but got 'magic'"):
+        find_method("magic")
     certain = Task("enkf", ring(steps=4), ring(steps=4).data(range(2)), options={"hold_r": True})
-    with pytest.raises(ValueError, match="way 'posterior' tunes the model, but .* has no free parameter of it"):
-        find_way("posterior").run("posterior", certain)
+    with pytest.raises(ValueError, match="method 'posterior' tunes the model, but .* has no free parameter of it"):
+        find_method("posterior").run("posterior", certain)
     ensemble = task_of(linear(), filter_name="enkf")
-    with pytest.raises(ValueError, match="a filter for way 'em' must be one of kf"):
-        find_way("em").run("em", ensemble)
+    with pytest.raises(ValueError, match="a filter for method 'em' must be one of kf"):
+        find_method("em").run("em", ensemble)
 
 
-def test_runs_are_counted_and_end_a_way():
+def test_runs_are_counted_and_end_a_method():
     task = task_of(linear(), budget=Budget(runs=40))
-    find_way("random").run("random", task)
+    find_method("random-only").run("random-only", task)
     assert task.runs == 44 and task.kept[-1].runs <= 40  # the evaluation that went beyond is not taken
     assert task.best_within(runs=0) == task.start
     assert [one.runs for one in task.kept] == sorted(one.runs for one in task.kept)
@@ -342,12 +342,14 @@ def test_innovations_ask_for_inflation_where_the_spread_is_too_small():
         plain = task_of(problem, 6, "enkf")
         start = at(plain, part * np.diag(Q), np.diag(R)).with_size(60)
         task = task_of(problem, 6, "enkf", start=start)
-        find_way("anderson").run("anderson", task)
+        find_method("anderson").run("anderson", task)
         found[name] = task.best.numbers["inflation"]
         assert task.runs == 6 and task.best.model == start.model
     assert 1.0 <= found["right"] < 1.03 < found["small"] - 0.03
 
 
 def test_a_filter_without_an_ensemble_has_no_inflation():
-    with pytest.raises(ValueError, match="way 'anderson' tunes the inflation of an ensemble, but 'kf' has none"):
-        find_way("anderson").run("anderson", task_of(linear()))
+    with pytest.raises(
+        ValueError, match="method 'anderson' tunes the inflation of an ensemble, but 'kf' has none"
+    ):
+        find_method("anderson").run("anderson", task_of(linear()))

@@ -10,9 +10,9 @@ import numpy as np
 
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.gradient import DIVERGED, minimum_within
+from tuning.methods.task import Spent, Task
 from tuning.problems.parameter import Coordinates
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.task import Spent, Task
 
 DRAWS, WARM_UP = 2000, 500
 DEVIATION = math.log(
@@ -136,8 +136,8 @@ def nuts(task: Task) -> None:
         theta = low + (high - low) s(y),   s(y) = 1 / (1 + exp(-y))
         log p(y | z) = log p(z | theta) - |theta - theta_0|^2 / (2 d^2) + sum log s(y) (1 - s(y)),   d = log 10
 
-    It is the posterior of the way `posterior`, from fewer draws, each of which takes several gradients. Draws of
-    the warm-up count until others are there. The sampler is nutpie's.
+    It is the posterior of `posterior`, from fewer draws, each of which takes several gradients. Draws of the
+    warm-up count until others are there. The sampler is nutpie's.
 
     Source: Hoffman, Gelman (2014), "The No-U-Turn Sampler", J. Machine Learning Research 15.
     """

@@ -13,9 +13,9 @@ from thruster_env.model.affine import linearize
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.family import Family
+from tuning.methods.task import Task
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.search.space import Choice
-from tuning.ways.task import Task
 
 LAGS = 15
 DROPPED = 100  # rows at the beginning, at most a fifth of a run
@@ -48,7 +48,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
 
     Args:
         task: what is tuned.
-        name: of the way, for errors.
+        name: of the method, for errors.
         equations: (linear, gain, covariances (lags, m, m), noise) returns the matrix (rows, p) and the right side.
 
     Raises:
@@ -60,7 +60,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
     coordinates = family.coordinates
     if not coordinates.log.all():
         raise ValueError(
-            f"way {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
+            f"method {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
         )
     model = task.model(task.start)
     linear = stationary(model, task.problems[0].name, name)
@@ -74,7 +74,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
         if any(abs(rest).max() > LINEAR * abs(of).max() for rest, of in zip((q, r), of_model, strict=True)):
             if not task.options.get("hold_r"):
                 raise ValueError(
-                    f"way {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
+                    f"method {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
                 )
         gain, measured = observed(task, linear, *of_model)
         design, wanted = equations(linear, gain, measured, Noise(units[0], units[1], (q, r)))
@@ -94,7 +94,7 @@ def observed(task: Task, linear: Stationary, q: np.ndarray, r: np.ndarray) -> tu
     return gain, measured
 
 
-def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
+def stationary(model: StateSpaceModel, name: str, method: str) -> Stationary:
     """The matrices of a linear model; ValueError for another one."""
     about = np.zeros(model.n), np.zeros(model.inputs)
     away = np.ones(model.n) * model.scales, np.ones(model.inputs)
@@ -105,14 +105,14 @@ def stationary(model: StateSpaceModel, name: str, way: str) -> Stationary:
         for first, two in pairs
     ):
         raise ValueError(
-            f"way {way!r} needs a linear model, such as that of the filter kf, but {name} has another one"
+            f"method {method!r} needs a linear model, such as that of the filter kf, but {name} has another one"
         )
     return Stationary(*matrices)
 
 
 def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """The gain L (n, m) of the stationary Kalman filter."""
-    rule = "ways by lagged covariances need a model with a stationary filter"
+    rule = "methods by lagged covariances need a model with a stationary filter"
     try:
         gain = steady_state(linear.a, linear.c, q, r)[1]
     except np.linalg.LinAlgError as error:
@@ -321,7 +321,7 @@ def mehra_equations(
     """
     a, c, n = linear.a, linear.c, len(linear.a)
     if len(measured) <= n or np.linalg.matrix_rank(a) < n:
-        raise ValueError(f"way 'mehra' needs an A with an inverse and {n} lags, but one of them is missing")
+        raise ValueError(f"method 'mehra' needs an A with an inverse and {n} lags, but one of them is missing")
     closed, power, rows = a - a @ gain @ c, np.eye(n), []
     for _ in range(n):
         rows.append(c @ power @ a)

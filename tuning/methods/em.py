@@ -6,9 +6,9 @@ import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.gradient import Goal
+from tuning.methods.task import FEW, Task, way_out
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
-from tuning.ways.task import FEW, Task, way_out
 
 MOST = 20_000  # steps
 CLOSE = 1e-9  # largest relative change of a variance in a step that ends the search

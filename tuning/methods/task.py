@@ -1,4 +1,4 @@
-"""`Task`: what a way of tuning works on: it runs the filter, counts what that takes, and keeps the best so far."""
+"""`Task`: what a method of tuning works on: it runs the filter, counts passes and keeps the best choice so far."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from filters.likelihood import Likelihood
 from filters.registry import filter_type
-from thruster_env.core.streams import WAY_OF_TUNING, derived_generator
+from thruster_env.core.streams import METHOD_OF_TUNING, derived_generator
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
@@ -34,7 +34,7 @@ SMOOTHER = 2.0  # passes that a smoother counts
 
 
 class Budget(NamedTuple):
-    """What a way may take."""
+    """What a method may take."""
 
     runs: float = math.inf  # passes of the filter over one run each
     seconds: float = math.inf  # of processor time, without compilation
@@ -49,33 +49,33 @@ class Kept(NamedTuple):
 
 
 class Refused(NamedTuple):
-    """An answer that was worse than what the way was given, which then is the answer."""
+    """An answer that was worse than what the method was given, which then is the answer."""
 
     given: float  # the objective of what was given
     found: float  # that of the answer
 
 
 class Spent(Exception):
-    """The budget is spent: the way ends here."""
+    """The budget is spent: the method ends here."""
 
 
 class Task:
     """A filter to be tuned on the runs of some problems, within a budget.
 
     Every pass of the filter over a run counts 1, a smoother's 2, and a pass with gradients as much as it was
-    measured to take. Compilation takes no time. A way calls `keep` for each choice that it would now give; what it
-    would give for less than the whole budget is `best`.
+    measured to take. Compilation takes no time. A method calls `keep` for each choice that it would now return;
+    the last of them is `best`.
 
     Args:
         filter_name: name of a filter.
         problems: make the models that it assumes.
         data: the training runs of each problem.
         options: hold_r, full_q, full_r and prior of `model_parameters`.
-        objective: what ways that search minimise; the score, or without truth the likelihood, if None.
-        budget: what the way may take.
+        objective: what methods that search minimise; the score, or without truth the likelihood, if None.
+        budget: what the method may take.
         start: where it begins; the rule of thumb if None.
         given: what one had before, than which an answer must not be worse, as than the start.
-        seed: of a way's own random numbers.
+        seed: of a method's own random numbers.
     """
 
     def __init__(
@@ -129,13 +129,13 @@ class Task:
         return self.kept[-1].choice
 
     def best_within(self, runs: float = math.inf, seconds: float = math.inf) -> Choice:
-        """The choice that the way would have given for a smaller budget."""
+        """The choice that the method would have given for a smaller budget."""
         return [entry for entry in self.kept if entry.runs <= runs and entry.seconds <= seconds][-1].choice
 
     @cached_property
     def generator(self) -> np.random.Generator:
-        """A way's own random numbers."""
-        return derived_generator(self.seed, WAY_OF_TUNING, len(self.data[0].seeds))
+        """A method's own random numbers."""
+        return derived_generator(self.seed, METHOD_OF_TUNING, len(self.data[0].seeds))
 
     @cached_property
     def free(self) -> list[Parameter]:
@@ -163,7 +163,7 @@ class Task:
         return choice
 
     def keep(self, choice: Choice) -> None:
-        """From now on this is what the way would give; Spent once the budget is over."""
+        """From now on this is what the method would give; Spent once the budget is over."""
         self.check()
         if not same_filter(choice, self.best):
             self.kept.append(Kept(self.runs, self.seconds, choice))
@@ -284,12 +284,12 @@ def shortest(call: Callable[[], object]) -> float:
 
 
 def way_out(name: str) -> str:
-    """How P0 is not tuned, for the message of a way that cannot; nothing for other parameters."""
+    """How P0 is not tuned, for the message of a method that cannot; nothing for other parameters."""
     if name != "P0":
         return ""
     return (
         f", as the first steps of runs are scored: leave out {FIRST_SCORED_STEP} of them (first_scored_step="
-        f"{FIRST_SCORED_STEP} of RunsProblem), or take way 'likelihood'"
+        f"{FIRST_SCORED_STEP} of RunsProblem), or take method 'likelihood'"
     )
 
 

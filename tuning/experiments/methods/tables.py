@@ -1,4 +1,4 @@
-"""Tables of the study of ways: what to use when, and the regret of every way in every case."""
+"""Tables of the study of methods: what to use when, and the regret of every method in every case."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from thruster_env.core.plots import new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
-from tuning.experiments.ways.entries import Result
-from tuning.experiments.ways.problems import (
-    FULL_WAYS,
+from tuning.experiments.methods.entries import Result
+from tuning.experiments.methods.problems import (
+    FULL_METHODS,
     GROUPS,
     ORACLE,
     RUNS,
@@ -26,20 +26,20 @@ from tuning.experiments.ways.problems import (
     Case,
     Protocol,
 )
-from tuning.experiments.ways.runs import Regret, regrets, within
+from tuning.experiments.methods.runs import Regret, regrets, within
+from tuning.methods.method import GRADIENT, TRUTH
+from tuning.methods.registry import ALONE, METHODS
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.registry import WAYS
-from tuning.ways.way import GRADIENT, TRUTH
 
-# Ways that look at no true state; but searches minimise an error where there are true states.
+# Methods that look at no true state; but searches minimise an error where there are true states.
 BLIND = (
-    *(name for name, way in WAYS.items() if TRUTH not in way.needs),
+    *(name for name, method in ALONE.items() if TRUTH not in method.needs),
     f"{LIKELIHOOD}{WITH_FULL}",
     f"als{WITH_FULL}",
 )
-SEARCHES = ("nelder-mead", "coordinate-steps", "tpe", "gp", "cma-es", "random")
-ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper way is taken
-NO_WAYS = (START, ORACLE)  # nobody has these
+SEARCHES = ("nelder-mead", "coordinate-steps", "tpe-only", "gp-only", "cma-es-only", "random-only")
+ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper method is taken
+NO_METHODS = (START, ORACLE)  # nobody has these
 
 
 class Situation(NamedTuple):
@@ -67,13 +67,13 @@ SITUATIONS = (
 )
 
 
-def is_blind(way: str, case: Case) -> bool:
-    """Whether a way looks at no true state in a case."""
-    return way in BLIND and (way not in SEARCHES or not case.truth)
+def is_blind(method: str, case: Case) -> bool:
+    """Whether a method looks at no true state in a case."""
+    return method in BLIND and (method not in SEARCHES or not case.truth)
 
 
 def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
-    """The cheapest way within 0.5 % of the least error, and that within 0.02 nat of the best log score."""
+    """The cheapest method within 0.5 % of the least error, and that within 0.02 nat of the best log score."""
     heads = [
         "you have",
         "least error",
@@ -88,54 +88,54 @@ def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
         cases = [case for case in protocol.cases if situation.has(case)]
         by_case = [regrets(results, case) for case in cases]
         allowed = [
-            [regret for regret in each if _may(regret.way, case, situation)]
+            [regret for regret in each if _may(regret.method, case, situation)]
             for each, case in zip(by_case, cases, strict=True)
         ]
         allowed = [of_case for of_case in allowed if of_case]
         if not allowed:
             continue
-        everywhere = set.intersection(*({regret.way for regret in each} for each in allowed)) - {SCALED}
+        everywhere = set.intersection(*({regret.method for regret in each} for each in allowed)) - {SCALED}
         if not everywhere:
             continue
         error = _cheapest(allowed, everywhere, lambda regret: math.log(regret.ratio.value), ENOUGH)
         proper = _cheapest(allowed, everywhere, lambda regret: _finite(regret.log_score), ENOUGH_NATS)
-        cells = [[f"`{way}`", _both(allowed, way), _nees(allowed, way)] for way in (error, proper)]
+        cells = [[f"`{method}`", _both(allowed, method), _nees(allowed, method)] for method in (error, proper)]
         rows.append([situation.text, *cells[0], *cells[1]])
     return markdown_table(heads, rows)
 
 
 def _cheapest(
-    by_case: Sequence[Sequence[Regret]], ways: set[str], of: Callable[[Regret], float], enough: float
+    by_case: Sequence[Sequence[Regret]], methods: set[str], of: Callable[[Regret], float], enough: float
 ) -> str:
-    """The way of the least time among those whose mean is within what is enough of the least mean."""
-    means = {way: _mean(by_case, way, of) for way in ways}
-    near = [way for way in ways if means[way] <= min(means.values()) + enough]
-    return min(near, key=lambda way: _mean(by_case, way, lambda regret: regret.seconds))
+    """The method of the least time among those whose mean is within what is enough of the least mean."""
+    means = {method: _mean(by_case, method, of) for method in methods}
+    near = [method for method in methods if means[method] <= min(means.values()) + enough]
+    return min(near, key=lambda method: _mean(by_case, method, lambda regret: regret.seconds))
 
 
-def _may(way: str, case: Case, situation: Situation) -> bool:
-    return way not in NO_WAYS and (situation.truth or is_blind(way, case))
+def _may(method: str, case: Case, situation: Situation) -> bool:
+    return method not in NO_METHODS and (situation.truth or is_blind(method, case))
 
 
-def _of(by_case: Sequence[Sequence[Regret]], way: str) -> list[Regret]:
-    return [regret for each in by_case for regret in each if regret.way == way]
+def _of(by_case: Sequence[Sequence[Regret]], method: str) -> list[Regret]:
+    return [regret for each in by_case for regret in each if regret.method == method]
 
 
-def _mean(by_case: Sequence[Sequence[Regret]], way: str, of: Callable[[Regret], float]) -> float:
-    return float(np.mean([of(regret) for regret in _of(by_case, way)]))
+def _mean(by_case: Sequence[Sequence[Regret]], method: str, of: Callable[[Regret], float]) -> float:
+    return float(np.mean([of(regret) for regret in _of(by_case, method)]))
 
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else 1e6
 
 
-def _both(by_case: Sequence[Sequence[Regret]], way: str) -> str:
-    values = [regret.ratio.value for regret in _of(by_case, way)]
+def _both(by_case: Sequence[Sequence[Regret]], method: str) -> str:
+    values = [regret.ratio.value for regret in _of(by_case, method)]
     return f"{percent(math.exp(np.mean(np.log(values))))}, {percent(max(values))}"
 
 
-def _nees(by_case: Sequence[Sequence[Regret]], way: str) -> str:
-    return spread([regret.nees for regret in _of(by_case, way)])
+def _nees(by_case: Sequence[Sequence[Regret]], method: str) -> str:
+    return spread([regret.nees for regret in _of(by_case, method)])
 
 
 def spread(values: Sequence[float]) -> str:
@@ -152,23 +152,25 @@ def percent(ratio: float) -> str:
 
 
 def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> str:
-    """Regrets of all ways in the cases of a group, in percent; significantly worse than the best: in italics."""
+    """Regrets of all methods in the cases of a group [%]; in italics if significantly worse than the best."""
     cases = [case for case in protocol.cases if case.group == group]
-    columns = [{regret.way: regret for regret in regrets(results, case)} for case in cases]
-    ways = dict.fromkeys(way for column in columns for way in column)
-    order = sorted(ways, key=lambda way: _rank(columns, way))
-    heads = ["way", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
-    return markdown_table(heads, [_row(way, columns) for way in order])
+    columns = [{regret.method: regret for regret in regrets(results, case)} for case in cases]
+    methods = dict.fromkeys(method for column in columns for method in column)
+    order = sorted(methods, key=lambda method: _rank(columns, method))
+    heads = ["method", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
+    return markdown_table(heads, [_row(method, columns) for method in order])
 
 
-def _rank(columns: Sequence[Mapping[str, Regret]], way: str) -> float:
-    return float(np.mean([math.log(column[way].ratio.value) if way in column else 9.0 for column in columns]))
+def _rank(columns: Sequence[Mapping[str, Regret]], method: str) -> float:
+    return float(
+        np.mean([math.log(column[method].ratio.value) if method in column else 9.0 for column in columns])
+    )
 
 
-def _row(way: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
-    regrets_ = [column[way] for column in columns if way in column]
-    cells = [_cell(column.get(way)) for column in columns]
-    name = f"**{way}**" if way in (STUDY, STUDY_LOG_SCORE) else way
+def _row(method: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
+    regrets_ = [column[method] for column in columns if method in column]
+    cells = [_cell(column.get(method)) for column in columns]
+    name = f"**{method}**" if method in (STUDY, STUDY_LOG_SCORE) else method
     cost = (
         f"{np.median([regret.runs for regret in regrets_]):.0f}",
         f"{np.median([regret.seconds for regret in regrets_]):.2g}",
@@ -196,35 +198,37 @@ def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
     looks = [(f"{key} passes", within("by_runs", key)) for key in by_runs]
     looks += [(f"{key} s", within("by_seconds", key)) for key in by_seconds]
     by_budget = {
-        name: [{regret.way: regret for regret in regrets(results, case, at)} for case in cases]
+        name: [{regret.method: regret for regret in regrets(results, case, at)} for case in cases]
         for name, at in looks
     }
     rows = []
-    for way in (*WAYS, *FULL_WAYS, STUDY, STUDY_LOG_SCORE):
+    for method in (*ALONE, *FULL_METHODS, STUDY, STUDY_LOG_SCORE):
         logs = [
-            [math.log(column[way].ratio.value) for column in columns if way in column]
+            [math.log(column[method].ratio.value) for column in columns if method in column]
             for columns in by_budget.values()
         ]
         if logs and all(logs):
             means = [float(np.mean(of_budget)) for of_budget in logs]
-            rows.append((means[-1], [way, str(len(logs[-1])), *(percent(math.exp(mean)) for mean in means)]))
-    return markdown_table(["way", "cases", *by_budget], [row for _, row in sorted(rows, key=lambda pair: pair[0])])
+            rows.append((means[-1], [method, str(len(logs[-1])), *(percent(math.exp(mean)) for mean in means)]))
+    return markdown_table(
+        ["method", "cases", *by_budget], [row for _, row in sorted(rows, key=lambda pair: pair[0])]
+    )
 
 
-def ways_table() -> str:
-    """What the ways are, whose, and when to use which."""
+def methods_table() -> str:
+    """What the methods are, whose, and when to use which."""
     rows = [
         [
             f"`{name}`",
-            way.about,
-            "yes" if TRUTH in way.needs else "",
-            "yes" if GRADIENT in way.needs else "",
-            way.when,
+            method.about,
+            "yes" if TRUTH in method.needs else "",
+            "yes" if GRADIENT in method.needs else "",
+            method.when,
         ]
-        for name, way in WAYS.items()
+        for name, method in METHODS.items()
     ]
-    sources = [way.source for way in WAYS.values()]
-    heads = ["way", "what it does", "truth", "gradient", "use it", "source"]
+    sources = [method.source for method in METHODS.values()]
+    heads = ["method", "what it does", "truth", "gradient", "use it", "source"]
     return markdown_table(heads, [[*row, source] for row, source in zip(rows, sources, strict=True)])
 
 
@@ -233,13 +237,13 @@ def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[
     of_groups = {f"group {key}": (lambda key=key: group_table(results, protocol, key)) for key in GROUPS}
     return {
         "what to use": lambda: what_to_use(results, protocol),
-        "ways": ways_table,
+        "methods": methods_table,
         "budgets": lambda: budget_table(results, protocol),
         **of_groups,
     }
 
 
-# The picture of the study of ways: regrets by group, at each budget of passes.
+# The picture of the study of methods: regrets by group, at each budget of passes.
 
 
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
@@ -247,7 +251,7 @@ MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
 
 def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> Path:
-    """A panel a group: the mean log ratio of each way over the cases, after each budget of passes."""
+    """A panel a group: the mean log ratio of each method over the cases, after each budget of passes."""
     groups = [key for key in GROUPS if any(case.group == key for case in protocol.cases)]
     rows = -(-len(groups) // 2)
     drawn = new_figure((10.0, 5.2 * rows))
@@ -261,21 +265,26 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
         points: dict[float, dict[str, float]] = {}
         for budget in budgets:
             by_case = [regrets(results, case, within("by_runs", f"{budget:g}")) for case in cases]
-            ways = dict.fromkeys(regret.way for each in by_case for regret in each)
+            methods = dict.fromkeys(regret.method for each in by_case for regret in each)
             points[budget] = {
-                way: float(
+                method: float(
                     np.mean(
-                        [math.log(regret.ratio.value) for each in by_case for regret in each if regret.way == way]
+                        [
+                            math.log(regret.ratio.value)
+                            for each in by_case
+                            for regret in each
+                            if regret.method == method
+                        ]
                     )
                 )
-                for way in ways
+                for method in methods
             }
         if not points or not points[budgets[-1]]:
             continue
         order = sorted(points[budgets[-1]], key=points[budgets[-1]].__getitem__, reverse=True)
         for budget in budgets:
             mark, colour = MARKS[budget]
-            values = [100.0 * np.clip(points[budget].get(way, np.nan), LEAST, MOST) for way in order]
+            values = [100.0 * np.clip(points[budget].get(method, np.nan), LEAST, MOST) for method in order]
             axis.plot(values, range(len(order)), mark, color=colour, markersize=4, label=f"{budget:g} passes")
         axis.set_xscale("log")
         axis.set_xlim(60.0 * LEAST, 150.0 * MOST)

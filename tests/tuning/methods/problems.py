@@ -1,10 +1,10 @@
-"""Problems of the ways' tests: runs drawn in NumPy, whose filters are those of textbooks."""
+"""Problems of the methods' tests: runs drawn in NumPy, whose filters are those of textbooks."""
 
 import numpy as np
 
 from filters import affine_model
+from tuning.methods.task import Task
 from tuning.problems.runs_problem import RunsProblem
-from tuning.ways.task import Task
 
 A = np.array([[1.0, 0.3], [0.0, 0.9]])
 C = np.array([[1.0, 0.0], [0.5, 1.0]])

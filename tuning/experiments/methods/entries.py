@@ -1,4 +1,4 @@
-"""A way on a data set of a case, within a budget, and the best constant numbers that it is held against."""
+"""A method on a data set of a case, within a budget, and the best constant numbers that it is held against."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
-from tuning.experiments.ways.problems import (
+from tuning.experiments.methods.problems import (
     FROM_NOISE,
     FULL,
     LIDAR_RUNS,
@@ -36,6 +36,8 @@ from tuning.experiments.ways.problems import (
 )
 from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.likelihood.gradient import optimum
+from tuning.methods.registry import ALONE, find_method
+from tuning.methods.task import Budget, Kept, Task
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LOG_SCORE, SCORE
@@ -44,8 +46,6 @@ from tuning.search.plan import Plan
 from tuning.search.quiet import quiet_optuna
 from tuning.search.space import Choice, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.ways.registry import WAYS, find_way
-from tuning.ways.task import Budget, Kept, Task
 
 SIMPLEX = 400  # evaluations of a descent to the reference of an ensemble, which has no gradient
 
@@ -61,14 +61,14 @@ class Scored(NamedTuple):
 
 
 class Result(NamedTuple):
-    """A way on a data set: the error that it ended in, and what it would have given for each budget."""
+    """A method on a data set: the error that it ended in, and what it would have given for each budget."""
 
     case: str
-    way: str
+    method: str
     set: int
     by_runs: Mapping[str, Scored]
     by_seconds: Mapping[str, Scored]
-    last: Scored | None  # None where the way cannot be followed
+    last: Scored | None  # None where the method cannot run
     taken_runs: float
     taken_seconds: float
     choice: Mapping[str, Any]
@@ -105,7 +105,7 @@ def scored(choice: Choice, case: Case, count: int) -> Scored:
 
 
 def start_of(case: Case, set_index: int) -> Choice:
-    """Where a data set's ways begin."""
+    """Where a data set's methods begin."""
     problem, (on_q, on_r) = case.make(), STARTS[set_index % len(STARTS)]
     choice = untuned_choice(case.filter, problem)
     if case.members is not None:
@@ -118,30 +118,30 @@ def start_of(case: Case, set_index: int) -> Choice:
     return choice
 
 
-def run_way(case: Case, way: str, set_index: int, protocol: Protocol) -> Result:
-    """A way on a data set."""
-    data, error, label = data_set(case, set_index), "", way
-    informed = way.endswith(FROM_NOISE)
-    if informed or way.endswith(WITH_FULL):
+def run_method(case: Case, method: str, set_index: int, protocol: Protocol) -> Result:
+    """A method on a data set."""
+    data, error, label = data_set(case, set_index), "", method
+    informed = method.endswith(FROM_NOISE)
+    if informed or method.endswith(WITH_FULL):
         if case.options == FULL and not informed:
             return Result(
-                case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here"
+                case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, "all methods have full Q and R here"
             )
-        way = way.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
+        method = method.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
         case = case._replace(options=FULL)
     try:
-        _check(case, way, _task(case, data, set_index, Budget()))
+        _check(case, method, _task(case, data, set_index, Budget()))
     except ValueError as lacking:
         return Result(case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, str(lacking))
-    if way in WAYS:  # so that nothing is left to compile
+    if method in ALONE:  # so that nothing is left to compile
         with suppress(ValueError):
-            find_way(way).run(way, _task(case, data.slice(0, 4), set_index, Budget(60, 5.0)))
+            find_method(method).run(method, _task(case, data.slice(0, 4), set_index, Budget(60, 5.0)))
     task = _task(case, data, set_index, Budget(protocol.runs, protocol.seconds))
     try:
         if informed:
-            find_way("noise-estimation").run("noise-estimation", task)
+            find_method("noise-estimation").run("noise-estimation", task)
             task.start = task.best
-        _follow(case, way, set_index, task)
+        _run(case, method, set_index, task)
     except ValueError as problem:
         error = str(problem) or type(problem).__name__
     cost = task.runs, task.seconds  # without that of scoring
@@ -171,43 +171,43 @@ def _task(case: Case, data: Data, set_index: int, budget: Budget) -> Task:
     return Task(case.filter, case.make(), data, start=start_of(case, set_index), **arguments)
 
 
-def _check(case: Case, way: str, task: Task) -> None:
-    """Raise ValueError if a case lacks what a way needs."""
-    if way in WAYS:
-        find_way(way).check(way, task)
-    elif way == ORACLE and oracle_choice(case.filter, task.problems[0]) is None:
+def _check(case: Case, method: str, task: Task) -> None:
+    """Raise ValueError if a case lacks what a method needs."""
+    if method in ALONE:
+        find_method(method).check(method, task)
+    elif method == ORACLE and oracle_choice(case.filter, task.problems[0]) is None:
         raise ValueError("the plant's own Q and R are unknown")
-    elif way in (STUDY, STUDY_LOG_SCORE) and (case.runs != 32 or case.group in "EG" or case.make is lidar):
+    elif method in (STUDY, STUDY_LOG_SCORE) and (case.runs != 32 or case.group in "EG" or case.make is lidar):
         raise ValueError("a study draws its own runs, not these")
 
 
-def _follow(case: Case, way: str, set_index: int, task: Task) -> None:
-    """Let a task keep what a way finds."""
+def _run(case: Case, method: str, set_index: int, task: Task) -> None:
+    """Let a task keep what a method finds."""
     problem = task.problems[0]
-    if way in WAYS:
-        return find_way(way).run(way, task, guarded=False)
+    if method in ALONE:
+        return find_method(method).run(method, task, guarded=False)
     choice: Choice | None = task.start
-    if way == SCALED:
+    if method == SCALED:
         choice = scaled_default(case.filter, problem, set_index).choice
-    elif way == ORACLE:
+    elif method == ORACLE:
         choice = oracle_choice(case.filter, problem)
-    elif way in (STUDY, STUDY_LOG_SCORE):
-        return _study(case, way, set_index, task)
+    elif method in (STUDY, STUDY_LOG_SCORE):
+        return _study(case, method, set_index, task)
     if choice is None:
-        raise ValueError(f"there is no {way}")
+        raise ValueError(f"there is no {method}")
     return task.keep(choice if case.members is None else choice.with_size(case.members))
 
 
-def _study(case: Case, way: str, set_index: int, task: Task) -> None:
+def _study(case: Case, method: str, set_index: int, task: Task) -> None:
     """What `thruster tune` does, which draws runs of its own to choose among its best trials; in one piece."""
-    objective = SCORE if way == STUDY else LOG_SCORE
+    objective = SCORE if method == STUDY else LOG_SCORE
     options: dict[str, Any] = dict(case.options)
     plan = Plan(case.filter, (case.make(),), set_index, (objective,), **options)
     with quiet_optuna():
         with task.uncounted():  # so that nothing is left to compile
             other = plan._replace(seed=set_index + 1000)
             run_study(open_study("first", other), other, 2)
-        result = run_study(open_study("ways", plan), plan, TRIALS)
+        result = run_study(open_study("methods", plan), plan, TRIALS)
     task.runs += TRIALS * task.passes
     task.kept.append(Kept(task.runs, task.seconds, result.choice))
 
@@ -241,7 +241,7 @@ def reference(case: Case, protocol: Protocol) -> Result:
             if begun in starts[:turn]:
                 continue
             simplex = Task(case.filter, problem, fewer, options=case.options, start=begun, budget=budget)
-            find_way("nelder-mead").run("nelder-mead", simplex)
+            find_method("nelder-mead").run("nelder-mead", simplex)
             value = simplex.value(simplex.best)
             if value < least:
                 least, choice = value, simplex.best

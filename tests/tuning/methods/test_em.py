@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from tests.tuning.ways.problems import P0, A, C, at, linear, task_of
+from tests.tuning.methods.problems import P0, A, C, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
+from tuning.methods.em import counts_of
+from tuning.methods.registry import find_method
+from tuning.methods.task import Budget
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.em import counts_of
-from tuning.ways.registry import find_way
-from tuning.ways.task import Budget
 
 FIRST_Q, FIRST_R = np.array([0.5, 0.02]), np.array([0.1, 0.6])
 
@@ -69,7 +69,7 @@ def test_a_step_of_diagonals_is_a_smoothers(missing):
     np.testing.assert_allclose(r, np.diag(expected[1]), rtol=1e-9)
 
 
-def test_the_way_goes_these_steps():
+def test_the_method_goes_these_steps():
     task = task_of(linear())
     task.start = at(task, FIRST_Q, FIRST_R)
     with pytest.raises(StopIteration):
@@ -81,7 +81,7 @@ def test_the_way_goes_these_steps():
         np.testing.assert_allclose(kept.choice.model["measurement_noise_cov"], np.diag(r), rtol=1e-8)
 
 
-def test_the_way_goes_these_steps_with_full_matrices():
+def test_the_method_goes_these_steps_with_full_matrices():
     task = task_of(linear(), options={"full_q": True, "full_r": True})
     task.start = at(task, FIRST_Q, FIRST_R)
     with pytest.raises(StopIteration):
@@ -94,7 +94,7 @@ def test_the_way_goes_these_steps_with_full_matrices():
 
 
 def _second_choice(task, name):
-    """Stop a way once it has kept five choices."""
+    """Stop a method once it has kept five choices."""
     keep = task.keep
 
     def counted(choice):
@@ -103,7 +103,7 @@ def _second_choice(task, name):
             raise StopIteration
 
     task.keep = counted
-    find_way(name).run(name, task)
+    find_method(name).run(name, task)
 
 
 @pytest.mark.parametrize(
@@ -111,9 +111,9 @@ def _second_choice(task, name):
 )
 def test_em_ends_where_the_gradient_of_the_likelihood_ends(name, options):
     problem, levels = linear(runs=6, steps=80), []
-    for way in (name, LIKELIHOOD):
+    for method in (name, LIKELIHOOD):
         task = task_of(problem, 6, options=options)
-        find_way(way).run(way, task)
+        find_method(method).run(method, task)
         levels.append(values_of(task.best.filter(problem), task.data[0], problem.scale).log_likelihood)
     assert levels[0] == pytest.approx(levels[1], rel=1e-6)
 
@@ -121,4 +121,4 @@ def test_em_ends_where_the_gradient_of_the_likelihood_ends(name, options):
 def test_em_refuses_numbers_that_are_no_variances():
     task = task_of(linear(), options={"prior": True})
     with pytest.raises(ValueError, match="EM tunes only variances in Q and R, but P0 is tuned, too"):
-        find_way("em").run("em", task)
+        find_method("em").run("em", task)

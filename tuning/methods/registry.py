@@ -1,67 +1,148 @@
-"""The ways by name."""
+"""The methods by name."""
 
 from __future__ import annotations
 
 from thruster_env.core.checks import one_of
+from tuning.methods.adaptive import anderson, sage_husa, vb
+from tuning.methods.correlations import als, desroziers, mehra
+from tuning.methods.em import em, squarem
+from tuning.methods.method import COVARIANCE, GRADIENT, INFLATION, LINEAR, MODEL, NOISE, NUTPIE, TRUTH, Method
+from tuning.methods.okf import masked, okf
+from tuning.methods.posterior import maximum_a_posteriori, nuts, posterior
+from tuning.methods.scoring import noise_estimation, scoring
+from tuning.methods.searches import SLOWER, ascend, coordinate_steps, nelder_mead, sample
+from tuning.methods.task import Task
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
-from tuning.ways.adaptive import anderson, sage_husa, vb
-from tuning.ways.correlations import als, desroziers, mehra
-from tuning.ways.em import em, squarem
-from tuning.ways.okf import masked, okf
-from tuning.ways.posterior import maximum_a_posteriori, nuts, posterior
-from tuning.ways.scoring import noise_estimation, scoring
-from tuning.ways.searches import SLOWER, ascend, coordinate_steps, nelder_mead, sample
-from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, MODEL, NOISE, NUTPIE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
 DIAGONAL = ("hold_r", "prior")
-MATRICES = (*DIAGONAL, "full_q", "full_r")  # of ways that find matrices as a whole, and know no relations
+MATRICES = (*DIAGONAL, "full_q", "full_r")  # of methods that find matrices as a whole, and know no relations
 
-WAYS = {
-    LIKELIHOOD: Way(
+TPE = "Bergstra, Bardenet, Bengio, Kegl (2011)"
+HANSEN = "Hansen (2016), arXiv 1604.00772"
+GAUSSIAN = "Optuna's GPSampler"
+UNIFORM = "Bergstra, Bengio (2012)"
+GRADIENT_METHOD = "gradient"
+DEFAULT = "tpe"
+ONLY = "-only"  # behind a sampler: without what a study does besides
+
+
+def study(task: Task) -> None:
+    """Trials of the objective, of the ensemble size, too, with the mean NIS in a band.
+
+    The first trials are the baselines and the maximum-likelihood values. The best trials then meet the baselines
+    on validation seeds, and the best baseline is chosen unless one of them is significantly better
+    (docs/tuning.md).
+    """
+    raise ValueError("a study must be run by tuning.tune or thruster tune, but got a task")
+
+
+def gradient(task: Task) -> None:
+    """The maximum of log L, or the least score, mse or log-score if that is the objective, with standard errors.
+
+    A study by `tpe` runs beside it. The optimum meets the baselines on validation seeds, as trials do.
+    """
+    study(task)
+
+
+STUDIES = {
+    DEFAULT: Method(
+        "the default: a study by Optuna's tree-structured Parzen estimator, its best trials validated",
+        "for any filter and objective, also for an ensemble's size and among filters",
+        study,
+        TPE,
+        sampler="tpe",
+    ),
+    "gp": Method(
+        "the same study by Optuna's Gaussian process",
+        "for any filter, if a trial takes seconds",
+        study,
+        GAUSSIAN,
+        sampler="gp",
+    ),
+    "cma-es": Method(
+        "the same study by covariance matrix adaptation",
+        "for any filter, with hundreds of trials",
+        study,
+        HANSEN,
+        sampler="cma-es",
+    ),
+    "nsga-ii": Method(
+        "the same study by a genetic algorithm",
+        "with two objectives, for a Pareto front",
+        study,
+        "Deb, Pratap, Agarwal, Meyarivan (2002)",
+        sampler="nsga-ii",
+    ),
+    "random": Method(
+        "the same study by independent draws",
+        "to compare: every sampler has to beat it",
+        study,
+        UNIFORM,
+        sampler="random",
+    ),
+    "grid": Method(
+        "the same study over five values of each parameter, in random order",
+        "with up to three parameters, to see the whole range",
+        study,
+        UNIFORM,
+        sampler="grid",
+    ),
+    GRADIENT_METHOD: Method(
+        "`likelihood` with standard errors, or `score`, `mse` or `log-score` if that is the objective, validated; "
+        "a study by `tpe` runs beside it",
+        "for Kalman filters, if the accuracy of Q and R counts, too",
+        gradient,
+        "Gupta, Mehra (1974)",
+        (GRADIENT,),
+        sampler="tpe",
+    ),
+}
+ALONE = {
+    LIKELIHOOD: Method(
         "maximum likelihood of the innovations by L-BFGS with exact gradients",
         "without true states; and with few runs",
         ascend(LIKELIHOOD),
         "Gupta, Mehra (1974)",
         (GRADIENT,),
     ),
-    "scoring": Way(
+    "scoring": Method(
         "maximum likelihood of the innovations by Fisher scoring with the exact information",
         "to compare: from a good start it ends where `likelihood` ends, in fewer steps",
         scoring,
         "Gupta, Mehra (1974)",
         (GRADIENT,),
     ),
-    LOG_SCORE: Way(
+    LOG_SCORE: Method(
         "the best log density of the true states by L-BFGS with exact gradients",
         "with true states, if both estimate and covariance count",
         ascend(LOG_SCORE),
         ABBEEL,
         (TRUTH, GRADIENT),
     ),
-    MSE: Way(
+    MSE: Method(
         "the least sum of mean square errors over scale squared by L-BFGS with exact gradients",
         "with true states, if the estimate alone counts",
         ascend(MSE),
         ABBEEL,
         (TRUTH, GRADIENT),
     ),
-    SCORE: Way(
+    SCORE: Method(
         "the least score, mean RMSE over scale, by L-BFGS with exact gradients",
         "with true states, if the estimate alone counts, each state alike",
         ascend(SCORE),
         "this package",
         (TRUTH, GRADIENT),
     ),
-    "map": Way(
+    "map": Method(
         "the likelihood with inverse Wishart priors about the start, by L-BFGS",
-        "without true states, if the start is worth something and the data are few",
+        "without true states, if the start is plausible and the data are few",
         maximum_a_posteriori,
         "Gelman, Carlin, Stern, Dunson, Vehtari, Rubin (2013)",
         (GRADIENT, NOISE),
     ),
-    "em": Way(
+    "em": Method(
         "expectation-maximisation, by slopes of the likelihood in place of a smoother",
         "to compare: it ends where `likelihood` ends, later",
         em,
@@ -69,7 +150,7 @@ WAYS = {
         (GRADIENT, NOISE),
         MATRICES,
     ),
-    "squarem": Way(
+    "squarem": Method(
         "expectation-maximisation with extrapolated steps",
         "to compare: em in a tenth of its steps",
         squarem,
@@ -77,15 +158,15 @@ WAYS = {
         (GRADIENT, NOISE),
         DIAGONAL,
     ),
-    "noise-estimation": Way(
-        "sample covariances of what the model leaves of true states and measurements",
+    "noise-estimation": Method(
+        "sample covariances of the residuals of the model on true states and measurements",
         "with true states and a model that is right: nothing is better or faster",
         noise_estimation,
         ABBEEL,
         (TRUTH, COVARIANCE, NOISE),
         MATRICES,
     ),
-    "okf": Way(
+    "okf": Method(
         "Adam on Cholesky factors of full Q and R, by batches, on the mean square error",
         "to compare: `mse` with full Q and R ends lower, sooner",
         okf,
@@ -93,15 +174,15 @@ WAYS = {
         (TRUTH, GRADIENT, NOISE),
         MATRICES,
     ),
-    "als": Way(
+    "als": Method(
         "least squares of lagged covariances of a fixed gain's innovations, full Q and R semidefinite",
-        "without true states, of a linear model on long stationary runs: a few passes",
+        "without true states, for a linear model on long stationary runs: a few passes",
         als,
         "Odelson, Rajamani, Rawlings (2006)",
         (GRADIENT, LINEAR),
         ("hold_r", "full_q", "full_r"),
     ),
-    "mehra": Way(
+    "mehra": Method(
         "P H', R and Q in turn from lagged covariances of the innovations of a fixed gain",
         "to compare: the ancestor of `als`, which scatters less",
         mehra,
@@ -109,31 +190,31 @@ WAYS = {
         (GRADIENT, LINEAR),
         ("hold_r",),
     ),
-    "desroziers": Way(
+    "desroziers": Method(
         "R and one factor on Q from innovations before and after updates, repeated",
-        "of ensembles, without true states: some thirty passes",
+        "for ensembles, without true states: some thirty passes",
         desroziers,
         "Desroziers, Berre, Chapnik, Poli (2005)",
         (COVARIANCE, NOISE),
         DIAGONAL,
     ),
-    "anderson": Way(
-        "the inflation of an ensemble that its innovations ask for, step by step, then its mean",
-        "of ensembles, without true states, if Q and R are known: one pass",
+    "anderson": Method(
+        "the inflation of an ensemble that its innovations imply, step by step, then its mean",
+        "for ensembles, without true states, if Q and R are known: one pass",
         anderson,
         "Anderson (2007)",
         (COVARIANCE, INFLATION),
         ("hold_r",),
     ),
-    "sage-husa": Way(
+    "sage-husa": Method(
         "Sage and Husa's adaptive filter over all runs, then its mean Q and R",
-        "to compare: one pass, seldom near",
+        "to compare: one pass, seldom near the optimum",
         sage_husa,
         "Sage, Husa (1969)",
         (GRADIENT, NOISE),
         MATRICES,
     ),
-    "vb": Way(
+    "vb": Method(
         "the variational Bayesian filter over all runs, then its mean R; Q stays",
         "without true states, if Q is known and R is not: one pass",
         vb,
@@ -141,76 +222,76 @@ WAYS = {
         (GRADIENT, NOISE),
         MATRICES,
     ),
-    "posterior": Way(
+    "posterior": Method(
         "the mean of the posterior by a Metropolis random walk",
         "without true states and with few runs, if time does not count",
         posterior,
         "Haario, Saksman, Tamminen (2001)",
         (COVARIANCE, MODEL),
     ),
-    "nuts": Way(
+    "nuts": Method(
         "the same mean by the no-U-turn sampler with exact gradients, of the package nutpie",
-        "like `posterior`, from six numbers on",
+        "like `posterior`, from six parameters on",
         nuts,
         "Hoffman, Gelman (2014)",
         (GRADIENT, NUTPIE),
     ),
-    "masked": Way(
-        "the downhill simplex on the error of measurements that the filter is not shown",
-        "without true states, if no likelihood is to be trusted",
+    "masked": Method(
+        "the downhill simplex on the error of measurements withheld from the filter",
+        "without true states, if no likelihood can be trusted",
         masked,
         "Barratt, Boyd (2020)",
         (COVARIANCE,),
     ),
-    "nelder-mead": Way(
+    "nelder-mead": Method(
         "the downhill simplex on the objective",
-        "of any filter, with up to six numbers",
+        "for any filter, with up to six parameters",
         nelder_mead,
         "Powell (2002)",
     ),
-    "coordinate-steps": Way(
-        "one number at a time, a step up or half of it, on the objective",
+    "coordinate-steps": Method(
+        "one parameter at a time, a step up or half of it, on the objective",
         "to compare: what MATLAB's tune documents",
         coordinate_steps,
         "The MathWorks, `tune`",
     ),
-    "tpe": Way(
-        "Optuna's tree-structured Parzen estimator on the objective",
-        "of any filter and objective; with up to ten numbers",
+    "tpe-only": Method(
+        "Optuna's tree-structured Parzen estimator on the objective, without baselines, band and validation",
+        "to compare with the study `tpe`",
         sample("tpe"),
-        "Bergstra, Bardenet, Bengio, Kegl (2011)",
+        TPE,
         by_trials=True,
     ),
-    "gp": Way(
-        "Optuna's Gaussian process on the objective",
-        "of any filter, if a pass takes seconds",
+    "gp-only": Method(
+        "Optuna's Gaussian process on the objective, alone",
+        "to compare with the study `gp`",
         sample("gp"),
-        "Optuna's GPSampler",
+        GAUSSIAN,
         by_trials=True,
     ),
-    "cma-es": Way(
-        "covariance matrix adaptation on the objective",
-        "of any filter, with hundreds of trials",
+    "cma-es-only": Method(
+        "covariance matrix adaptation on the objective, alone",
+        "to compare with the study `cma-es`",
         sample("cma-es"),
-        "Hansen (2016), arXiv 1604.00772",
+        HANSEN,
         by_trials=True,
     ),
-    "random": Way(
-        "independent draws",
+    "random-only": Method(
+        "independent draws alone",
         "to compare: every search has to beat it",
         sample("random"),
-        "Bergstra, Bengio (2012)",
+        UNIFORM,
         by_trials=True,
     ),
-    "nis": Way(
+    "nis": Method(
         "trials that minimise abs(log(mean NIS / m)), by the sampler tpe",
-        "to compare: it is zero on a curve, and says nothing of error",
+        "to compare: it is zero on a curve, whatever the error",
         sample("tpe", "nis"),
         CHEN,
         (COVARIANCE,),
         by_trials=True,
     ),
-    "c-nis": Way(
+    "c-nis": Method(
         "the same of mean and variance of the NIS",
         "to compare",
         sample("tpe", "c-nis"),
@@ -218,15 +299,15 @@ WAYS = {
         (COVARIANCE,),
         by_trials=True,
     ),
-    "c-nis-two-rates": Way(
+    "c-nis-two-rates": Method(
         "the larger one of c-nis at the sample time and at one ten times as long",
-        "to compare: two sample times tell Q from R where one leaves a curve of zeros",
+        "to compare: two sample times separate Q and R, one leaves a curve of zeros",
         sample("tpe", "c-nis", SLOWER),
         "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
         (COVARIANCE,),
         by_trials=True,
     ),
-    "nees": Way(
+    "nees": Method(
         "trials that minimise abs(log(mean NEES / n)), by the sampler tpe",
         "to compare",
         sample("tpe", "nees"),
@@ -234,7 +315,7 @@ WAYS = {
         (TRUTH, COVARIANCE),
         by_trials=True,
     ),
-    "c-nees": Way(
+    "c-nees": Method(
         "the same of mean and variance of the NEES",
         "to compare",
         sample("tpe", "c-nees"),
@@ -245,6 +326,9 @@ WAYS = {
 }
 
 
-def find_way(name: str) -> Way:
-    """A way by its name; ValueError for an unknown one."""
-    return WAYS[one_of("way", name, tuple(WAYS))]
+METHODS = STUDIES | ALONE
+
+
+def find_method(name: str) -> Method:
+    """A method by its name; ValueError for an unknown one."""
+    return METHODS[one_of("method", name, tuple(METHODS))]

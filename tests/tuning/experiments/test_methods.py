@@ -1,4 +1,4 @@
-"""The study of ways of tuning: statistics against closed forms, resuming, and the command in its quick form."""
+"""The study of methods of tuning: statistics against closed forms, resuming, and the command in its quick form."""
 
 import json
 import math
@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tuning.experiments.ways import runs as study_runs
-from tuning.experiments.ways.entries import Result, Scored, data_set, reference, run_way, start_of
-from tuning.experiments.ways.problems import (
+from tuning.experiments.methods import runs as study_runs
+from tuning.experiments.methods.entries import Result, Scored, data_set, reference, run_method, start_of
+from tuning.experiments.methods.problems import (
     CASES,
     ENTRIES,
     FAST,
@@ -22,15 +22,15 @@ from tuning.experiments.ways.problems import (
     Protocol,
     ring,
 )
-from tuning.experiments.ways.runs import chance, file_of, jobs_of, regrets, run_protocol, student
-from tuning.experiments.ways.tables import percent, tables
+from tuning.experiments.methods.runs import chance, file_of, jobs_of, regrets, run_protocol, student
+from tuning.experiments.methods.tables import percent, tables
 
 WALK = QUICK[0]
 
 
-def result(way, place, score, error="", log_score=-1.0):
+def result(method, place, score, error="", log_score=-1.0):
     scored = Scored(score, 1.0, 1.0, -10.0, log_score)
-    return Result(WALK.name, way, place, {"1000": scored}, {"1": scored}, scored, 100.0, 0.1, {}, error)
+    return Result(WALK.name, method, place, {"1000": scored}, {"1": scored}, scored, 100.0, 0.1, {}, error)
 
 
 def test_intervals_and_chances_are_students():
@@ -49,9 +49,9 @@ def test_regrets_are_ratios_to_the_reference_and_the_best_comes_first():
     good, bad = 1.0 + rng.uniform(0.0, 0.004, 6), 1.2 + rng.uniform(0.0, 0.01, 6)
     results = [result(REFERENCE, 0, 0.8, log_score=-0.9)]
     results += [result("likelihood", k, 0.8 * one) for k, one in enumerate(good)]
-    results += [result("random", k, 0.8 * one, "broke" if k == 2 else "") for k, one in enumerate(bad)]
+    results += [result("random-only", k, 0.8 * one, "broke" if k == 2 else "") for k, one in enumerate(bad)]
     first, second = regrets(results, WALK)
-    assert (first.way, second.way) == ("likelihood", "random")
+    assert (first.method, second.method) == ("likelihood", "random-only")
     assert first.ratio.value == pytest.approx(math.exp(np.log(good).mean()))
     assert first.equal and not first.worse and second.worse and not second.equal
     assert second.failures == 1 and second.sets == 6 and second.worst == pytest.approx(bad.max())
@@ -59,7 +59,7 @@ def test_regrets_are_ratios_to_the_reference_and_the_best_comes_first():
     assert [percent(one) for one in (1.012, 0.999, 3.0)] == ["+1.2 %", "-0.1 %", "x 3"]
 
 
-def test_all_ways_have_equal_data_and_starts_and_held_out_runs_are_others():
+def test_all_methods_have_equal_data_and_starts_and_held_out_runs_are_others():
     first, again, other = (data_set(WALK, place) for place in (0, 0, 1))
     np.testing.assert_array_equal(first.measurements, again.measurements)
     assert len(first.seeds) == WALK.runs and not set(first.seeds) & set(other.seeds)
@@ -71,22 +71,22 @@ def test_all_ways_have_equal_data_and_starts_and_held_out_runs_are_others():
     assert start_of(WALK, 2).model["measurement_noise_cov"] == pytest.approx(400.0)
 
 
-def test_a_way_that_lacks_something_is_no_failure_and_one_that_breaks_is():
-    blind = run_way(QUICK[1], "noise-estimation", 0, FAST)
+def test_a_method_that_lacks_something_is_no_failure_and_one_that_breaks_is():
+    blind = run_method(QUICK[1], "noise-estimation", 0, FAST)
     assert blind.last is None and "needs true states" in blind.error
-    studied = run_way(WALK, "study", 0, FAST)
+    studied = run_method(WALK, "study", 0, FAST)
     assert studied.last is None  # it would draw runs of its own
-    em = run_way(WALK, "em", 0, FAST)
+    em = run_method(WALK, "em", 0, FAST)
     assert em.error == "" and em.by_seconds.keys() == {"1"} and em.taken_runs <= FAST.runs + WALK.runs
     best = reference(WALK, FAST).last
     assert best.score < em.last.score * 1.01
 
 
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
-    few = FAST._replace(ways=("likelihood", "noise-estimation"), sets=2)
+    few = FAST._replace(methods=("likelihood", "noise-estimation"), sets=2)
     first = run_protocol(few, tmp_path)
     assert len(first) == len(list(jobs_of(few))) == 1 + 2 * 2 * 2
-    monkeypatch.setattr(study_runs, "run_way", None)
+    monkeypatch.setattr(study_runs, "run_method", None)
     again = run_protocol(few, tmp_path)
     assert json.dumps([one._asdict() for one in again]) == json.dumps([one._asdict() for one in first])
     name = file_of(tmp_path, WALK, "likelihood", 1, few)
@@ -95,9 +95,19 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     assert "noise-estimation" in made["what to use"]() and "`walk`" in made["group A"]()
 
 
+def test_results_that_say_way_are_read(tmp_path):
+    few = FAST._replace(cases=(WALK,), methods=("random-only",), sets=1)
+    file = file_of(tmp_path, WALK, "random-only", 0, few)
+    assert file.name.startswith("random-0-")
+    file.parent.mkdir()
+    content = result("random", 0, 1.0)._asdict()
+    file.write_text(json.dumps({"way": content.pop("method"), **content}))
+    assert study_runs.read(tmp_path, few) == [result("random-only", 0, 1.0)]
+
+
 def test_the_protocol_names_all_groups_and_was_predicted():
     assert {case.group for case in CASES} == set(GROUPS)
-    assert len({case.name for case in CASES}) == len(CASES) and Protocol().ways == ENTRIES
+    assert len({case.name for case in CASES}) == len(CASES) and Protocol().methods == ENTRIES
     assert pickle.loads(pickle.dumps(CASES)) is not None  # --jobs sends them to processes
     assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
 
@@ -115,7 +125,9 @@ def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
         [[np.trapezoid(a * b, steps) for b in (steps, 1.0 + 0.0 * steps)] for a in (steps, 1.0 + 0.0 * steps)]
     )
     np.testing.assert_allclose(blocks[0, :, 0], np.kron(moved, blocks[0, 2:, 0, 2:]), rtol=1e-6)
-    found, start, oracle = (run_way(case, way, 0, FAST).last for way in ("noise-estimation", "start", "oracle"))
+    found, start, oracle = (
+        run_method(case, method, 0, FAST).last for method in ("noise-estimation", "start", "oracle")
+    )
     assert found.score < 1.01 * oracle.score < 0.9 * start.score
 
 
@@ -125,14 +137,14 @@ def test_a_ring_is_tuned_by_its_inflation_alone():
     starts = [start_of(case, place) for place in range(3)]
     assert starts[0] == starts[1] == starts[2] and starts[0].numbers["ensemble_size"] == 20
     assert set(starts[0].model["measurement_noise_cov"]) == {1.0}
-    found = run_way(case, "anderson", 0, FAST)
+    found = run_method(case, "anderson", 0, FAST)
     assert found.error == "" and 1.005 < found.choice["numbers"]["inflation"] < 1.05
-    assert run_way(case, "likelihood", 0, FAST).last is None
+    assert run_method(case, "likelihood", 0, FAST).last is None
 
 
 def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811
-    page = tmp_path / "ways.md"
-    page.write_text("# Ways\n\n<!-- table group A -->\n<!-- end -->\n", encoding="utf-8")
-    told = as_json("study", "ways", "--quick", "--way", "likelihood", "--way", "start", "--page", page)
-    assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "ways_groups.png").is_file()
-    assert {one["way"] for one in told["results"]} == {"likelihood", "start", "reference"}
+    page = tmp_path / "methods.md"
+    page.write_text("# Methods\n\n<!-- table group A -->\n<!-- end -->\n", encoding="utf-8")
+    told = as_json("study", "methods", "--quick", "--method", "likelihood", "--method", "start", "--page", page)
+    assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "methods_groups.png").is_file()
+    assert {one["method"] for one in told["results"]} == {"likelihood", "start", "reference"}

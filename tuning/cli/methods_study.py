@@ -1,4 +1,4 @@
-"""`thruster study ways`: all ways of tuning on the same filters, data and budgets."""
+"""`thruster study methods`: all methods of tuning on the same filters, data and budgets."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tuning.cli.options import OUTPUT, RUNS, JsonOption
 from tuning.cli.output import announce_compilation, emit, progress_console
 
-RESULTS = Path("out") / "ways"
+RESULTS = Path("out") / "methods"
 
 
 def command(
     groups: Annotated[str, typer.Option(help="Groups of problems.", rich_help_panel=RUNS)] = "ABCDEFGH",
-    way: Annotated[
+    method: Annotated[
         list[str] | None,
-        typer.Option("--way", help="A way, may be repeated; by default all.", rich_help_panel=RUNS),
+        typer.Option("--method", help="A method, may be repeated; by default all.", rich_help_panel=RUNS),
     ] = None,
     sets: Annotated[int | None, typer.Option(min=2, max=20, help="Data sets; 20.", rich_help_panel=RUNS)] = None,
     runs: Annotated[
-        float | None, typer.Option(min=100, max=1e7, help="Passes that a way may take; 1e5.", rich_help_panel=RUNS)
+        float | None,
+        typer.Option(min=100, max=1e7, help="Passes that a method may take; 1e5.", rich_help_panel=RUNS),
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, max=1e4, help="Seconds of one core; 100.", rich_help_panel=RUNS)
@@ -55,23 +56,23 @@ def command(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Run every way of tuning on the same data within the same budget, and score it on held-out truth.
+    """Run every method of tuning on the same data within the same budget, and score it on held-out truth.
 
-    The regret of a way is its score over that of the best constant parameters, found by gradients from many starts
-    on many runs. Ctrl-C keeps finished results, and the same command continues. The whole study takes days; the
-    options reduce it, and results of different budgets are stored separately.
+    The regret of a method is its score over that of the best constant parameters, found by gradients from many
+    starts on many runs. Ctrl-C keeps finished results, and the same command continues. The whole study takes days;
+    the options reduce it, and results of different budgets are stored separately.
 
-    Example: thruster study ways --quick
+    Example: thruster study methods --quick
     """
     from thruster_env.core.files import write_whole
     from thruster_env.core.text_tables import with_tables
-    from tuning.experiments.ways.problems import FAST, PREDICTIONS, Protocol
-    from tuning.experiments.ways.runs import run_protocol
-    from tuning.experiments.ways.tables import figure, tables
+    from tuning.experiments.methods.problems import FAST, PREDICTIONS, Protocol
+    from tuning.experiments.methods.runs import run_protocol
+    from tuning.experiments.methods.tables import figure, tables
 
     protocol = FAST if quick else Protocol()
     changes: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
-    changes["ways"] = tuple(way) if way else None
+    changes["methods"] = tuple(method) if method else None
     changes["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
     protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
     text = None if page is None else page.read_text(encoding="utf-8")
@@ -79,7 +80,7 @@ def command(
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=progress_console) as progress:
-            bar = progress.add_task("ways", total=None)
+            bar = progress.add_task("methods", total=None)
             results = run_protocol(
                 protocol,
                 out,
@@ -92,7 +93,7 @@ def command(
         progress_console.print(f"Interrupted: finished results are in {out}, and the same command continues.")
         raise
     makers = tables(results, protocol)
-    written = [figure(results, protocol, (out if page is None else page.parent) / "ways_groups.png")]
+    written = [figure(results, protocol, (out if page is None else page.parent) / "methods_groups.png")]
     if page is not None and text is not None:
         write_whole(page, with_tables(text, makers))
         written.append(page)

@@ -1,4 +1,4 @@
-"""Ways of tuning by the functions and commands of users: a study whose choice is the way's answer."""
+"""Methods of tuning by the functions and commands of users: a study whose choice is the method's answer."""
 
 import json
 import signal
@@ -9,33 +9,33 @@ import pytest
 import tuning
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tests.tuning.ways.problems import linear
+from tests.tuning.methods.problems import linear
 from thruster_env.model.affine import affine_model
-from tuning.api import run as by_way
+from tuning.api import run as by_method
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
+from tuning.methods.correlations import stationary, steady_gain
+from tuning.methods.registry import ALONE, METHODS, find_method
+from tuning.methods.task import Budget, Task
 from tuning.problems.find import find_problem
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import reported, reported_name
-from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import given_choice, untuned_choice
-from tuning.ways.correlations import stationary, steady_gain
-from tuning.ways.registry import WAYS, find_way
-from tuning.ways.task import Budget, Task
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
-    study = tuning.tune(SHORT, "ekf", way="likelihood", trials=10, progress=False)
+def test_a_method_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
+    study = tuning.tune(SHORT, "ekf", method="likelihood", trials=10, progress=False)
     data = SHORT.data(SHORT.training_seeds(0, TRAINING_SEEDS))
     expected = tune_by_gradient("ekf", SHORT, data).choice
     for name in ("process_noise_cov", "measurement_noise_cov"):
         np.testing.assert_allclose(study.choice.model[name], expected.model[name], rtol=1e-4)
-    assert "Way likelihood: maximum likelihood" in str(study) and "held-out" in str(study)
+    assert "Method likelihood: maximum likelihood" in str(study) and "held-out" in str(study)
     assert 0 < len(study.trials) <= 10 and study.consistent is None
     file = study.save(tmp_path / "tuned.json")
     written = json.loads(file.read_text())
@@ -48,63 +48,98 @@ def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
 def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
     storage = tmp_path / "studies.journal"
     options = {"filter": "kf", "trials": 6, "progress": False, "storage": storage}
-    first = tuning.tune("published_tunnel", way="noise-estimation", **options)
-    again = tuning.tune("published_tunnel", way="noise-estimation", **options)
+    first = tuning.tune("published_tunnel", method="noise-estimation", **options)
+    again = tuning.tune("published_tunnel", method="noise-estimation", **options)
     assert again.choice == first.choice and len(again.trials) == len(first.trials)
-    assert again.tuning.way.runs == first.tuning.way.runs == TRAINING_SEEDS
-    assert np.shape(first.choice.model["process_noise_cov"]) == (2, 2)  # of the way, where trials have diagonals
+    assert again.tuning.answer.runs == first.tuning.answer.runs == TRAINING_SEEDS
+    assert np.shape(first.choice.model["process_noise_cov"]) == (2, 2)  # where trials have diagonals
 
 
 @pytest.mark.parametrize(
     ("problem", "options", "words"),
     [
-        (LinearProblem(truth=False), {"way": "mse"}, "way 'mse' needs true states, but linear-3 has none"),
-        ("nominal", {"way": "em", "filter": "enkf"}, "a filter for way 'em' must be one of kf"),
-        ("nominal", {"way": "als"}, "way 'als' needs a linear model"),
-        ("nominal", {"way": "magic"}, "way must be one of"),
-        ("nominal", {"way": "em", "method": "gradient"}, "must come without method='gradient'"),
-        ("nominal", {"way": "em", "worst": True}, "must minimise the mean over problems"),
-        ("nominal", {"way": "squarem", "full_q": True}, "must come without full_q"),
+        (LinearProblem(truth=False), {"method": "mse"}, "method 'mse' needs true states, but linear-3 has none"),
+        ("nominal", {"method": "em", "filter": "enkf"}, "a filter for method 'em' must be one of kf"),
+        ("nominal", {"method": "als"}, "method 'als' needs a linear model"),
+        ("nominal", {"method": "magic"}, "method must be one of"),
+        ("nominal", {"method": "em", "worst": True}, "must minimise the mean over problems"),
+        ("nominal", {"method": "squarem", "full_q": True}, "must come without full_q"),
     ],
 )
-def test_what_a_way_lacks_is_said_in_one_line(problem, options, words):
+def test_what_a_method_lacks_is_said_in_one_line(problem, options, words):
     with pytest.raises(ValueError, match=words) as said:
         tuning.tune(problem, **{"filter": "ekf", **options}, trials=3, progress=False)
     assert "\n" not in str(said.value)
 
 
-def test_an_unknown_way_is_refused_in_one_line(thruster):  # noqa: F811
-    unknown = thruster("ways", "magic")
-    assert unknown.returncode == 2 and "way must be one of" in unknown.stderr and "'magic'" in unknown.stderr
+@pytest.mark.parametrize(("method", "former"), [("likelihood", "likelihood"), ("random-only", "random")])
+def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, method, former):
+    """As `tune` wrote it before methods had one name."""
+    problem, storage = singular(first_scored_step=50), tmp_path / "studies.journal"
+    options = {"filter": "kf", "trials": 2, "progress": False, "storage": storage, "method": method}
+    plan = Plan("kf", (problem,), objectives=("likelihood",))
+    with monkeypatch.context() as before:
+        before.setattr(by_method, "ANSWER", "answer of the way")
+        name = f"{by_method.name_of(plan)}-way-{former}"
+        first = tuning.tune(problem, name=name, **options)
+    monkeypatch.setattr(by_method, "Task", None)  # nothing is run again
+    again = tuning.tune(problem, **options)
+    assert same_filter(again.choice, first.choice) and again.tuning.study == name
+    assert again.tuning.answer.runs == first.tuning.answer.runs
+
+
+def test_former_names_are_answered_with_those_of_today(thruster):  # noqa: F811
+    for command, name in (
+        (("tune", "--way", "em"), "--method"),
+        (("tune", "--sampler=gp"), "--method"),
+        (("study", "methods", "--way", "em"), "--method"),
+        (("ways",), "'methods'"),
+        (("study", "ways"), "'methods'"),
+    ):
+        refused = thruster(*command)
+        assert refused.returncode == 2 and refused.stderr.strip().endswith(f"Did you mean {name}?")
+        assert refused.stderr.count("\n") == 1
+
+
+def test_a_study_cannot_be_run_on_a_task():
+    problem = singular()
+    with pytest.raises(ValueError, match="a study must be run by tuning.tune"):
+        find_method("tpe").run("tpe", Task("kf", problem, problem.data([0])))
+
+
+def test_an_unknown_method_is_refused_in_one_line(thruster):  # noqa: F811
+    unknown = thruster("methods", "magic")
+    assert unknown.returncode == 2 and "method must be one of" in unknown.stderr and "'magic'" in unknown.stderr
 
 
 @pytest.mark.slow
-def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
-    told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--way", "desroziers", "--trials", 4)
-    assert told["way"]["name"] == "desroziers" and told["way"]["runs"] % 32 == 0 and told["way"]["runs"] > 4 * 32
-    assert told["file"].endswith("enkf-nominal-seed0-way-desroziers.json") and told["trials"] <= 4
-    assert "true states" in thruster("ways").stdout
-    shown = thruster("ways", "EM").stdout
+def test_the_command_follows_a_method(as_json, thruster):  # noqa: F811
+    told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--method", "desroziers", "--trials", 4)
+    assert told["method"]["name"] == "desroziers"
+    assert told["method"]["runs"] % 32 == 0 and told["method"]["runs"] > 4 * 32
+    assert told["file"].endswith("enkf-nominal-seed0-method-desroziers.json") and told["trials"] <= 4
+    assert "true states" in thruster("methods").stdout
+    shown = thruster("methods", "EM").stdout
     assert "Shumway" in shown and "dlog L/dq" in shown
 
 
 @pytest.mark.slow
 def test_gradients_of_full_matrices_begin_at_noise_estimation():
-    study = tuning.tune("deadband", "ekf", way="log-score", full_q=True, trials=6, progress=False)
+    study = tuning.tune("deadband", "ekf", method="log-score", full_q=True, trials=6, progress=False)
     ratios = study.held_out.ratios
     assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
     assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)
 
 
-def test_ctrl_c_ends_a_way_with_what_it_has_found(monkeypatch, tmp_path):
+def test_ctrl_c_ends_a_method_with_what_it_has_found(monkeypatch, tmp_path):
     def follow(task):
         task.keep(task.with_values([2.0 * one for one in task.values_of(task.start, task.free)], task.free))
         signal.raise_signal(signal.SIGINT)
         task.value(task.best)
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(by_way, "find_way", lambda name: WAYS["random"]._replace(follow=follow))
-    study = tuning.tune(SHORT, "ekf", way="random", trials=4, progress=False)
+    monkeypatch.setattr(by_method, "find_method", lambda name: METHODS["random-only"]._replace(function=follow))
+    study = tuning.tune(SHORT, "ekf", method="random-only", trials=4, progress=False)
     assert study.interrupted and len(study.trials) == 2
     before = SHORT.untuned["process_noise_cov"]
     np.testing.assert_allclose(study.choice.model["process_noise_cov"], np.multiply(2.0, before))
@@ -134,32 +169,32 @@ def singular(first_scored_step=0, runs=6, steps=60):
     return RunsProblem(found, model, first_scored_step=first_scored_step, name="driven")
 
 
-@pytest.mark.parametrize("way", ["em", "squarem", "als", "mehra"])
-def test_ways_of_q_and_r_alone_say_how_p0_is_left_out(as_python, way):
+@pytest.mark.parametrize("method", ["em", "squarem", "als", "mehra"])
+def test_methods_of_q_and_r_alone_say_how_p0_is_left_out(as_python, method):
     with pytest.raises(
-        ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*way 'likelihood'"
+        ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*method 'likelihood'"
     ) as said:
-        tuning.tune(singular(), "kf", way=way, trials=3, progress=False)
+        tuning.tune(singular(), "kf", method=method, trials=3, progress=False)
     assert "\n" not in str(said.value)
     problem = singular(first_scored_step=50)
     task = Task("kf", problem, problem.data([0, 1]), options={"prior": problem.counts_start_up})
-    WAYS[way].check(way, task)
+    METHODS[method].check(method, task)
 
 
 def with_larger_r(task):
-    """A way that believes the measurements far too little."""
+    """A method that believes the measurements far too little."""
     task.keep(task.with_values([1e3 * one for one in task.values_of(task.start, task.free)], task.free))
 
 
 def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypatch, tmp_path):
-    monkeypatch.setitem(WAYS, "scoring", WAYS["scoring"]._replace(follow=with_larger_r))
+    monkeypatch.setitem(METHODS, "scoring", METHODS["scoring"]._replace(function=with_larger_r))
     problem, options = singular(first_scored_step=50), {"trials": 3, "progress": False}
     storage = tmp_path / "studies.journal"
-    study = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
+    study = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
     assert same_filter(study.choice, given_choice("kf", problem))
-    refused = study.tuning.way.refused
+    refused = study.tuning.answer.refused
     assert refused.found > refused.given == pytest.approx(study.tuning.result.best_value)
-    again = tuning.tune(problem, "kf", way="scoring", storage=storage, **options)
+    again = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
     objective = study.tuning.plan.objectives[0]
     for one in (study, again):
         answer, given = (f"{reported(objective, value):.4g}" for value in (refused.found, refused.given))
@@ -168,20 +203,20 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
 
 @pytest.mark.parametrize("options", [{}, {"hold_r": True}])
 def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypatch, options):
-    keeps_the_rule_of_thumb = WAYS["scoring"]._replace(follow=lambda task: None)
-    monkeypatch.setitem(WAYS, "scoring", keeps_the_rule_of_thumb)
+    keeps_the_rule_of_thumb = METHODS["scoring"]._replace(function=lambda task: None)
+    monkeypatch.setitem(METHODS, "scoring", keeps_the_rule_of_thumb)
     problem = singular(first_scored_step=50)
-    study = tuning.tune(problem, "kf", way="scoring", trials=2, progress=False, **options)
+    study = tuning.tune(problem, "kf", method="scoring", trials=2, progress=False, **options)
     own, found = given_choice("kf", problem).model, study.choice.model
     r = (untuned_choice("kf", problem).model if options else own)["measurement_noise_cov"]
     np.testing.assert_array_equal(found["process_noise_cov"], own["process_noise_cov"])
     np.testing.assert_array_equal(found["measurement_noise_cov"], r)
-    refused = study.tuning.way.refused
+    refused = study.tuning.answer.refused
     assert refused.given < refused.found and "so that one is returned" in study.tuning.chosen[0]
 
 
-@pytest.mark.parametrize(("way", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])
-def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, way, options):
+@pytest.mark.parametrize(("method", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])
+def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, method, options):
     rng = np.random.default_rng(0)
     model = affine_model(
         a=[[0.9]],
@@ -195,14 +230,14 @@ def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, w
     runs = [{"measurements": np.column_stack([rng.normal(size=20), np.full(20, np.nan)])} for _ in range(4)]
     problem = RunsProblem(runs, model, held_out=[2, 3], name="half of it")
     task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options}, budget=Budget(runs=400))
-    WAYS[way].run(way, task)
+    METHODS[method].run(method, task)
     before, after = (
         np.asarray(one.filter(problem).model.measurement_noise_cov) for one in (task.start, task.best)
     )
     assert after[1, 1] == pytest.approx(before[1, 1]) and after[0, 0] > 2 * before[0, 0]
 
 
-def test_ways_by_lags_refuse_a_filter_whose_errors_do_not_decay():
+def test_methods_by_lags_refuse_a_filter_whose_errors_do_not_decay():
     linear_model = stationary(singular().model(), "driven", "als")
     with pytest.raises(ValueError, match="an eigenvalue of A - A L C is 1: its errors do not decay") as refused:
         steady_gain(linear_model, np.zeros((2, 2)), np.eye(1))
@@ -210,12 +245,12 @@ def test_ways_by_lags_refuse_a_filter_whose_errors_do_not_decay():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", [one for one in WAYS if one not in ("nuts", "posterior")])
-def test_no_way_returns_worse_than_it_was_given(way):
+@pytest.mark.parametrize("method", [one for one in ALONE if one not in ("nuts", "posterior")])
+def test_no_method_returns_worse_than_it_was_given(method):
     problem = singular(first_scored_step=50)
     task = Task("kf", problem, problem.data(range(4)), budget=Budget(300, 1.0))
     try:
-        find_way(way).run(way, task)
+        find_method(method).run(method, task)
     except ValueError as lacking:
         assert "needs" in str(lacking) or "tunes" in str(lacking)
     meter = Task("kf", problem, problem.data(range(4)))
@@ -226,6 +261,6 @@ def test_em_with_long_steps_ends_where_a_variance_goes_to_zero():
     """It took 20 000 steps and minutes for some sixty rows."""
     problem = linear(runs=2, steps=30, truth=False)
     task = Task("kf", problem, problem.data([0, 1]), options={})
-    find_way("squarem").run("squarem", task)
+    find_method("squarem").run("squarem", task)
     assert task.runs < 20_000
-    assert task.value(task.best) == pytest.approx(64.2459381973658, abs=1e-4)  # of way "likelihood"
+    assert task.value(task.best) == pytest.approx(64.2459381973658, abs=1e-4)  # of method "likelihood"

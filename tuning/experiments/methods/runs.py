@@ -15,9 +15,10 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from thruster_env.core.files import write_whole
+from tuning.experiments.methods.entries import Result, Scored, reference, run_method
+from tuning.experiments.methods.problems import REFERENCE, Case, Protocol
 from tuning.experiments.users import holm
-from tuning.experiments.ways.entries import Result, Scored, reference, run_way
-from tuning.experiments.ways.problems import REFERENCE, Case, Protocol
+from tuning.methods.registry import ALONE, ONLY
 
 OnResult = Callable[[str, int, int], None]  # what is done, results so far, all
 
@@ -27,7 +28,7 @@ def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:
     models = {case.model: case for case in reversed(protocol.cases)}
     yield from ((case, REFERENCE, 0) for case in protocol.cases if models[case.model] is case)
     for set_index in range(protocol.sets):
-        yield from ((case, way, set_index) for case in protocol.cases for way in protocol.ways)
+        yield from ((case, method, set_index) for case in protocol.cases for method in protocol.methods)
 
 
 def run_protocol(
@@ -63,8 +64,8 @@ def run_protocol(
                 for future in as_completed(waiting):
                     future.result()
                     done += 1
-                    case, way, _ = waiting[future]
-                    on_result(f"{case.name}, {way}", done, len(wanted))
+                    case, method, _ = waiting[future]
+                    on_result(f"{case.name}, {method}", done, len(wanted))
             except KeyboardInterrupt:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -77,24 +78,24 @@ def read(folder: Path, protocol: Protocol) -> list[Result]:
     return [_result(json.loads(file.read_text(encoding="utf-8"))) for file in files if file.is_file()]
 
 
-def file_of(folder: Path, case: Case, way: str, set_index: int, protocol: Protocol) -> Path:
+def file_of(folder: Path, case: Case, method: str, set_index: int, protocol: Protocol) -> Path:
     """The file of a result, whose name says what it depends on."""
 
     def plain(text: str) -> str:
         return "".join(letter if letter.isalnum() else "-" for letter in text)
 
-    if way == REFERENCE:
-        return folder / plain(case.model) / f"{way}-{protocol.many}-{protocol.starts}-{protocol.held_out}.json"
+    if method == REFERENCE:
+        return folder / plain(case.model) / f"{method}-{protocol.many}-{protocol.starts}-{protocol.held_out}.json"
     budget = f"{protocol.runs:g}-{protocol.seconds:g}-{protocol.held_out}"
-    return folder / plain(case.name) / f"{plain(way)}-{set_index}-{budget}.json"
+    return folder / plain(case.name) / f"{plain(method.removesuffix(ONLY))}-{set_index}-{budget}.json"
 
 
-def _one(case: Case, way: str, set_index: int, protocol: Protocol, folder: Path) -> None:
+def _one(case: Case, method: str, set_index: int, protocol: Protocol, folder: Path) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    file = file_of(folder, case, way, set_index, protocol)
+    file = file_of(folder, case, method, set_index, protocol)
     if file.is_file():  # of another host, meanwhile
         return
-    result = reference(case, protocol) if way == REFERENCE else run_way(case, way, set_index, protocol)
+    result = reference(case, protocol) if method == REFERENCE else run_method(case, method, set_index, protocol)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(_as_data(result), indent=1))
 
@@ -107,6 +108,9 @@ def _as_data(result: Result) -> dict[str, Any]:
 
 
 def _result(content: dict[str, Any]) -> Result:
+    """A result as `_as_data` has it; files of 2026 call the method `way`, and samplers have no "-only"."""
+    name = content.pop("way", None) or content["method"]
+    content["method"] = f"{name}{ONLY}" if f"{name}{ONLY}" in ALONE else name
     for name in ("by_runs", "by_seconds"):
         content[name] = {key: Scored(*map(_float, scored)) for key, scored in content[name].items()}
     last: Sequence[float] | None = content.pop("last")
@@ -117,7 +121,7 @@ def _float(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-# Regrets of ways with intervals over data sets, and which ways are significantly worse than the best.
+# Regrets of methods with intervals over data sets, and which methods are significantly worse than the best.
 
 
 LEVEL = 0.05
@@ -125,14 +129,14 @@ EQUAL = 0.01  # of log ratios: "equal" is within 1 %
 
 
 def within(kind: str, key: str) -> Callable[[Result], Scored | None]:
-    """What of a result counts: what the way gave for a budget of "by_runs" or "by_seconds"."""
+    """What of a result counts: what the method gave for a budget of "by_runs" or "by_seconds"."""
     return lambda result: getattr(result, kind).get(key)
 
 
 class Regret(NamedTuple):
-    """A way on the data sets of a case."""
+    """A method on the data sets of a case."""
 
-    way: str
+    method: str
     ratio: (
         Interval  # score over that of the best constant numbers: mean of logarithms with Student's 95 % interval
     )
@@ -145,7 +149,7 @@ class Regret(NamedTuple):
     sets: int
     runs: float  # median of what it took
     seconds: float
-    worse: bool = False  # significantly worse than the best way of the case, by Holm's procedure at 5 %
+    worse: bool = False  # significantly worse than the best method of the case, by Holm's procedure at 5 %
 
     @property
     def equal(self) -> bool:
@@ -156,62 +160,62 @@ class Regret(NamedTuple):
 def regrets(
     results: Sequence[Result], case: Case, at: Callable[[Result], Scored | None] = lambda result: result.last
 ) -> list[Regret]:
-    """The ways that a case allows, the best first; those with fewer data sets than the others, too.
+    """The methods that a case allows, the best first; those with fewer data sets than the others, too.
 
     Args:
         results: of a protocol.
         case: of it.
-        at: what of a result counts, by default what the way gave in the end.
+        at: what of a result counts, by default what the method gave in the end.
     """
     reference = reference_of(results, case)
     if reference is None:
         return []
     logs: dict[str, dict[int, float]] = {}
-    regrets_, by_way = [], _by_way(results, case)
-    for way, of_way in by_way.items():
-        scores = {result.set: at(result) for result in of_way}
-        logs[way] = {
+    regrets_, by_method = [], _by_method(results, case)
+    for method, of_method in by_method.items():
+        scores = {result.set: at(result) for result in of_method}
+        logs[method] = {
             set_index: math.log(scored.score / reference.score)
             for set_index, scored in scores.items()
             if scored is not None
         }
-        values = np.array(list(logs[way].values()))
+        values = np.array(list(logs[method].values()))
         if not len(values):
             continue
         valid = [scored for scored in scores.values() if scored is not None]
         regrets_.append(
             Regret(
-                way,
+                method,
                 _exp(student(values)),
                 math.exp(float(np.median(values))),
                 math.exp(float(values.max())),
                 float(np.median([scored.nees for scored in valid])),
                 float(np.median([scored.nis for scored in valid])),
                 reference.log_score - float(np.mean([scored.log_score for scored in valid])),
-                sum(bool(result.error) for result in of_way),
+                sum(bool(result.error) for result in of_method),
                 len(values),
-                float(np.median([result.taken_runs for result in of_way])),
-                float(np.median([result.taken_seconds for result in of_way])),
+                float(np.median([result.taken_runs for result in of_method])),
+                float(np.median([result.taken_seconds for result in of_method])),
             )
         )
     regrets_.sort(key=lambda regret: regret.ratio.value)
-    worse = holm([chance(logs[regret.way], logs[regrets_[0].way]) for regret in regrets_], LEVEL)
+    worse = holm([chance(logs[regret.method], logs[regrets_[0].method]) for regret in regrets_], LEVEL)
     return [regret._replace(worse=is_worse) for regret, is_worse in zip(regrets_, worse, strict=True)]
 
 
 def reference_of(results: Sequence[Result], case: Case) -> Scored | None:
     """What the best constant numbers of a case have, which cases that differ in their data share."""
-    names = {result.case for result in results if result.way == REFERENCE}
+    names = {result.case for result in results if result.method == REFERENCE}
     name = next((candidate for candidate in (case.name, case.name.split(",")[0]) if candidate in names), None)
-    return next((result.last for result in results if result.way == REFERENCE and result.case == name), None)
+    return next((result.last for result in results if result.method == REFERENCE and result.case == name), None)
 
 
-def _by_way(results: Iterable[Result], case: Case) -> dict[str, list[Result]]:
-    by_way: dict[str, list[Result]] = {}
+def _by_method(results: Iterable[Result], case: Case) -> dict[str, list[Result]]:
+    by_method: dict[str, list[Result]] = {}
     for result in results:
-        if result.case == case.name and result.way != REFERENCE and result.last is not None:
-            by_way.setdefault(result.way, []).append(result)
-    return by_way
+        if result.case == case.name and result.method != REFERENCE and result.last is not None:
+            by_method.setdefault(result.method, []).append(result)
+    return by_method
 
 
 def student(values: np.ndarray) -> Interval:

@@ -6,8 +6,8 @@ import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.residuals import estimated_from
+from tuning.methods.task import Task
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.task import Task
 
 MOST_STEPS = 100
 CLOSE = 1e-8  # of the log-likelihood that a step is expected to gain, which ends it
@@ -55,7 +55,7 @@ def _of(likelihood) -> tuple[float, np.ndarray]:
     return float(likelihood.values.sum()), likelihood.gradients.sum(axis=0)
 
 
-# Noise estimation from true states: the only way without a search, and the best one for a model that is right.
+# Noise estimation from true states: the only method without a search, and the best one for a model that is right.
 
 
 def noise_estimation(task: Task) -> None:
@@ -68,7 +68,7 @@ def noise_estimation(task: Task) -> None:
     for problem, data in zip(task.problems, task.data, strict=True):
         estimate = estimated_from(problem.model(**problem.untuned), data)
         if estimate.process_cov is None or estimate.measurement_cov is None:
-            raise ValueError(f"way 'noise-estimation' needs residuals on {problem.name}, but {estimate.reason}")
+            raise ValueError(f"method 'noise-estimation' needs residuals on {problem.name}, but {estimate.reason}")
         estimates.append((estimate.process_cov, estimate.measurement_cov))
     task.charge(task.passes)
     weights = [len(runs.seeds) for runs in task.data]

@@ -1,4 +1,4 @@
-"""The problems of the study, in groups: what is known of the model decides which way is good."""
+"""The problems of the study, in groups: what is known of the model decides which method is good."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tuning.experiments import lorenz96
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.experiments.lidar import drawn, lidar_problem
 from tuning.experiments.pendulum import model as pendulum
+from tuning.methods.registry import ALONE
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.ways.registry import WAYS
 
 NOTHING: Mapping[str, bool] = {}
 FULL: Mapping[str, bool] = {"full_q": True, "full_r": True}
@@ -195,7 +195,7 @@ CASES = (
 QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "kf", runs=4, truth=False))
 
 
-# How much is done: cases, ways, data sets and budgets.
+# How much is done: cases, methods, data sets and budgets.
 
 
 RUNS, SECONDS = (1e3, 1e4, 1e5), (1.0, 10.0, 100.0)  # budgets
@@ -204,20 +204,20 @@ REFERENCE = "reference"  # the best constant numbers
 START, SCALED, ORACLE = "start", "scaled default", "oracle"
 STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
 TRIALS = 50
-WITH_FULL = ", full"  # behind a way: it tunes full Q and R, where the others of a case tune diagonals
+WITH_FULL = ", full"  # behind a method: it tunes full Q and R, where the others of a case tune diagonals
 FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
-FULL_WAYS = (
-    *(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood", "als")),
-    *(f"{way}{FROM_NOISE}" for way in ("mse", "log-score")),
+FULL_METHODS = (
+    *(f"{method}{WITH_FULL}" for method in ("mse", "log-score", "likelihood", "als")),
+    *(f"{method}{FROM_NOISE}" for method in ("mse", "log-score")),
 )
-ENTRIES = (*WAYS, *FULL_WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
+ENTRIES = (*ALONE, *FULL_METHODS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
 
 
 class Protocol(NamedTuple):
     """How much is done."""
 
     cases: tuple[Case, ...] = CASES
-    ways: tuple[str, ...] = ENTRIES
+    methods: tuple[str, ...] = ENTRIES
     sets: int = 20
     runs: float = max(RUNS)
     seconds: float = max(SECONDS)
@@ -227,11 +227,11 @@ class Protocol(NamedTuple):
 
 
 FAST = Protocol(
-    QUICK, ("likelihood", "log-score", "em", "noise-estimation", "random", START), 3, 200, 2.0, 20, 20, 2
+    QUICK, ("likelihood", "log-score", "em", "noise-estimation", "random-only", START), 3, 200, 2.0, 20, 20, 2
 )
 
 
-# What the authors of the ways, and we, would predict of the study; written before its first run.
+# What the authors of the methods, and we, would predict of the study; written before its first run.
 
 
 class Prediction(NamedTuple):
@@ -260,6 +260,6 @@ PREDICTIONS = (
     ),
     Prediction("we", "From ten numbers on, gradients beat samplers by 5 % in a tenth of the time."),
     Prediction("we", "The log score is within 2 % of the least error, with a NEES near 1, everywhere."),
-    Prediction("we", "Ways without truth lose less than 5 % but on wrong models."),
+    Prediction("we", "Methods without truth lose less than 5 % but on wrong models."),
     Prediction("we", "Random search within 1e4 runs is beaten by every search but coordinate steps."),
 )

@@ -11,12 +11,12 @@ from thruster_env.core.angles import difference
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.residuals import predicted
 from tuning.likelihood.gradient import Goal
+from tuning.methods.scoring import noise_estimation
+from tuning.methods.searches import nelder_mead
+from tuning.methods.task import FEW, Task
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.search.objectives import MSE
 from tuning.search.space import Choice
-from tuning.ways.scoring import noise_estimation
-from tuning.ways.searches import nelder_mead
-from tuning.ways.task import FEW, Task
 
 RATE, HALVED_EVERY, CLIP = 1e-2, 150, 1.0  # of Adam: steps, and the largest norm of a gradient
 BATCH, VALIDATION = 10, 0.15  # runs of a step, and the part of all runs that chooses among steps

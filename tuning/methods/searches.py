@@ -1,4 +1,4 @@
-"""Ways by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts."""
+"""Methods by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import optuna
 from optuna.distributions import BaseDistribution
 
 from tuning.likelihood.gradient import optimum, start_at, starts_of
+from tuning.methods.task import Task
 from tuning.problems.parameter import Coordinates
 from tuning.search.quiet import quiet_optuna
 from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice
-from tuning.ways.task import Task
 
 
 def ascend(objective: str) -> Callable[[Task], None]:
-    """The way that follows the gradient of an objective: from the task's start, then from those of `starts_of`.
+    """The method that follows the gradient of an objective from the task's start, then from those of `starts_of`.
 
     It is what `tune_by_gradient` does, which adds standard errors.
     """
 
-    def follow(task: Task) -> None:
+    def run(task: Task) -> None:
         goal = task.goal(objective)
         coordinates = goal.coordinates
         first = np.clip(coordinates.of(goal.untuned), coordinates.low, coordinates.high)
@@ -35,10 +35,10 @@ def ascend(objective: str) -> Callable[[Task], None]:
                 best = other
             task.keep(goal.choice_at(coordinates.of(best.parameters)))
 
-    return follow
+    return run
 
 
-# Ways down an objective without its gradient: the downhill simplex, and one number at a time.
+# Searches of an objective without its gradient: the downhill simplex, and one number at a time.
 
 
 FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
@@ -119,7 +119,7 @@ def coordinate_steps(task: Task) -> None:
             return
 
 
-# Ways that ask one of Optuna's samplers for trials, and know of an objective nothing but its values.
+# Methods that ask one of Optuna's samplers for trials, and know of an objective nothing but its values.
 
 
 MOST_TRIALS = 10_000
@@ -127,13 +127,13 @@ SLOWER = 10  # steps from one measurement to the next at the second sample time:
 
 
 def sample(sampler: str, objective: str | None = None, slower: int | None = None) -> Callable[[Task], None]:
-    """The way that minimises an objective, by default the task's, over trials of a sampler, from the start on.
+    """The method that minimises an objective, by default the task's, over trials of a sampler, from the start on.
 
     Every trial has the same runs, so that the differences between trials are not those of noise. With a second
     sample time, slower by so many steps, each trial is measured at both, and the larger value counts.
     """
 
-    def follow(task: Task) -> None:
+    def run(task: Task) -> None:
         rates = [task.data] if slower is None else [task.data, [runs.every(slower) for runs in task.data]]
         space: dict[str, BaseDistribution] = {
             parameter.name: parameter.distribution for parameter in task.searched
@@ -159,4 +159,4 @@ def sample(sampler: str, objective: str | None = None, slower: int | None = None
                 least = value
                 task.keep(choice)
 
-    return follow
+    return run

@@ -9,21 +9,21 @@ import numpy as np
 from filters import make_filter
 from filters.engine.session import Session
 from tuning.evaluation.baselines import with_covariances
+from tuning.methods.method import INFLATION
+from tuning.methods.task import Task
 from tuning.search.parameters import FILTER_PARAMETERS
-from tuning.ways.task import Task
-from tuning.ways.way import INFLATION
 
 FORGETTING = 0.995  # of Q and R a step
 
 
 def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
-    """The way that runs an adaptive filter over each training run in turn, beginning with what the last one found.
+    """The method that runs an adaptive filter over each training run in turn, from the values of the last one.
 
     What a run finds is the mean over its second half of the filter's R, and of its Q where it learns that. In the
     end it is the mean over the second half of the runs.
     """
 
-    def follow(task: Task) -> None:
+    def run(task: Task) -> None:
         model = task.model(task.start)
         q, r = model.process_noise_cov, model.measurement_noise_cov
         estimates: list[tuple[np.ndarray, np.ndarray]] = []
@@ -34,7 +34,7 @@ def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
                     q, r = _means(make_filter(name, model, **numbers), data.one(index))
                 except ValueError:  # a belief that is none
                     raise ValueError(
-                        f"way {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
+                        f"method {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
                     ) from None
                 task.charge(1)
                 estimates.append((q, r))
@@ -42,7 +42,7 @@ def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
                 means = (np.mean([estimate[side] for estimate in half], axis=0) for side in (0, 1))
                 task.keep(with_covariances(task.start, *_diagonals(task, *means)))
 
-    return follow
+    return run
 
 
 def _means(filter_, data) -> tuple[np.ndarray, np.ndarray]:

@@ -1,1 +1,0 @@
-"""Ways of tuning: published methods that find Q, R and other numbers, each behind the same interface."""
