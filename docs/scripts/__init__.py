@@ -30,13 +30,13 @@ PAGES: Mapping[str, tuple[str, ...]] = {  # and the modules that make their tabl
     "filters": ("docs.scripts.filters",),
     "logs": ("tuning.experiments.hidden_truth",),
     "machine_code": ("docs.scripts.machine_code",),
+    "methods": ("tuning.experiments.lidar",),
     "monitoring": ("tuning.experiments.faults",),
     "plant": ("docs.scripts.plant",),
     "ranking": ("docs.scripts.ranking", "docs.scripts.estimators"),
     "readme": ("docs.scripts.pictures",),
     "real_data": ("tuning.experiments.recordings.tables",),
     "tuning": ("docs.scripts.tuning", "docs.scripts.tuning_choice", "tuning.experiments.users"),
-    "methods": ("tuning.experiments.lidar",),
     "workers": ("docs.scripts.workers",),
 }
 
