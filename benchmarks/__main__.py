@@ -5,14 +5,14 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from benchmarks.rates import measure_again, rates
-from benchmarks.speed_page import check_page, write_page
-from benchmarks.timing import COLUMNS, machine, machine_lines
+from benchmarks.timing import COLUMNS, Row, check_page, machine, machine_lines, write_page
 from thruster_env.core.checks import one_of
 from thruster_env.core.text_tables import table
 from thruster_env.core.threads import cores
@@ -29,10 +29,19 @@ CAPTION = (
     "Goals are the most that a ratio, a multiple of the limit, or a time may be."
 )
 
-PARTS = (
-    *("steps", "vectors", "vector_filters", "batches", "c_code", "horizon", "vehicles", "trajectories"),
-    *("studies", "assimilation", "policies", "processes"),
-)
+PARTS = {  # with the modules and functions that measure their rows
+    **{"steps": "steps.rows", "vectors": "steps.vector_rows", "vector_filters": "steps.vector_filter_rows"},
+    **{"batches": "batches.rows", "c_code": "c_code.rows", "horizon": "steps.horizon_rows"},
+    **{"vehicles": "vehicles.rows", "trajectories": "batches.trajectory_rows", "studies": "studies.rows"},
+    **{"assimilation": "studies.assimilation_rows", "policies": "policies.rows", "processes": "first_use.rows"},
+}
+
+
+def rows_of(part: str) -> Callable[[int, bool], Iterator[Row]]:
+    """The function that measures a part, its packages imported."""
+    module, _, function = PARTS[part].partition(".")
+    return getattr(importlib.import_module(f"benchmarks.{module}"), function)
+
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -61,7 +70,7 @@ def command(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
     check_installed()
-    parts = [one_of("part", name, PARTS) for name in part or PARTS]
+    parts = [one_of("part", name, tuple(PARTS)) for name in part or PARTS]
     if page is not None:
         if part:
             raise ValueError(f"--part must go without --page, which has all parts, but got --page {page}")
@@ -70,15 +79,15 @@ def command(
         check_page(page)
     check_targets([page], json)
     # After the checks: they import FilterPy, or Stable-Baselines3.
-    modules = [importlib.import_module(f"benchmarks.{name}") for name in parts]
-    from benchmarks import studies, vectors
+    measures = [rows_of(name) for name in parts]
+    from benchmarks import steps, studies
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring the machine's arithmetic ...") as status:
-        for module in modules:
+        for rows_of_part in measures:
             measure_again()
-            for row in module.rows(seed, quick):
+            for row in rows_of_part(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")
         status.update("memory of the study ...")
@@ -86,7 +95,7 @@ def command(
     seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
     facts = machine()
     speeds = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
-    memory = [vectors.memory_line(), studies.memory_line(resident)]
+    memory = [steps.memory_line(), studies.memory_line(resident)]
     if page is not None:
         write_page(page, rows, facts, memory)
     emit(

@@ -1,26 +1,33 @@
-"""Whole evaluations on all cores, per member and step, beside the least arithmetic that they need."""
+"""Whole evaluations and many trajectories on all cores, beside the least arithmetic that they need, and JAX."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
+from importlib.util import find_spec
+from math import gcd
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from benchmarks.rates import arithmetic_limit, normals, operations_of, step_of_filter, times
 from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import run
+from filters.filter import Filter
+from thruster_env.core.checks import covariance_root
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import column_reader, column_writer, vector_reader
 from thruster_env.core.streams import FILTER_PROCESS, fill_normals
 from thruster_env.core.threads import cores, spread
-from thruster_env.thruster.dynamics import Constants, substep
+from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
+from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
-from tuning.search.space import Choice, oracle_choice
+from tuning.search.space import oracle_choice
 from tuning.thruster.scenario import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
@@ -51,15 +58,11 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
     timing = side_by_side(shared(compute_metrics, count), whole_floor, rounds)
     yield Row(f"evaluate, {workload}", "floor", timing, ratio_goal=EVALUATE_GOAL, limit=limit)
-    timing = side_by_side(shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
+    timing = side_by_side(shared(lambda: estimates(choice.filter(scenario), data), count), whole_floor, rounds)
     yield Row("the same without metrics", "floor", timing, ratio_goal=RUN_GOAL, limit=limit)
     for (name, measure), count in zip(floor.items(), floor_operations(scenario.plant), strict=True):
         limit = arithmetic_limit(count, cores=cores())
         yield Row(f"floor: {name}", None, alone(measure, rounds), limit=limit)
-
-
-def _run(choice: Choice, scenario, data) -> None:
-    run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
 
 
 def shared(work: Callable[[], object], count: int) -> Measure:
@@ -127,3 +130,182 @@ def _floor_functions() -> tuple[Callable, Callable]:
             fill_normals(draws, draws.shape[0], step, FILTER_PROCESS, key, 0)
 
     return compiled(propagate), compiled(draw)
+
+
+# Filters over many trajectories at once; the ensemble filter beside one written in JAX.
+
+
+TRAJECTORIES, TRAJECTORY_SIZE = 256, 100
+AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart
+ALONE = (("ekf", 2.6), ("ukf", 2.5))  # filters without an ensemble, and the most of the limit that a step may be
+LIMIT_GOAL = 1.9  # of the ensemble filter
+
+
+def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    scenario = find_scenario("nominal")
+    count = TRAJECTORIES // 4 if quick else TRAJECTORIES
+    data, steps = scenario.data(training_seeds(seed, count)), count * scenario.steps
+    for name, goal in ALONE:
+        filter_ = oracle_choice(name, scenario).filter(scenario)
+        measure = shared(partial(estimates, filter_, data), steps)
+        timing = alone(measure, 5 if quick else 40)
+        limit = arithmetic_limit(step_of_filter(filter_), cores=cores())
+        yield Row(f"{name.upper()} batch, a step", None, timing, limit=limit, limit_goal=goal)
+
+    filter_ = oracle_choice("enkf", scenario).with_size(TRAJECTORY_SIZE).filter(scenario)
+    ours = shared(partial(estimates, filter_, data), steps * TRAJECTORY_SIZE)
+    rounds, what = 2 if quick else 10, f"EnKF batch, N = {TRAJECTORY_SIZE}"
+    limit = arithmetic_limit(times(step_of_filter(filter_), 1 / TRAJECTORY_SIZE), cores=cores())
+    yield Row(what, None, alone(ours, 5 * rounds), limit=limit, limit_goal=LIMIT_GOAL)
+    if find_spec("jax") is None:
+        yield Row(what, "JAX is not installed", alone(ours, rounds), limit=limit)
+        return
+    arrays = data.inputs[..., 0], data.measurements[..., 0]
+    parts = gcd(cores(), count)
+    for devices, name, goal in ((1, "JAX", 1 / 7), (parts, f"JAX, {parts} devices", None)):
+        estimate = partial(jax_filter(scenario.plant, TRAJECTORY_SIZE, seed, devices), *arrays)
+        check_agreement(estimates(filter_, data), estimate()[0], data.states)
+        peer = shared(estimate, steps * TRAJECTORY_SIZE)
+        yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal, limit=limit)
+
+
+def estimates(filter_: Filter, data: Data) -> np.ndarray:
+    """The means that a filter finds, (B, K + 1, n)."""
+    return run(filter_, data.filter_keys, data.inputs, data.measurements).means
+
+
+def check_agreement(ours: np.ndarray, theirs: np.ndarray, states: np.ndarray) -> None:
+    """Raise ValueError unless two filters' estimates (B, K + 1, n) are equally accurate, so that times compare."""
+    ratio = np.sqrt(np.mean((ours - states) ** 2, axis=(0, 1)) / np.mean((theirs - states) ** 2, axis=(0, 1)))
+    if np.any(np.abs(ratio - 1.0) > AGREEMENT):
+        raise ValueError(f"two ensemble filters must have the same RMSE within {AGREEMENT:.0%}, but got {ratio}")
+
+
+# The ensemble Kalman filter by hand in JAX: jit, vmap over trajectories, scan over steps, float64 on the CPU, as a
+# user of JAX would write it, but for the equations of motion, which are our own: JAX traces their operators. The
+# filter is that of `filters.ensembles`, in array code that knows no JAX, so that a test can run it on NumPy.
+
+
+class Operand(NDArrayOperatorsMixin):
+    """An array of some module under operators, whose power 1/2 is a square root.
+
+    JAX calls the general power for x**0.5, and a Runge-Kutta step takes three times as long.
+    """
+
+    def __init__(self, arrays, values):
+        self.arrays, self.values = arrays, values
+
+    def __array_ufunc__(self, ufunc, method, *inputs):
+        values = [x.values if isinstance(x, Operand) else x for x in inputs]
+        if ufunc is np.power and values[1] == 0.5:
+            return Operand(self.arrays, self.arrays.sqrt(values[0]))
+        return Operand(self.arrays, getattr(self.arrays, ufunc.__name__)(*values))
+
+
+class ArrayFilter(NamedTuple):
+    """A stochastic ensemble filter of a thruster with a thrust sensor, for members (2, N) and normals (3, N)."""
+
+    start: Callable  # start(normals, z): members drawn from the prior, updated with the first measurement
+    step: Callable  # step(members, voltage, normals, z): members moved and stirred, then updated
+    moments: Callable  # moments(members): mean (2,) and covariance (2, 2)
+
+
+def repeat(function: Callable, count: int, x):
+    """function(function(... x)), count times."""
+    for _ in range(count):
+        x = function(x)
+    return x
+
+
+def array_filter(plant: Plant, arrays, repeat: Callable = repeat) -> ArrayFilter:
+    """The filter for a plant, on the arrays of a module: numpy or jax.numpy.
+
+        x_j = f(x_j, u) + w_j,  y_j = T(x_j),  S = var(y) + R,  K = cov(x, y)/S,  x_j += K (z - v_j - y_j)
+
+    Sums of products are written out: XLA is slow at small matrix products in batches.
+    """
+    c = plant.constants
+    prior_mean = np.asarray(plant.initial_mean)[:, None]
+    prior_root, q_root = covariance_root(plant.initial_cov), covariance_root(plant.process_noise_cov)
+    (r,) = np.ravel(plant.measurement_noise_cov)
+
+    def on_components(function, x):
+        results = function(tuple(Operand(arrays, component) for component in x))
+        return arrays.stack([component.values for component in results])
+
+    def correlated(root, normals):
+        return arrays.stack([root[0, 0] * normals[0], root[1, 0] * normals[0] + root[1, 1] * normals[1]])
+
+    def update(members, normals, z):
+        predicted = on_components(lambda x: thrust_and_torque(x, c)[:1], members)[0]
+        distances = members - members.mean(axis=1, keepdims=True)
+        of_predicted, degrees = predicted - predicted.mean(), members.shape[1] - 1
+        s = (of_predicted * of_predicted).sum() / degrees + r
+        gain = (distances * of_predicted).sum(axis=1) / degrees / s
+        return members + gain[:, None] * (z - r**0.5 * normals - predicted)
+
+    def start(normals, z):
+        return update(prior_mean + correlated(prior_root, normals), normals[2], z)
+
+    def step(members, voltage, normals, z):
+        u = Operand(arrays, voltage), plant.ambient_velocity
+        members = repeat(lambda m: on_components(lambda x: substep(x, u, c), m), plant.substeps, members)
+        return update(members + correlated(q_root, normals), normals[2], z)
+
+    def moments(members):
+        mean = members.mean(axis=1)
+        distances = members - mean[:, None]
+        return mean, (distances[:, None] * distances[None]).sum(axis=2) / (members.shape[1] - 1)
+
+    return ArrayFilter(start, step, moments)
+
+
+@cache
+def _jax():
+    import jax  # an extra of the benchmarks alone
+
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_num_cpu_devices", cores())
+    jax.config.update("jax_enable_x64", True)
+    return jax
+
+
+def jax_filter(plant: Plant, size: int, seed: int, devices: int = 1) -> Callable:
+    """Return `estimate(voltages, measurements)`, compiled: what the filter finds for many trajectories.
+
+    Voltages are (B, K), measurements (B, K + 1); it returns means (B, K + 1, 2) and covariances (B, K + 1, 2, 2).
+    On one device XLA uses the cores where it sees fit; with a device a core each has its part of the trajectories.
+    """
+    jax = _jax()
+
+    def loop(function, count, x):
+        return jax.lax.fori_loop(0, count, lambda _, y: function(y), x)
+
+    filter_ = array_filter(plant, jax.numpy, loop)
+
+    def draw(key):
+        return jax.random.normal(key, (NORMALS, size))
+
+    def advance(members, scanned):
+        voltage, z, key = scanned
+        members = filter_.step(members, voltage, draw(key), z)
+        return members, filter_.moments(members)
+
+    def trajectory(key, voltages, z):
+        of_prior, of_steps = jax.random.split(key)
+        members = filter_.start(draw(of_prior), z[0])
+        first = filter_.moments(members)
+        _, later = jax.lax.scan(advance, members, (voltages, z[1:], jax.random.split(of_steps, len(voltages))))
+        return tuple(jax.numpy.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
+
+    batch = jax.jit(jax.vmap(trajectory))
+    mesh = jax.make_mesh((devices,), ("trajectories",))
+    shared = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("trajectories"))
+
+    def estimate(voltages, measurements):
+        keys = jax.random.split(jax.random.key(seed), len(voltages))
+        sharded = (jax.device_put(part, shared) for part in (keys, voltages, measurements))
+        return tuple(np.asarray(part) for part in batch(*sharded))
+
+    return estimate

@@ -1,21 +1,35 @@
-"""Single steps as a user takes them through Gymnasium: the env alone, and with a filter around it."""
+"""Steps as a user takes them through Gymnasium: the env alone, with a filter around it, and thousands at once."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib.util import find_spec
+from time import perf_counter
 
 import gymnasium as gym
 import numpy as np
 
-import thruster_env  # noqa: F401 - registers BowThruster-v0
+import thruster_env  # noqa: F401 - registers BowThruster-v0  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
-from benchmarks.rates import arithmetic_limit, step_of_env, step_of_filtered
-from benchmarks.timing import Measure, Row, seconds_a_call, side_by_side
+from benchmarks.rates import arithmetic_limit, operations_of, step_of_env, step_of_filtered
+from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.single import EstimateState
+from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.memory import set_row
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
-from thruster_env.thruster.plant import Plant
+from thruster_env.core.threads import cores, spread
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.dynamics import substep
+from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.plant import Plant, make_plant
+from thruster_env.thruster.simulation import COMMAND, SUBSTEPS, VOLTAGE, Copies, move_thruster
+from thruster_env.thruster.task import Task
 
 ENSEMBLE_SIZE = 50
+HORIZON, HORIZON_GOAL = 10, 1 / 10
 PEER_STEPS = 100  # of FilterPy's slow filters in a round; their time a step does not depend on their number
 
 
@@ -85,3 +99,154 @@ def peer_ensemble(plant: Plant, model, voltages, measurements, seed: int) -> Mea
     step = EnsembleStep(plant, ENSEMBLE_SIZE, model)
     recorded = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
     return seconds_a_call(step, recorded, step.reset)
+
+
+# Moving-horizon estimation, beside do-mpc's of the same model and window.
+
+
+def horizon_rows(seed: int, quick: bool) -> Iterator[Row]:
+    """The step, beside do-mpc's where that is installed."""
+    wrapped = EstimateState(gym.make("BowThruster-v0"), filter="mhe", horizon=HORIZON, loss="quadratic")
+    ours, what = episode(wrapped, seed), f"MHE step, L = {HORIZON}"
+    if find_spec("do_mpc") is None:
+        yield Row(what, None, alone(ours, 4 if quick else 40))
+        return
+    step, reset = do_mpc_step(thruster_model())
+    voltages, measurements = recorded_episode(seed)
+    recorded = list(zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS, 0].tolist(), strict=True))
+    peer = seconds_a_call(step, recorded, reset)
+    yield Row(what, "do-mpc", side_by_side(ours, peer, 2 if quick else 10), ratio_goal=HORIZON_GOAL)
+
+
+def do_mpc_step(model: StateSpaceModel) -> tuple[Callable[[float, float], np.ndarray], Callable[[], None]]:
+    """Functions step(u, z) and reset() of do-mpc's estimator of a model with one input and one channel."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of parts of do-mpc that are not installed
+        import do_mpc
+    import casadi
+
+    logging.getLogger("do_mpc").setLevel(logging.ERROR)
+    plant = do_mpc.model.Model("discrete", "SX")
+    x, u = plant.set_variable("_x", "x", (model.n, 1)), plant.set_variable("_u", "u")
+    propagated = tuple(casadi.vertsplit(x))
+    for _ in range(model.substeps):
+        propagated = model.transition(propagated, (u,), model.constants)
+    plant.set_meas(
+        "z", casadi.vertcat(*model.observe(tuple(casadi.vertsplit(x)), model.constants)), meas_noise=True
+    )
+    plant.set_meas("given", u, meas_noise=False)
+    plant.set_rhs("x", casadi.vertcat(*propagated), process_noise=True)
+    plant.setup()
+    estimator = do_mpc.estimator.MHE(plant, [])
+    estimator.settings.n_horizon, estimator.settings.t_step = HORIZON, 1.0
+    estimator.settings.meas_from_data = True
+    estimator.settings.supress_ipopt_output()
+    weights = (
+        np.linalg.inv(cov) for cov in (model.prior_cov, model.measurement_noise_cov, model.process_noise_cov)
+    )
+    prior, noise, disturbance = weights
+    estimator.set_default_objective(P_x=prior, P_v=noise, P_w=disturbance)
+    estimator.setup()
+
+    def reset() -> None:
+        estimator.reset_history()
+        estimator.x0 = model.prior_mean
+        estimator.set_initial_guess()
+
+    def step(voltage: float, z: float) -> np.ndarray:
+        return estimator.make_step(np.array([[z], [voltage]]))
+
+    return step, reset
+
+
+# Thousands of thrusters at once: the native vector env, and a Runge-Kutta step of its equations of motion.
+
+
+COPIES, STEPS = 8192, 200
+PROPAGATED = 65536
+LIMIT_GOAL = 1.8
+
+
+def vector_rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    rounds = 5 if quick else 40
+    ours, peer = vector_steps("BowThruster-v0", seed), vector_steps("CartPole-v1", seed)
+    timing = side_by_side(ours, peer, rounds)
+    limit = arithmetic_limit(step_of_env(gym.make("BowThruster-v0")), cores=cores())
+    yield Row(f"vector env, {COPIES} copies", "CartPole-v1", timing, ratio_goal=0.4, limit=limit)
+
+    count = operations_of(substep, np.zeros(2), (12.0, 0.0), make_plant().constants)
+    limit, timing = arithmetic_limit(count, cores=cores()), alone(propagation(), rounds)
+    yield Row(f"Runge-Kutta step, {PROPAGATED} copies", None, timing, limit=limit, limit_goal=LIMIT_GOAL)
+
+
+def memory_line() -> str:
+    """Memory of a copy, in words."""
+    env = gym.make_vec("BowThruster-v0", num_envs=COPIES)
+    return f"Memory: {env.unwrapped.bytes_per_copy} bytes a copy of the vector env while it steps."
+
+
+def vector_steps(name: str, seed: int, copies: int = COPIES, steps: int = STEPS, **arguments) -> Measure:
+    """A measure of one copy's step in a vector env of many copies under random actions."""
+    env = gym.make_vec(name, num_envs=copies, **arguments)
+    env.action_space.seed(derived_seed(seed, ACTION_SPACE))
+    actions = env.action_space.sample()
+
+    def measure() -> float:
+        env.reset(seed=seed)
+        begin = perf_counter()
+        for _ in range(steps):
+            env.step(actions)
+        return (perf_counter() - begin) / (steps * copies)
+
+    return measure
+
+
+def propagation() -> Measure:
+    """A measure of one Runge-Kutta step of one copy without noise, many copies on all cores."""
+    plant = make_plant()
+    copies = Copies(plant, Task(), PROPAGATED)
+    memory, numbers = copies.memory, copies.numbers
+    for row in (COMMAND, VOLTAGE):
+        set_row(memory, row, np.full(PROPAGATED, 12.0))
+    move, calls = _propagate(), 10
+
+    def measure() -> float:
+        begin = perf_counter()
+        spread(lambda first, last: move(memory, numbers, calls, first, last), len(memory))
+        return (perf_counter() - begin) / (calls * plant.substeps * PROPAGATED)
+
+    assert numbers[SUBSTEPS] == plant.substeps
+    return measure
+
+
+@cache
+def _propagate() -> Callable:
+    fingerprint = function_fingerprint(within=__name__)
+
+    def propagate(memory, numbers, calls, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        for b in range(first, last):
+            for _ in range(calls):
+                move_thruster(memory, b, numbers)
+
+    return compiled(propagate)
+
+
+# A filter on every copy of a vector env.
+
+
+FILTERED_COPIES, FILTERED_STEPS = 1024, 100
+
+
+def vector_filter_rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    sized = {"filter_arguments": {"ensemble_size": ENSEMBLE_SIZE}}
+    for what, name, arguments, goal in (
+        ("EKF", "filters:BowThruster-EKF-v0", {}, 16),
+        (f"EnKF, N = {ENSEMBLE_SIZE},", "filters:BowThruster-EnKF-v0", sized, 2.9),
+    ):
+        measure = vector_steps(name, seed, FILTERED_COPIES, FILTERED_STEPS, **arguments)
+        timing = alone(measure, 5 if quick else 40)
+        limit = arithmetic_limit(step_of_filtered(gym.make(name, **arguments)), cores=cores())
+        yield Row(f"{what} on {FILTERED_COPIES} copies", None, timing, limit=limit, limit_goal=goal)

@@ -16,10 +16,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.batches import floor_measures, shared
+from benchmarks.batches import estimates, floor_measures, shared
+from benchmarks.steps import vector_steps
 from benchmarks.timing import Measure
-from benchmarks.trajectories import estimates
-from benchmarks.vectors import vector_steps
 from benchmarks.vehicles import member_steps
 from thruster_env.core import optimising
 from tuning.auv.scenario import find_scenario as find_vehicles

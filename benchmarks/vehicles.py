@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.batches import shared
 from benchmarks.rates import arithmetic_limit, operations_of, step_of_filter, step_of_filtered, times
+from benchmarks.steps import vector_steps
 from benchmarks.timing import Measure, Row, alone, side_by_side
-from benchmarks.vectors import vector_steps
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep

@@ -1,4 +1,3 @@
-import importlib
 import inspect
 import json
 from pathlib import Path
@@ -7,10 +6,9 @@ import numpy as np
 import pytest
 
 import benchmarks.rates as rates_module
-from benchmarks.__main__ import PARTS, command
-from benchmarks.jax_enkf import NORMALS, array_filter
-from benchmarks.speed_page import HEADER, NO_BREAK, check_page, write_page
-from benchmarks.timing import Row, Timing
+from benchmarks.__main__ import PARTS, command, rows_of
+from benchmarks.batches import NORMALS, array_filter
+from benchmarks.timing import HEADER, NO_BREAK, Row, Timing, check_page, write_page
 from filters import EnsembleKalmanFilter, thruster_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -22,9 +20,8 @@ def test_each_part_of_the_benchmark_can_be_measured_quickly():
     """Some rows of one part; that all parts run is for the slow test."""
     pytest.importorskip("filterpy")
     for part in PARTS:
-        found = importlib.import_module(f"benchmarks.{part}")
-        assert list(inspect.signature(found.rows).parameters) == ["seed", "quick"]
-    row = next(importlib.import_module(f"benchmarks.{PARTS[0]}").rows(0, True))
+        assert list(inspect.signature(rows_of(part)).parameters) == ["seed", "quick"]
+    row = next(rows_of("steps")(0, True))
     assert row.timing.ours > 0 and row.as_json()["limit_seconds"] > 0
 
 
