@@ -25,8 +25,7 @@ from thruster_env.core.threads import cores, spread
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.data import Data
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import Data, training_seeds
 from tuning.search.space import oracle_choice
 from tuning.thruster.scenario import find_scenario
 

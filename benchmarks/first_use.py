@@ -33,7 +33,7 @@ env.step(env.action_space.high)
 TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
 from tuning.thruster.scenario import find_scenario
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 from tuning.search.space import oracle_choice
 """
 FIRST_EVALUATION = """

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.rates import arithmetic_limit, step_of_env, step_of_filtered
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from tuning.policies.setup import TrainingConfiguration
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 from tuning.thruster.scenario import find_scenario
 
 # A short training by PPO: as `thruster train` learns, and by Stable-Baselines3 as its documentation has it.
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
     """Seconds a step of a short training, as `thruster train` learns."""
     from tuning.policies.environments import make_environments
-    from tuning.policies.learn import new_model
-    from tuning.policies.torch_settings import learning
+    from tuning.policies.learn import learning, new_model
 
     model = new_model(setup, make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=native))
     return _steps_of(model, lambda: learning(model), rollouts)

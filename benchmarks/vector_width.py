@@ -22,7 +22,7 @@ from benchmarks.timing import Measure
 from benchmarks.vehicles import member_steps
 from thruster_env.core import optimising
 from tuning.auv.scenario import find_scenario as find_vehicles
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 from tuning.search.space import oracle_choice
 from tuning.thruster.scenario import find_scenario
 

@@ -23,7 +23,7 @@ from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import cores
 from tuning.auv.scenario import Scenario, find_scenario
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 
 MEMBERS, STEPS = 256, 200
 COPIES, VECTOR_STEPS = 1024, 50

@@ -21,8 +21,8 @@ from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.commands import ObserveStateVector
 from tuning.auv.scenario import Scenario, find_scenario
 from tuning.evaluation.compare import Contender, Row, compare, contender
+from tuning.problems.data import held_out_seeds
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import Choice
 
 EPISODES = 50

@@ -22,8 +22,8 @@ from tuning.api.train_estimator import FOLDER, train_estimator
 from tuning.evaluation.compare import Contender, Row, contender
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.check import data_of
+from tuning.problems.data import held_out_seeds
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import open_study, quiet_optuna, run_study

@@ -10,8 +10,7 @@ import numpy as np
 from docs.scripts import digits, subplots
 from thruster_env.core.plots import BLUE, DARK, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
-from tuning.exploring.bench import Bench
-from tuning.exploring.scenes import SCENES, Scene
+from tuning.exploring.bench import SCENES, Bench, Scene
 from tuning.exploring.view import View
 
 BAND = 1.96  # half of a 95 % interval, in standard deviations

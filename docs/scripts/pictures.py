@@ -23,7 +23,7 @@ from tuning.api.run import Tuning
 from tuning.cli.demo import FILTER, SCENARIO, before_and_after
 from tuning.cli.tune import tune
 from tuning.exploring.bench import Bench
-from tuning.exploring.page.server import Server, page_of
+from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
 from tuning.reporting.time_figures import axis_label
 from tuning.search.plan import Plan

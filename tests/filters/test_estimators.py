@@ -19,8 +19,8 @@ from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import check_keepable
+from tuning.problems.data import held_out_seeds
 from tuning.problems.parameter import Parameter
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, distributions
 from tuning.thruster.scenario import find_scenario
 

@@ -24,7 +24,7 @@ from thruster_env.graphs.programs import Place, values_of
 from tuning.auv.scenario import find_scenario as find_vehicle
 from tuning.cli.templates.filter import Template
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 from tuning.search.space import untuned_choice
 from tuning.thruster.scenario import find_scenario
 

@@ -22,7 +22,7 @@ from tuning.evaluation.evaluate import evaluate, restart_sentences
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.summary import summarised, summary
 from tuning.problems.data import Data
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.page import html_page
 from tuning.reporting.search_figures import Sketchbook
 from tuning.reporting.sections import held_out_section

@@ -22,7 +22,7 @@ from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, 
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
 KEYS = np.array([KEY])

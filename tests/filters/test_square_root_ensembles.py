@@ -19,7 +19,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import is_array
 from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
 SIZE = 9

@@ -12,7 +12,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.problems.data import checked_first_scored_step
-from tuning.search.enqueued import RESCALED
+from tuning.search.among_types import RESCALED
 from tuning.search.parameters import PRIOR_FACTORS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice

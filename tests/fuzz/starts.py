@@ -14,7 +14,7 @@ from tests.tuning.test_null_tests import EFFECTS
 from thruster_env.thruster.logged import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.identification import Identification, identify
-from tuning.thruster.identification import ThrusterFamily
+from tuning.thruster.logs import ThrusterFamily
 
 SENSORS = ("thrust", "speed")
 WIDE = 6.0  # standard errors: nobody meets that by chance in a year of attacks

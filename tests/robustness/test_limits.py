@@ -15,8 +15,8 @@ from thruster_env.thruster.parameters import TUNNEL
 from tuning.cli.simulate import command
 from tuning.experiments.thruster_papers import compare
 from tuning.policies.setup import configuration_from_json
-from tuning.problems.files import read_scenario
-from tuning.problems.seeds import held_out_seeds, training_seeds
+from tuning.problems.data import held_out_seeds, training_seeds
+from tuning.problems.find import read_scenario
 from tuning.thruster.scenario import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -12,7 +12,7 @@ from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from tuning.cli import evaluate as consistency
-from tuning.cli.tables import choice_table
+from tuning.cli.output import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison
@@ -23,9 +23,8 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.choice_words import gains
-from tuning.reporting.consistency_figures import consistency_figure
 from tuning.reporting.error_tables import comparison_table
-from tuning.reporting.search_figures import comparison_figure
+from tuning.reporting.search_figures import comparison_figure, consistency_figure
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table, numbers_table

@@ -22,9 +22,9 @@ from tuning.evaluation.compare import default_filters
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.knowledge import KNOWS, known
 from tuning.evaluation.residuals import model_error
-from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
+from tuning.problems.scenario import Steps
 from tuning.reporting.leaderboard import as_json as boards_as_json
 from tuning.search.plan import Plan
 from tuning.search.space import given_choice
@@ -204,7 +204,7 @@ def test_errors_state_the_rule_and_the_value(call, said):
 
 
 def test_beliefs_have_several_forms():
-    from tuning.problems.augmented import unknowns_of
+    from tuning.problems.assumed import unknowns_of
 
     mine = Unknown(0.2)
     assert unknowns_of(["a", "b"]) == {"a": None, "b": None} == unknowns_of({"a": None, "b": None})

@@ -12,7 +12,7 @@ from tests.models import scalar_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned
 from tuning.policies.setup import make_configuration
-from tuning.problems.augmented import AugmentedProblem, augmented, name_and_unknown, unknowns_of
+from tuning.problems.assumed import AugmentedProblem, augmented, name_and_unknown, unknowns_of
 from tuning.problems.find import find_given, find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter

@@ -19,14 +19,14 @@ from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.excitation import Steps
-from tuning.problems.model_problem import ModelProblem
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import ModelProblem, RunsProblem
+from tuning.problems.scenario import Steps
 from tuning.search import trials as tuning_trials
 from tuning.search.among_types import (
     ESTIMATED,
     ESTIMATED_Q,
     NEAR_BEST,
+    RESCALED,
     SMALLER,
     TRANSFERRED,
     UNTUNED,
@@ -35,8 +35,6 @@ from tuning.search.among_types import (
     race_of,
     trials_of_type,
 )
-from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.enqueued import RESCALED
 from tuning.search.gradient_noise import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import (
@@ -48,7 +46,15 @@ from tuning.search.space import (
     untuned_choice,
 )
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import best_trial, is_over_budget, violation
+from tuning.search.trials import (
+    BUDGET,
+    COST,
+    best_trial,
+    is_over_budget,
+    microseconds_a_step,
+    over_budget,
+    violation,
+)
 from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")

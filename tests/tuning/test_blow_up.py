@@ -10,7 +10,7 @@ from filters.consistency.verdicts import sentences
 from thruster_env.model.affine import affine_model
 from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.evaluate import check_consistency
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 
 
 def model(factor, r=1e9):

@@ -19,7 +19,7 @@ from tuning.methods.correlations import stationary, steady_gain
 from tuning.methods.registry import ALONE, METHODS, find_method
 from tuning.methods.task import Budget, Task
 from tuning.problems.find import find_problem
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.search.objectives import reported, reported_name
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import given_choice, untuned_choice

@@ -17,9 +17,9 @@ from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.knowledge import belief_sentences
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.augmented import beliefs_of, default_belief
+from tuning.problems.assumed import beliefs_of, default_belief
+from tuning.problems.data import held_out_seeds
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.linear_problem import LinearProblem
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.search import compiling
 from tuning.search.compiling import compile_filters
 from tuning.search.plan import TRAINING_SEEDS, Plan

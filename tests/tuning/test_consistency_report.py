@@ -24,8 +24,8 @@ from tests.models import scalar_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.problems.seeds import held_out_seeds
-from tuning.reporting.consistency_figures import consistency_figure
+from tuning.problems.data import held_out_seeds
+from tuning.reporting.search_figures import consistency_figure
 from tuning.thruster.scenario import find_scenario
 
 

@@ -13,7 +13,7 @@ from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.runs import _means_over_steps
 from tuning.evaluation.summary import summary
 from tuning.problems import data as in_parts
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
 from tuning.thruster.scenario import find_scenario
 

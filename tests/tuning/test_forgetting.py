@@ -18,10 +18,9 @@ from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence, warnings_of
-from tuning.problems.augmented import augmented
+from tuning.problems.assumed import augmented
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.model_problem import ModelProblem
-from tuning.problems.runs_problem import log_of
+from tuning.problems.model_problem import ModelProblem, log_of
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan

@@ -12,12 +12,11 @@ from tests.tuning.test_unequal_runs import MODEL, runs_of
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import ensemble_sizes, few_seeds_first
 from tuning.evaluation.tuned import verify
+from tuning.problems.model_problem import RunsProblem
 from tuning.problems.parameter import Parameter
-from tuning.problems.runs_problem import RunsProblem
 from tuning.search.plan import Plan
-from tuning.search.pruning import BLOCK
 from tuning.search.space import choice_of, untuned_choice
-from tuning.search.trials import measure, shares
+from tuning.search.trials import BLOCK, measure, shares
 
 LENGTHS = (30, 41, 33, 52, 26, 45, 38, 44, 59, 31, 36, 48, 29, 40, 35, 27, 43, 34, 39)  # ten for training
 

@@ -15,7 +15,7 @@ from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.problem import log_problem
 from tuning.problems.log_problem import MEASURED
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.search.space import untuned_choice
 
 CART = affine_model(

@@ -14,7 +14,7 @@ from tuning.identification import identify
 from tuning.identification.objective import kept_variance, lost_information
 from tuning.identification.result import NullTest
 from tuning.problems.parameter import Parameter
-from tuning.thruster.identification import ThrusterFamily
+from tuning.thruster.logs import ThrusterFamily
 
 EFFECTS = (
     "lag_speed",

@@ -11,7 +11,7 @@ from tests.linear_problem import LinearProblem
 from tuning.cli.tuning_report import _band_sentence
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.runs import RunMetrics, variance_ratios
-from tuning.reporting.alternatives import of_front, of_history
+from tuning.reporting.page import of_front, of_history
 from tuning.reporting.search_figures import draw_history
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured

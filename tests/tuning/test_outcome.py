@@ -11,7 +11,7 @@ from filters.consistency.intervals import Interval
 from tuning.cli.main import main
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.sizes import SizeRow, sufficient_size
-from tuning.search.enqueued import BASELINE
+from tuning.search.among_types import BASELINE
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage

@@ -7,7 +7,7 @@ import optuna
 import pytest
 from scipy import stats
 
-from tuning.search.pruning import BLOCK, P_THRESHOLD, PairedPruner, critical_rank_sum, positive_rank_sum
+from tuning.search.trials import BLOCK, P_THRESHOLD, PairedPruner, critical_rank_sum, positive_rank_sum
 
 
 def pruner_of_optuna():

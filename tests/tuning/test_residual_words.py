@@ -13,7 +13,7 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.regression import log_densities
 from tuning.evaluation.summary import comparison_as_data
 from tuning.problems.find import find_problem
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.choice_words import (
     MADE_UP,
     consistency_of,

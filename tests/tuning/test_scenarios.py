@@ -9,7 +9,7 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState, run
 from filters.bounds import riccati_covariances
 from thruster_env.thruster.model import model_of_plant
-from tuning.problems.seeds import held_out_seeds, training_seeds
+from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
 from tuning.thruster.scenario import SCENARIOS, computed_scale, find_scenario, main
 

@@ -13,15 +13,14 @@ from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.search import trials
-from tuning.search.enqueued import MAXIMUM_LIKELIHOOD_AFTER, RESCALED
+from tuning.search.among_types import MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.plan import Plan
-from tuning.search.pruning import BLOCK
 from tuning.search.samplers import SAMPLERS, box, make_sampler
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import best_trial, enqueue_new, measure, violation
+from tuning.search.trials import BLOCK, best_trial, enqueue_new, measure, violation
 from tuning.thruster.scenario import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))

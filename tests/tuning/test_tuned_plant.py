@@ -26,7 +26,7 @@ from tuning.evaluation.tuned import read_tuned, verify
 from tuning.logs.problem import log_problem, problems_in
 from tuning.logs.read import as_tuned
 from tuning.policies.setup import make_configuration
-from tuning.problems.files import scenario_of
+from tuning.problems.find import scenario_of
 from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan
 from tuning.thruster.scenario import SCENARIOS, find_scenario

@@ -16,7 +16,7 @@ from tuning.likelihood.identifiability import identify
 from tuning.problems.check import check_data, checked_problem
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.runs_problem import RunsProblem, log_of
+from tuning.problems.model_problem import RunsProblem, log_of
 from tuning.reporting.time_figures import one_run
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice

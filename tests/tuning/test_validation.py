@@ -30,19 +30,26 @@ from tuning.evaluation.baselines import (
     scaled_default,
 )
 from tuning.evaluation.tuned import read_tuned
-from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
+from tuning.problems.scenario import Steps
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.units import apart
 from tuning.search import validation
-from tuning.search.enqueued import BASELINE
+from tuning.search.among_types import BASELINE
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters
-from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
-from tuning.search.ranges import at_ends, range_warning, range_words
+from tuning.search.plan import (
+    HELD_OUT_SEEDS,
+    TRAINING_SEEDS,
+    VALIDATION_SEEDS,
+    Plan,
+    at_ends,
+    range_warning,
+    range_words,
+)
 from tuning.search.samplers import is_local, near
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study

@@ -204,7 +204,7 @@ class Number:
         if isinstance(other, Number):
             return as_number(other)
         if isinstance(other, (int, float, np.generic)) or isinstance(other, np.ndarray) and not other.shape:
-            return self.graph.constant(other)
+            return self.graph.constant(float(other))
         return None
 
     __add__, __radd__ = _in_both_orders(total)

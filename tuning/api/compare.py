@@ -23,9 +23,8 @@ from thruster_env.core.text_tables import TITLE, plain_text, verbatim
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of
 from tuning.api.problems import given_for, is_filter, problems_of
-from tuning.api.progress import console_for, row_bar
+from tuning.api.progress import about, console_for, drawn, frame, html, number, row_bar
 from tuning.api.run import MOST_TRIALS
-from tuning.api.showing import about, drawn, frame, html, number
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
 from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import (
@@ -43,7 +42,7 @@ from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.knowledge import OF_FILE, OF_FILTER, STUDY, STUDY_TRIALS, noise_sentence
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
-from tuning.problems.augmented import Unknowns, constants_in, suited, unknowns_of
+from tuning.problems.assumed import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import report
 from tuning.search.plan import HELD_OUT_SEEDS

@@ -21,7 +21,7 @@ from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.checks import short_repr
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_columns
-from tuning.api.showing import drawn, frame, html, number
+from tuning.api.progress import drawn, frame, html, number
 from tuning.logs.problem import name_of
 from tuning.logs.read import as_tuned, model_of_logs, read_named
 

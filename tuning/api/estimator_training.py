@@ -15,12 +15,12 @@ from filters.filter import Filter
 from filters.logs.figure import colour_of
 from thruster_env.core.plots import panels
 from thruster_env.core.text_tables import plain_text, table, verbatim
-from tuning.api.showing import about, drawn, frame, html, number
+from tuning.api.progress import about, drawn, frame, html, number
 from tuning.evaluation.baselines import ORACLE
 from tuning.learning.training import HELD_OUT, LONGER, NOISIER, Check, Standing
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Table as PageTable
-from tuning.reporting.training_report import write_training_report
+from tuning.reporting.report import write_training_report
 
 if TYPE_CHECKING:
     import pandas

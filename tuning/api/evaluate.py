@@ -11,7 +11,7 @@ from tuning.api.progress import console_for
 from tuning.api.study import Study, is_own, user_choice
 from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
-from tuning.problems.augmented import constants_in, suited
+from tuning.problems.assumed import constants_in, suited
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice

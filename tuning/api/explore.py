@@ -13,7 +13,7 @@ from tuning.api.study import Study, is_own
 from tuning.exploring.bench import Bench
 
 if TYPE_CHECKING:
-    from tuning.exploring.page.server import Server
+    from tuning.exploring.page.session import Server
 
 HEIGHT = 900  # [px] in a notebook
 NEEDS = "tuning.explore must have Bokeh: pip install 'thruster-env[explore]'"
@@ -93,7 +93,7 @@ class Explorer:
 
     def _made(self, port: int, *, ends_when_left: bool) -> Server:
         try:
-            from tuning.exploring.page.server import Server, page_of
+            from tuning.exploring.page.session import Server, page_of
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(NEEDS, name=error.name) from error
         return Server(page_of(self.bench, self.seeds), port=port, ends_when_left=ends_when_left)

@@ -14,8 +14,7 @@ from filters.estimators.find import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import plain_text
-from tuning.api.progress import working
-from tuning.api.showing import about, drawn, frame, html, number
+from tuning.api.progress import about, drawn, frame, html, number, working
 from tuning.evaluation.baselines import RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
@@ -176,7 +175,7 @@ class HeldOut:
         Raises:
             ValueError: for a filter without a covariance.
         """
-        from tuning.reporting.consistency_figures import draw_consistency
+        from tuning.reporting.search_figures import draw_consistency
 
         title = f"{label_of(self.choice.name)} on {len(self.seeds)} seeds of {self.problem.name}"
         scored = self.evaluation.scored or None

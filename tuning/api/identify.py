@@ -14,15 +14,13 @@ from rich.console import Console
 from thruster_env.core.checks import short_repr
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.api.progress import console_for
-from tuning.api.showing import drawn, frame, html
+from tuning.api.progress import console_for, drawn, frame, html
 from tuning.identification.family import with_ranges
-from tuning.identification.identify import STARTS
+from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import Validation, fall_sentence, profile_figure, profiles, validate
 from tuning.identification.result import Identification
-from tuning.identification.screening import check_excitation
 from tuning.logs.identify import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import model_of_logs
 from tuning.problems.parameter import Coordinates, Parameter

@@ -19,9 +19,8 @@ from tuning.evaluation.summary import sizes_as_data
 from tuning.problems.problem import Problem
 from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file
-from tuning.search.enqueued import SIZES
-from tuning.search.quiet import quiet_optuna
-from tuning.search.storage import open_storage, storage_text
+from tuning.search.among_types import SIZES
+from tuning.search.storage import open_storage, quiet_optuna, storage_text
 
 STUDIES = "out/studies.journal"  # where studies are unless it is told
 

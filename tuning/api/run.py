@@ -28,20 +28,16 @@ from tuning.likelihood.gradient import OF_STATES, GradientResult, tune_by_gradie
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
 from tuning.methods.task import Budget, Refused, Task
-from tuning.problems.assumed import AssumedProblem
-from tuning.problems.augmented import within
+from tuning.problems.assumed import AssumedProblem, within
 from tuning.problems.data import Data
-from tuning.problems.plant_packages import built_in
+from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
 from tuning.search.compiling import compile_filters
-from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
 from tuning.search.objectives import LIKELIHOOD, SCORE, reported, reported_name
 from tuning.search.parameters import R
-from tuning.search.plan import HELD_OUT_SEEDS, Plan
-from tuning.search.quiet import quiet_optuna
-from tuning.search.ranges import range_warning
+from tuning.search.plan import HELD_OUT_SEEDS, Plan, range_warning
 from tuning.search.space import (
     AUTO,
     Choice,
@@ -51,7 +47,7 @@ from tuning.search.space import (
     untuned_choice,
     within_ranges,
 )
-from tuning.search.storage import open_storage
+from tuning.search.storage import open_storage, quiet_optuna
 from tuning.search.study import (
     FINISHED,
     OnTrial,
@@ -62,6 +58,7 @@ from tuning.search.study import (
     open_study,
     run_study,
     run_trials,
+    stop_on_interrupt,
 )
 from tuning.search.trials import run_trial
 from tuning.search.validation import as_data

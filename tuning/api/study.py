@@ -19,13 +19,11 @@ from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.held_out import HeldOut
 from tuning.api.problems import problems_of
-from tuning.api.progress import console_for
+from tuning.api.progress import about, console_for, drawn, frame, html, number
 from tuning.api.run import Tuning, aim_of, run_tuning, sampler_of, with_budget
-from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import tuning_effect
-from tuning.problems.assumed import as_argument, rows_argument
-from tuning.problems.augmented import augmented, unknowns_of
+from tuning.problems.assumed import as_argument, augmented, rows_argument, unknowns_of
 from tuning.problems.problem import Problem, score_label
 from tuning.search.objectives import reported, reported_name
 from tuning.search.plan import Plan

@@ -26,8 +26,8 @@ from tuning.evaluation.tuned import read_choice
 from tuning.learning.settings import Settings
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
-from tuning.search.interruption import STOPPING, stop_on_interrupt
 from tuning.search.plan import HELD_OUT_SEEDS, VALIDATION_SEEDS
+from tuning.search.study import STOPPING, stop_on_interrupt
 
 if TYPE_CHECKING:
     from filters.learned.estimator import LearnedEstimator

@@ -25,8 +25,7 @@ from tuning.cli.options import (
     SeedOption,
     filter_option,
 )
-from tuning.cli.output import announce_compilation, working
-from tuning.cli.problems import PROBLEMS
+from tuning.cli.output import PROBLEMS, announce_compilation, working
 from tuning.exploring.bench import Bench
 from tuning.search.storage import is_alive
 
@@ -85,7 +84,7 @@ def command(
     """
     bench = _bench(file, filter_name, scenario, logs, reading, seed)
     try:
-        from tuning.exploring.page.server import Server, page_of
+        from tuning.exploring.page.session import Server, page_of
     except ModuleNotFoundError as error:
         raise ValueError(NEEDS.replace("tuning.explore", "thruster explore")) from error
     announce_compilation()

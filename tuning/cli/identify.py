@@ -45,7 +45,7 @@ from tuning.logs.identify import family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs, read_named
 from tuning.problems.parameter import Parameter
 from tuning.search.parameters import index_pairs
-from tuning.thruster.identification import ThrusterFamily
+from tuning.thruster.logs import ThrusterFamily
 
 # What `thruster identify` prints and writes.
 

@@ -22,12 +22,11 @@ from tuning.cli.options import (
     filter_option,
     spelt,
 )
-from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
-from tuning.cli.problems import PROBLEMS
+from tuning.cli.output import PROBLEMS, announce_compilation, check_targets, emit, progress_console
 from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.tuned import check_keepable
 from tuning.methods.registry import DEFAULT, METHODS
-from tuning.problems.augmented import augmented, unknowns_of
+from tuning.problems.assumed import augmented, unknowns_of
 from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
 

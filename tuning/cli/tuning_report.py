@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from filters.consistency.intervals import slightly, span
 from thruster_env.core.modules import is_code
 from tuning.api.run import Tuning
-from tuning.cli.tables import choice_table, front_table, gradient_table, kinds_table
+from tuning.cli.output import choice_table, front_table, gradient_table, kinds_table
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -34,16 +34,15 @@ from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
-from tuning.problems.augmented import within
-from tuning.problems.plant_packages import built_in
+from tuning.problems.assumed import within
+from tuning.problems.find import built_in
 from tuning.reporting.choice_words import consistency_sentence, gains, model_doubts, residual_sentences
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.units import apart
 from tuning.search.among_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs, size_ladder
-from tuning.search.plan import Plan
-from tuning.search.ranges import at_ends, range_words
+from tuning.search.plan import Plan, at_ends, range_words
 from tuning.search.space import parameters_of
 from tuning.search.study import StudyResult
 from tuning.search.trials import is_over_budget

@@ -30,14 +30,14 @@ from tuning.evaluation.evaluate import (
 )
 from tuning.evaluation.knowledge import KNOWLEDGE, STUDY_TRIALS, Known, known
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
-from tuning.problems.augmented import beliefs_of
+from tuning.problems.assumed import beliefs_of
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.forgetting import time_constants_on
-from tuning.search.interruption import stop_on_interrupt
 from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.space import Choice
+from tuning.search.study import stop_on_interrupt
 
 VERDICTS = {  # in sentences
     "better": "better than",

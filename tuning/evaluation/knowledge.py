@@ -26,8 +26,8 @@ from tuning.search.measures import measured
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.plan import Plan
-from tuning.search.quiet import quiet_optuna
 from tuning.search.space import Choice, has_search_space
+from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_trials
 from tuning.search.trials import best_trial
 

@@ -22,9 +22,8 @@ from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.runs import state_errors
 from tuning.experiments import BENCHMARKS
-from tuning.problems.data import Data
+from tuning.problems.data import Data, held_out_seeds
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 

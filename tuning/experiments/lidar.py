@@ -29,7 +29,7 @@ from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
 from tuning.methods.registry import find_method
 from tuning.methods.task import Task
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 from tuning.search.space import Choice, untuned_choice
 
 RANGE, BEARING = 2.0, np.deg2rad(1.5)  # deviations [m, rad]

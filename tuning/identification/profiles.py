@@ -26,7 +26,7 @@ from tuning.identification.result import Identification
 from tuning.identification.starts import estimates_of, starts_of
 from tuning.likelihood.identifiability import SIGNIFICANT
 from tuning.problems.data import Data
-from tuning.search.interruption import stop_on_interrupt
+from tuning.search.study import stop_on_interrupt
 
 REACH = (0.75, 1.5, 2.5)  # standard errors at which a parameter is held
 WIDE = 10.0  # ends of a range whose ratio is beyond this are told apart on a logarithmic axis alone

@@ -13,7 +13,7 @@ from thruster_env.core.checks import short_repr
 from thruster_env.env.record import read_for
 from thruster_env.logs.log import Log
 from tuning.logs.read import check_model, read_named, texts
-from tuning.problems.augmented import name_and_unknown
+from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem

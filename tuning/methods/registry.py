@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from thruster_env.core.checks import one_of
-from tuning.methods.adaptive import anderson, sage_husa, vb
 from tuning.methods.correlations import als, desroziers, mehra
-from tuning.methods.em import em, squarem
-from tuning.methods.method import COVARIANCE, GRADIENT, INFLATION, LINEAR, MODEL, NOISE, NUTPIE, TRUTH, Method
+from tuning.methods.em import em, maximum_a_posteriori, nuts, posterior, squarem
 from tuning.methods.okf import masked, okf
-from tuning.methods.posterior import maximum_a_posteriori, nuts, posterior
-from tuning.methods.scoring import noise_estimation, scoring
-from tuning.methods.searches import SLOWER, ascend, coordinate_steps, nelder_mead, sample
+from tuning.methods.scoring import (
+    COVARIANCE,
+    GRADIENT,
+    INFLATION,
+    LINEAR,
+    MODEL,
+    NOISE,
+    NUTPIE,
+    TRUTH,
+    Method,
+    noise_estimation,
+    scoring,
+)
+from tuning.methods.searches import SLOWER, anderson, ascend, coordinate_steps, nelder_mead, sage_husa, sample, vb
 from tuning.methods.task import Task
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 

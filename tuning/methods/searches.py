@@ -1,4 +1,7 @@
-"""Methods by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts."""
+"""Methods by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts.
+
+Adaptive filters run until they have converged: their mean Q and R, kept constant from then on.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,17 @@ import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution
 
+from filters import make_filter
+from filters.engine.session import Session
+from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.gradient import optimum, start_at, starts_of
+from tuning.methods.scoring import INFLATION
 from tuning.methods.task import Task
 from tuning.problems.parameter import Coordinates
-from tuning.search.quiet import quiet_optuna
+from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice
+from tuning.search.storage import quiet_optuna
 
 
 def ascend(objective: str) -> Callable[[Task], None]:
@@ -160,3 +168,129 @@ def sample(sampler: str, objective: str | None = None, slower: int | None = None
                 task.keep(choice)
 
     return run
+
+
+FORGETTING = 0.995  # of Q and R a step
+
+
+def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
+    """The method that runs an adaptive filter over each training run in turn, from the values of the last one.
+
+    What a run finds is the mean over its second half of the filter's R, and of its Q where it learns that. In the
+    end it is the mean over the second half of the runs.
+    """
+
+    def run(task: Task) -> None:
+        model = task.model(task.start)
+        q, r = model.process_noise_cov, model.measurement_noise_cov
+        estimates: list[tuple[np.ndarray, np.ndarray]] = []
+        for i, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
+            for index in range(len(data.seeds)):
+                try:
+                    model = task.model(task.start, i).replace(process_noise_cov=q, measurement_noise_cov=r)
+                    q, r = _means(make_filter(name, model, **numbers), data.one(index))
+                except ValueError:  # a belief that is none
+                    raise ValueError(
+                        f"method {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
+                    ) from None
+                task.charge(1)
+                estimates.append((q, r))
+                half = estimates[len(estimates) // 2 :]
+                means = (np.mean([estimate[side] for estimate in half], axis=0) for side in (0, 1))
+                task.keep(with_covariances(task.start, *_diagonals(task, *means)))
+
+    return run
+
+
+def _means(filter_, data) -> tuple[np.ndarray, np.ndarray]:
+    """Mean Q (n, n) and R (m, m) over the second half of a run."""
+    belief, qs, rs = filter_.init(), [], []
+    for k in range(data.measurements.shape[1]):
+        if k:
+            belief = filter_.predict(belief, data.inputs[0, k - 1])
+        belief, _ = filter_.update(belief, data.measurements[0, k])
+        if 2 * k >= data.measurements.shape[1]:
+            rs.append(filter_.estimated_noise(belief))
+            learns = hasattr(filter_, "estimated_process_noise")
+            qs.append(filter_.estimated_process_noise(belief) if learns else filter_.model.process_noise_cov)
+    return np.mean(qs, axis=0), np.mean(rs, axis=0)
+
+
+def _diagonals(task: Task, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Q and R without correlations, unless these are tuned."""
+    q = q if task.options.get("full_q") or not task.start.model else np.diag(np.diag(q))
+    if task.options.get("hold_r"):
+        return q, None
+    return q, r if task.options.get("full_r") else np.diag(np.diag(r))
+
+
+sage_husa = converged("sage-husa", {"forgetting_factor": FORGETTING, "process_forgetting_factor": FORGETTING})
+vb = converged("vb", {"forgetting_factor": FORGETTING})
+
+
+# Adaptive inflation of an ensemble, after Anderson: from each innovation, and then its mean over all steps.
+
+
+DEVIATION = 0.1  # s at the beginning: how well lambda is known
+LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
+NEWTON = 8  # steps to the mode
+SETTLED = 0.25  # part of a run whose lambdas do not count
+
+
+def anderson(task: Task) -> None:
+    """Follow the factor lambda on the members' variance from innovation to innovation; then take its mean root.
+
+        d ~ N(0, lambda p + R_jj),   p = (S_jj - R_jj) / lambda before,   lambda ~ N(l, s^2)
+        l <- the mode of lambda given d,   1/s^2 <- the curvature of the log density there
+
+    for one channel after the other. The next step has it. Q and R stay; a spread that is too small because Q is
+    shows here, too. It needs one pass of the filter, step by step.
+
+    Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
+    Tellus A 59, with a lambda for all states alike; Anderson (2009), Tellus A 61.
+    """
+    parameter, levels_of_runs, start = (
+        FILTER_PARAMETERS[INFLATION],
+        [],
+        1.0 + 1e-9,
+    )  # so that there is one to change
+    choice = task.start._replace(numbers={**task.start.numbers, INFLATION: start})
+    for i, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        filter_, variances = choice.filter(problem), np.diag(task.model(choice, i).measurement_noise_cov)
+        for run in range(len(data.seeds)):
+            session, level, spread = Session(filter_), 1.0, DEVIATION
+            inputs, z = data.seen.inputs[run], data.seen.measurements[run]
+            session.start(data.filter_keys[run], z[0])
+            levels = []
+            for k in range(1, int(data.rows[run])):
+                session.set_parameter(INFLATION, level**0.5)
+                session.step(inputs[k - 1], z[k])
+                plain = (np.diag(session.innovation_cov) - variances) / level
+                for d, p, r in zip(session.innovation, plain, variances, strict=True):
+                    if d == d and d != 0.0 and p > 0.0:
+                        level, spread = updated(level, spread, d * d, p, r)
+                levels.append(level)
+            task.charge(1)
+            levels_of_runs += levels[int(SETTLED * len(levels)) :]
+    mean = float(np.clip(np.sqrt(levels_of_runs).mean(), parameter.low, parameter.high))
+    task.keep(task.start._replace(numbers={**task.start.numbers, INFLATION: mean}))
+
+
+def updated(level: float, spread: float, square: float, plain: float, noise: float) -> tuple[float, float]:
+    """Mode and deviation of lambda after an innovation with this square, by Newton's method with safe steps.
+
+    Args:
+        level: mean of lambda before.
+        spread: its standard deviation before.
+        square: d^2.
+        plain: variance p of what the members expect, without inflation.
+        noise: variance of the measurement.
+    """
+    at, curvature = level, 1.0 / spread**2
+    for _ in range(NEWTON):
+        total = at * plain + noise
+        slope = (level - at) / spread**2 + 0.5 * plain * (square - total) / total**2
+        # The expected curvature: always positive, so that each step climbs.
+        curvature = 1.0 / spread**2 + 0.5 * (plain / total) ** 2
+        at = max(at + slope / curvature, 0.25 * at)
+    return at, max(curvature**-0.5, LEAST_DEVIATION)

@@ -52,10 +52,9 @@ from tuning.policies.learn import train
 from tuning.policies.plants import Part
 from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load, score
 from tuning.policies.setup import TrainingConfiguration, make_configuration
-from tuning.problems.seeds import held_out_seeds
-from tuning.search.interruption import without_interrupts
+from tuning.problems.data import held_out_seeds
 from tuning.search.plan import Plan
-from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.search.study import open_study, quiet_optuna, run_study, without_interrupts
 from tuning.thruster.scenario import Scenario, find_scenario
 
 TASK = "manoeuvre"

@@ -37,7 +37,7 @@ from tuning.policies.environments import episode_steps, make_environments, make_
 from tuning.policies.observations import box_of
 from tuning.policies.plants import Part, TrainingPlant, plant_of
 from tuning.policies.setup import TrainingConfiguration, configuration_from_json
-from tuning.problems.seeds import training_seeds
+from tuning.problems.data import training_seeds
 
 SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
 FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"

@@ -14,7 +14,7 @@ import numpy as np
 from filters.consistency.time_constants import Run
 from thruster_env.model.quantities import Quantities
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems import seeds
+from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
 from tuning.problems.parameter import Parameter
 

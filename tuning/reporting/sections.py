@@ -23,11 +23,19 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.summary import versions
 from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
-from tuning.problems.augmented import within
+from tuning.problems.assumed import within
+from tuning.problems.find import built_in
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem, score_label
-from tuning.reporting.alternatives import (
+from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
+from tuning.reporting.matlab import matlab_function
+from tuning.reporting.page import (
+    Code,
+    Part,
+    Picture,
+    Section,
+    Table,
+    Words,
     of_comparison,
     of_estimates,
     of_front,
@@ -37,15 +45,12 @@ from tuning.reporting.alternatives import (
     of_sizes,
     of_slices,
 )
-from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
-from tuning.reporting.consistency_figures import draw_consistency
-from tuning.reporting.matlab import matlab_function
-from tuning.reporting.page import Code, Part, Picture, Section, Table, Words
 from tuning.reporting.search_figures import (
     FEWEST_TRIALS,
     Sketchbook,
     counted_trials,
     draw_comparison,
+    draw_consistency,
     draw_front,
     draw_history,
     draw_importance,
@@ -59,8 +64,7 @@ from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innov
 from tuning.search.among_types import filter_types_tried, trials_of_type
 from tuning.search.objectives import NIS_BAND, find_objective, reported_about, reported_name
 from tuning.search.parameters import index_pairs
-from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
-from tuning.search.ranges import range_warning, range_words
+from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan, range_warning, range_words
 from tuning.search.space import AUTO, Choice
 
 MANY_TRIALS = 50

@@ -15,7 +15,7 @@ from tuning.evaluation.summary import versions
 from tuning.evaluation.tuned import problem_in, read_tuned
 from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
-from tuning.search.enqueued import SIZES
+from tuning.search.among_types import SIZES
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice
 from tuning.search.storage import open_storage, public_url

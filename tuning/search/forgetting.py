@@ -22,8 +22,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.registry import make_filter
 from filters.tuned_file import NOISE, PRIOR
-from tuning.problems.assumed import rows_argument
-from tuning.problems.augmented import constants_in
+from tuning.problems.assumed import constants_in, rows_argument
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice, oracle_choice, untuned_choice
 

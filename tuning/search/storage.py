@@ -1,6 +1,8 @@
 """Where studies live: a journal file by default, made safe to resume; a database for several machines.
 
 Only a study in a database loads SQLAlchemy, which takes a tenth of a second.
+
+Suppress Optuna's messages in programs that show their own progress.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ import re
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, suppress
 from functools import wraps
 from itertools import count
 from pathlib import Path
@@ -511,3 +513,14 @@ def is_alive(process: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+@contextmanager
+def quiet_optuna() -> Iterator[None]:
+    """Within this context Optuna reports only errors, since we show our own progress."""
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        yield
+    finally:
+        optuna.logging.set_verbosity(before)

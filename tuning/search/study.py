@@ -1,31 +1,85 @@
 """Optuna studies of a filter's parameters, with common random numbers for all trials.
 
 NIS is the normalised innovation squared.
+
+Ctrl-C during long work: the first one asks for an end, the second one forces it.
 """
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from thruster_env.core.progress import tell
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
-from tuning.search.among_types import choose_type_by_race, is_race
-from tuning.search.cost import COST
-from tuning.search.enqueued import enqueue_after, enqueue_what_is_left, sized, sizes_of
-from tuning.search.interruption import stop_on_interrupt
+from tuning.search.among_types import (
+    choose_type_by_race,
+    enqueue_after,
+    enqueue_what_is_left,
+    is_race,
+    sized,
+    sizes_of,
+)
 from tuning.search.measures import measured
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.samplers import give_sampler, make_sampler
 from tuning.search.space import Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
-from tuning.search.trials import best_trial, cost_of, is_consistent, make_pruner, measure, run_trial
+from tuning.search.trials import COST, best_trial, cost_of, is_consistent, make_pruner, measure, run_trial
 from tuning.search.validation import Validation, as_data, finalists_of, validate
+
+STOPPING = "stopping after the running task; Ctrl-C again stops at once"
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Within this context the first Ctrl-C makes the yielded function return True, with a message to listeners.
+
+    An exception within compiled code or a storage's lock could get lost or leave the lock behind. Outside the main
+    thread, where Python delivers no signals, this has no effect.
+    """
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number, frame):
+        caught.append(number)
+        signal.signal(signal.SIGINT, before)
+        tell(STOPPING)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(caught)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Within this context Ctrl-C waits, and new processes ignore it: their parent ends them.
+
+    Otherwise they would receive it while they load packages, and each would print a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints

@@ -178,8 +178,8 @@ def validate(
     raised = {name for name, choice in before.items() if not same_filter(choice, baselines[name])}
     exact: set[str] = set()
     while True:  # until those that the choice is about forget in time by their own gain
-        sides = [{name: results[name] for name in side} for side in (before, finalists)]
-        validation = _chosen(plan, everyone, *sides, on_training, data[0].seeds, has_own_seeds)
+        present, proposed = ({name: results[name] for name in side} for side in (before, finalists))
+        validation = _chosen(plan, everyone, present, proposed, on_training, data[0].seeds, has_own_seeds)
         rest = {validation.chosen, validation.baseline, validation.candidate} - exact
         if plan.forget is None or not rest:
             break

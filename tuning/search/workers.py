@@ -26,15 +26,22 @@ import optuna
 
 from thruster_env.core.modules import as_module, working_folder_last
 from thruster_env.core.threads import cores
-from tuning.problems.augmented import within
+from tuning.problems.assumed import within
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
-from tuning.search.interruption import stop_on_interrupt, without_interrupts
 from tuning.search.plan import Plan
 from tuning.search.storage import drop_waiting, open_storage, retry_orphans, this_process
-from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
+from tuning.search.study import (
+    OnTrial,
+    finished_trials,
+    open_study,
+    quiet_optuna,
+    run_trials,
+    stop_on_interrupt,
+    without_interrupts,
+)
 
 # Processes beside this one that work for a study: started, told its plan in a line of JSON, and ended.
 

@@ -1,23 +1,33 @@
-"""Logs of a thruster with its model, and scenarios of another thruster than the default one."""
+"""Logs of a thruster with its model, and scenarios of another thruster than the default one.
+
+The parameters of a thruster that may be free in `thruster identify`, and the model for their values.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
-from thruster_env.logs.log import Log
+from thruster_env.core.checks import short_repr
+from thruster_env.logs.grid import NEIGHBOURS
+from thruster_env.logs.log import Log, at_offset
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.env import ModelledThruster
-from thruster_env.thruster.logged import NO_BAND, logged_plant, with_recorder
+from thruster_env.thruster.logged import NO_BAND, Recorder, lag_weights, logged_plant, with_recorder
 from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked
+from thruster_env.thruster.plant import Plant
 from thruster_env.thruster.preset_file import is_file, read_preset
-from tuning.problems.files import FILE_SEQUENCES
+from tuning.problems.find import FILE_SEQUENCES
+from tuning.problems.parameter import Parameter, squared
 from tuning.problems.problem import Problem
 from tuning.problems.scenario import BaseScenario
+from tuning.search.parameters import r_name
 
 DEFAULT_PRESET = "tunnel"
 FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # free parameters by default
@@ -90,7 +100,7 @@ def family_of_preset(
     *,
     noise: bool,
 ):
-    """The thruster of a preset whose parameters are free, `tuning.thruster.identification.ThrusterFamily`.
+    """The thruster of a preset whose parameters are free, `tuning.thruster.logs.ThrusterFamily`.
 
     Args:
         logs: training logs.
@@ -99,8 +109,6 @@ def family_of_preset(
         free: names of the free parameters; motor damping, voltage gain and lift by default.
         noise: whether Q and R are free, too.
     """
-    from tuning.thruster.identification import ThrusterFamily  # which imports Optuna
-
     largest = max(np.abs(log.inputs).max() for log in logs)
     arguments: dict[str, Any] = {"preset": preset or DEFAULT_PRESET, "dt": logs[0].dt}
     arguments["max_voltage"] = float(max(largest, 1.0))
@@ -161,3 +169,248 @@ def write_identified(path: str | Path, identification: Any, family: Any, logs: S
     from thruster_env.thruster.preset_file import write_preset
 
     write_preset(path, preset_of(identification, family, logs), "A thruster as `thruster identify` found it.")
+
+
+UNITS = {
+    "lift_coefficient": "",
+    "drag_coefficient": "",
+    "motor_damping": "1/s",
+    "voltage_gain": "rad/(s^2 V)",
+    "load_gain": "1/(kg m^2)",
+    "added_mass": "kg",
+    "momentum_drag": "kg/m",
+    "area": "m^2",
+    "diameter": "m",
+    "gear_ratio": "",
+    "density": "kg/m^3",
+    "blade_angle": "rad",
+    "thrust_asymmetry": "",
+}  # of the thruster's own parameters
+FACTOR = 10.0  # range of a positive parameter about its start
+NOISE_FACTOR = 1e4  # range of a variance about its start
+LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
+FASTEST_FLOW = 2.0  # [m/s], ambient
+DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
+DEAD_START = 0.02
+BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
+LONGEST_LAG = 100.0  # in sample times
+LAG_START = 3.0
+OFFSETS = 10.0  # largest clock offset, in sample times, but at least
+LEAST_OFFSET = 0.1  # [s]
+
+
+class ThrusterFamily:
+    """A thruster's models and logs as functions of its free parameters.
+
+    The parameters are the fields of `ThrusterParameters` except angles; ambient_velocity; dead_band, or
+    dead_band_low and dead_band_high; bias_CHANNEL, lag_CHANNEL and clock_offset_CHANNEL; Q11, Q22 and R, or R11,
+    R22, ...
+
+    Args:
+        logs: logs with the plant's inputs and channels.
+        plant: the start of all parameters, and the values of the held ones.
+        recorder: start of the recorder's parameters: dead band, bias and lag.
+        free: names of free parameters.
+        noise: whether Q and R are free, too.
+
+    Raises:
+        ValueError: for an unknown name; the message has the known ones.
+    """
+
+    def __init__(
+        self, logs: Sequence[Log], plant: Plant, recorder: Recorder, free: Sequence[str], *, noise: bool = True
+    ):
+        """Find the parameters by name."""
+        self.logs, self.plant, self.recorder = tuple(logs), plant, recorder
+        if plant.linear is not None:
+            raise ValueError("an identified thruster must follow the equations of motion, but this one is linear")
+        known = self.known
+        names = list(free) + [name for name in self.noise_names if noise and name not in free]
+        wrong = [name for name in names if name not in known]
+        if wrong:
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {short_repr(wrong[0])}")
+        if "dead_band" in names and {"dead_band_low", "dead_band_high"} & set(names):
+            raise ValueError("dead_band must not be free beside dead_band_low or dead_band_high")
+        self.free = tuple(known[name] for name in dict.fromkeys(names))
+        self._lagging = tuple(channel for channel in plant.channels if f"lag_{channel}" in names)
+        base = model_of_plant(plant._replace(dead_band=NO_BAND))
+        self._base = with_recorder(base, plant, self._recorder({}), always=True)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Names of the variances in Q and R."""
+        count = len(self.plant.channels)
+        return ("Q11", "Q22", *(r_name(i, count) for i in range(count)))
+
+    @cached_property
+    def known(self) -> dict[str, Parameter]:
+        """Every parameter that may be free, with its range about its start."""
+        plant, recorder, parameters = self.plant, self.recorder, {}
+        for name, unit in UNITS.items():
+            parameters[name] = _about(name, getattr(plant.parameters, name), unit)
+        flow = plant.ambient_velocity
+        ends = min(-FASTEST_FLOW, 2 * flow), max(FASTEST_FLOW, 2 * flow)
+        parameters["ambient_velocity"] = Parameter("ambient_velocity", *ends, "m/s", log=False, default=flow)
+        reach, first = DEAD_PART * plant.max_voltage, DEAD_START * plant.max_voltage
+        low, high = (max(-reach, recorder.dead_band_low) or -first), (min(reach, recorder.dead_band_high) or first)
+        parameters["dead_band"] = Parameter("dead_band", 0.0, reach, "V", log=False, default=high)
+        parameters["dead_band_low"] = Parameter("dead_band_low", -reach, 0.0, "V", log=False, default=low)
+        parameters["dead_band_high"] = Parameter("dead_band_high", 0.0, reach, "V", log=False, default=high)
+        dt = plant.dt
+        offset = max(OFFSETS * dt, LEAST_OFFSET)
+        model = model_of_plant(plant)
+        for i, (channel, quantity) in enumerate(zip(plant.channels, model.measurements, strict=True)):
+            largest = max(np.nanmax(np.abs(log.measurements[:, i]), initial=0.0) for log in self.logs)
+            bias, at = BIAS_PART * (largest or 1.0), dict(recorder.bias).get(channel, 0.0)
+            name = f"bias_{channel}"
+            parameters[name] = Parameter(
+                name, min(-bias, 2 * at), max(bias, 2 * at), quantity.unit, log=False, default=at
+            )
+            name, lag = f"lag_{channel}", dict(recorder.lag).get(channel, LAG_START * dt)
+            parameters[name] = Parameter(name, 0.0, max(LONGEST_LAG * dt, lag), "s", log=False, default=lag)
+            name = f"clock_offset_{channel}"
+            parameters[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
+        q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)
+        units = [quantity.unit for quantity in (*model.states, *model.measurements)]
+        for name, variance, unit in zip(self.noise_names, (*q, *r), units, strict=True):
+            ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
+            if variance > 0:
+                parameters[name] = Parameter(name, *ends, squared(unit), default=float(variance))
+        return parameters
+
+    @property
+    def data(self):
+        """The logs, or a function of the free clock offsets."""
+        return self.shifted(self.logs)
+
+    def shifted(self, logs: Sequence[Log]):
+        """Some logs for this family: unchanged, or a function of the free clock offsets."""
+        offsets = tuple(parameter.name for parameter in self.free if parameter.name.startswith("clock_offset_"))
+        return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
+
+    def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
+        """The thruster's own parameters."""
+        changes: dict[str, Any] = {name: value for name, value in values.items() if name in UNITS}
+        return checked(self.plant.parameters._replace(**changes))
+
+    def plant_at(self, values: Mapping[str, float]) -> Plant:
+        """The plant for some values; the others are held."""
+        q, r = self._noise(values)
+        return self.plant._replace(
+            parameters=self.parameters(values),
+            ambient_velocity=values.get("ambient_velocity", self.plant.ambient_velocity),
+            process_noise_cov=q,
+            measurement_noise_cov=r,
+        )
+
+    def recorder_at(self, values: Mapping[str, float]) -> Recorder:
+        """The recorder's parameters (dead band, bias and lag) for some values."""
+        return self._recorder(values)
+
+    def model(self, **values: float) -> StateSpaceModel:
+        """The model for values of the free parameters without clock offsets; its ranges stay, which is fast."""
+        plant, recorder = self.plant_at(values), self._recorder(values)
+        constants = plant.constants
+        step, biases, lags = constants.substep, dict(recorder.bias), dict(recorder.lag)
+        further = {"dead_band_low": recorder.dead_band_low, "dead_band_high": recorder.dead_band_high}
+        for i, channel in enumerate(plant.channels):
+            further[f"bias_{i}"] = biases.get(channel, 0.0)
+            further[f"kept_{i}"], further[f"after_{i}"] = lag_weights(lags.get(channel, 0.0), step)
+        q = self._base.process_noise_cov.copy()
+        q[:2, :2] = plant.process_noise_cov
+        before: Any = self._base.constants  # a NamedTuple
+        return self._base.replace(
+            constants=before._replace(**constants._asdict(), **further),
+            process_noise_cov=q,
+            measurement_noise_cov=plant.measurement_noise_cov,
+        )
+
+    def _noise(self, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        covs = []
+        for cov, names in (
+            (self.plant.process_noise_cov, self.noise_names[:2]),
+            (self.plant.measurement_noise_cov, self.noise_names[2:]),
+        ):
+            before = np.diag(cov)
+            after = [values.get(name, variance) for name, variance in zip(names, before, strict=True)]
+            factors = np.sqrt(np.divide(after, before, out=np.ones(len(before)), where=before > 0))
+            covs.append(cov * np.outer(factors, factors))
+        return covs[0], covs[1]
+
+    def _recorder(self, values: Mapping[str, float]) -> Recorder:
+        known, recorder = self.known, self.recorder
+        half = values.get("dead_band")
+        low, high = recorder.dead_band_low, recorder.dead_band_high
+        low = values.get("dead_band_low", low) if half is None else -half
+        high = values.get("dead_band_high", high) if half is None else half
+        bias, lag = dict(recorder.bias), dict(recorder.lag)
+        for channel in self.plant.channels:
+            if f"bias_{channel}" in values:
+                bias[channel] = values[f"bias_{channel}"]
+            if channel in self._lagging:
+                lag[channel] = values.get(f"lag_{channel}", known[f"lag_{channel}"].start)
+        return Recorder(low, high, tuple(bias.items()), tuple(lag.items()))
+
+
+class ShiftedLogs:
+    """Logs as a function of clock offsets of their channels [s].
+
+    Of a shifted channel only every other row is used. It is interpolated between two samples, so that the noise of
+    consecutive rows is correlated, and a likelihood of white noise would prefer a wrong offset. Every other row
+    shares no sample with the next one.
+    """
+
+    def __init__(self, logs: Sequence[Log], names: Sequence[str]):
+        """Take logs, and names such as clock_offset_CHANNEL."""
+        self.logs, self.parameters = tuple(logs), tuple(names)
+
+    def __call__(self, **offsets: float) -> list[Log]:
+        """The logs with shifted clocks of the channels."""
+        return [self._shifted(log, offsets) for log in self.logs]
+
+    def noise_factors(self, **offsets: float) -> dict[str, float]:
+        """Factors on the variance of white noise in each shifted channel, by symbol.
+
+        An interpolated sample has weights w and 1 - w of its neighbours, and its noise w^2 + (1 - w)^2 of their
+        variance. A likelihood without this factor would prefer offsets of half a sample.
+        """
+        factors = {}
+        for name, seconds in offsets.items():
+            channel = name.removeprefix("clock_offset_")
+            parts = [_left(log, f"measurement:{channel}", seconds) for log in self.logs]
+            factors[channel] = float(np.mean(np.concatenate(parts)))
+        return factors
+
+    def _shifted(self, log: Log, offsets: Mapping[str, float]) -> Log:
+        for name, seconds in offsets.items():
+            channel = f"measurement:{name.removeprefix('clock_offset_')}"
+            dense = np.median(np.diff(log.series(channel).times)) < NEIGHBOURS * log.dt
+            log = at_offset(log, channel, seconds)
+            if dense:
+                rows = log.measurements.copy()
+                rows[1::2, [quantity.symbol for quantity in log.measured].index(channel.partition(":")[2])] = (
+                    np.nan
+                )
+                log = replace(log, measurements=rows)
+        return log
+
+
+def _left(log: Log, channel: str, seconds: float) -> np.ndarray:
+    """w^2 + (1 - w)^2 of each row of a shifted channel that lies between two close samples."""
+    samples = log.series(channel).times
+    times = log.times + seconds
+    after = np.clip(np.searchsorted(samples, times), 1, len(samples) - 1)
+    gap = samples[after] - samples[after - 1]
+    w = (times - samples[after - 1]) / gap
+    between = (w >= 0) & (w <= 1) & (gap < NEIGHBOURS * log.dt)
+    return w[between] ** 2 + (1 - w[between]) ** 2 if between.any() else np.ones(1)
+
+
+def _about(name: str, value: float, unit: str) -> Parameter:
+    """A parameter of the thruster, within a range about its value."""
+    if name in LINEAR:
+        low, high = LINEAR[name]
+        return Parameter(name, min(low, value), max(high, value), unit, log=False, default=value)
+    if value == 0:  # as a preset without drag
+        return Parameter(name, 0.0, 1.0, unit, log=False, default=0.0)
+    return Parameter(name, value / FACTOR, value * FACTOR, unit, default=value)

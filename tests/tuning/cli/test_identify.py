@@ -21,8 +21,7 @@ from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
 from thruster_env.thruster.preset_file import PresetFile, read_preset, write_preset
 from tuning.experiments.identification import TRUTH, record
 from tuning.identification.result import with_values
-from tuning.problems.files import scenario_of
-from tuning.problems.find import find_problem
+from tuning.problems.find import find_problem, scenario_of
 from tuning.thruster.logs import of_preset
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))

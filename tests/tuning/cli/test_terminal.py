@@ -29,8 +29,8 @@ from tuning.cli.tuning_report import way_out
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem
 from tuning.reporting.search_figures import draw_history
-from tuning.search.interruption import STOPPING, stop_on_interrupt
 from tuning.search.plan import Plan
+from tuning.search.study import STOPPING, stop_on_interrupt
 
 WITHOUT_JSON = ("explore",)  # what it finds is exported from its page
 

@@ -11,7 +11,7 @@ from tuning.experiments import identification
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.identification.objective import Objective
 from tuning.problems.parameter import Coordinates
-from tuning.thruster.identification import ThrusterFamily
+from tuning.thruster.logs import ThrusterFamily
 
 
 @pytest.mark.slow

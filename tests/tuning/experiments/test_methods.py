@@ -10,7 +10,6 @@ from scipy.stats import ttest_1samp, ttest_rel
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments.methods import runs as study_runs
-from tuning.experiments.methods.entries import Result, Scored, data_set, reference, run_method, start_of
 from tuning.experiments.methods.problems import (
     CASES,
     ENTRIES,
@@ -22,7 +21,20 @@ from tuning.experiments.methods.problems import (
     Protocol,
     ring,
 )
-from tuning.experiments.methods.runs import chance, file_of, jobs_of, regrets, run_protocol, student
+from tuning.experiments.methods.runs import (
+    Result,
+    Scored,
+    chance,
+    data_set,
+    file_of,
+    jobs_of,
+    reference,
+    regrets,
+    run_method,
+    run_protocol,
+    start_of,
+    student,
+)
 from tuning.experiments.methods.tables import percent, tables
 
 WALK = QUICK[0]

@@ -24,8 +24,8 @@ from tuning.experiments.benchmark import (
     noise_free_problem,
 )
 from tuning.problems.check import checked_problem
+from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study

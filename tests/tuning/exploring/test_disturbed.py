@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tuning.exploring.bench import Bench
-from tuning.exploring.knobs import disturbances_of, disturbed
+from tuning.exploring.view import disturbances_of, disturbed
 from tuning.problems.find import find_problem
 from tuning.problems.scenario import plain
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from tuning.exploring.bench import Bench
-from tuning.exploring.scenes import OWN, SCENES
+from tuning.exploring.bench import OWN, SCENES, Bench
 from tuning.problems.find import find_problem
 
 every_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)

@@ -4,7 +4,7 @@ import numpy as np
 
 from filters import affine_model
 from tuning.methods.task import Task
-from tuning.problems.runs_problem import RunsProblem
+from tuning.problems.model_problem import RunsProblem
 
 A = np.array([[1.0, 0.3], [0.0, 0.9]])
 C = np.array([[1.0, 0.0], [0.5, 1.0]])

@@ -10,7 +10,6 @@ from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
 from tuning.experiments.methods.problems import ring
 from tuning.likelihood.family import symmetric_units
-from tuning.methods.adaptive import updated
 from tuning.methods.correlations import (
     Noise,
     autocovariances,
@@ -21,10 +20,10 @@ from tuning.methods.correlations import (
     steady_gain,
 )
 from tuning.methods.registry import find_method
+from tuning.methods.searches import updated
 from tuning.methods.task import Budget, Task
-from tuning.problems.model_problem import ModelProblem
+from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.parameter import Parameter
-from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import LIKELIHOOD
 
 # Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space

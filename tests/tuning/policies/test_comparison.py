@@ -31,7 +31,7 @@ from tuning.policies.environments import make_environments
 from tuning.policies.plants import FIRST_SCORED_STEP, THRUSTER, Part
 from tuning.policies.saved import Scores, classical_policy, run_episodes, score
 from tuning.policies.setup import make_configuration
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
 MEDIUM = find_scenario("medium_noise")

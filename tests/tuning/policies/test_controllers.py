@@ -12,7 +12,7 @@ from tests.learners import COPIES, LIMIT, learn, setup_of, short_episodes  # noq
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import classical_policy, find_saved, load, score
 from tuning.policies.setup import configuration_from_json
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 
 SEEDS = list(range(10, 10 + COPIES))
 SHARE = 0.2

@@ -15,8 +15,7 @@ from tests.learners import setup_of, short_episodes  # noqa: F401 - a fixture
 from thruster_env.core.threads import wait_policy
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
-from tuning.policies.learn import new_model
-from tuning.policies.torch_settings import EpochBuffer, NumpyTanh, learning, numpys_tanh
+from tuning.policies.learn import EpochBuffer, NumpyTanh, learning, new_model, numpys_tanh
 
 SEEDS = range(4)
 

@@ -14,7 +14,7 @@ from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.plants import TASKS
 from tuning.policies.saved import classical_policy, score
 from tuning.policies.setup import make_configuration
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -17,7 +17,7 @@ from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
 from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration, score
 from tuning.policies.setup import configuration_from_json
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 
 
 @pytest.mark.parametrize("observe", OBSERVATION_SETS)

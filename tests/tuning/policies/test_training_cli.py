@@ -16,7 +16,7 @@ from tuning.cli.train import name_of
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import FINAL, load, play, read_configuration, score
-from tuning.problems.seeds import held_out_seeds
+from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
 

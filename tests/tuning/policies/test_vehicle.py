@@ -14,8 +14,8 @@ from tuning.policies.environments import make_environments, make_single
 from tuning.policies.plants import PLANTS, TASKS, Part, plant_of
 from tuning.policies.saved import classical_policy, find_saved, load, run_episodes, score
 from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
+from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
-from tuning.problems.seeds import held_out_seeds
 
 LIMIT, SEEDS = 40, held_out_seeds(0, 3)
 ENVS = [task.env_id for task in PLANTS["vehicle"].tasks.values()]

@@ -11,7 +11,6 @@ import numpy as np
 
 from thruster_env.core.plots import new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
-from tuning.experiments.methods.entries import Result
 from tuning.experiments.methods.problems import (
     FULL_METHODS,
     GROUPS,
@@ -26,9 +25,9 @@ from tuning.experiments.methods.problems import (
     Case,
     Protocol,
 )
-from tuning.experiments.methods.runs import Regret, regrets, within
-from tuning.methods.method import GRADIENT, TRUTH
+from tuning.experiments.methods.runs import Regret, Result, regrets, within
 from tuning.methods.registry import ALONE, METHODS
+from tuning.methods.scoring import GRADIENT, TRUTH
 from tuning.search.objectives import LIKELIHOOD
 
 # Methods that look at no true state; but searches minimise an error where there are true states.

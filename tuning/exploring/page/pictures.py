@@ -25,9 +25,8 @@ from bokeh.palettes import Cividis256, RdBu11
 from bokeh.plotting import figure
 
 from tuning.exploring.bench import Bench, Map, Trial
-from tuning.exploring.knobs import Knob
 from tuning.exploring.page.export import WITHIN_95, mean_of_runs, present
-from tuning.exploring.view import View
+from tuning.exploring.view import Knob, View
 
 Column = np.ndarray | Sequence[np.ndarray]
 

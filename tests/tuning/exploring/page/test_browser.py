@@ -13,7 +13,7 @@ pytest.importorskip("playwright")
 from playwright.sync_api import sync_playwright
 
 from tuning.exploring.bench import Bench
-from tuning.exploring.page.server import Server, page_of
+from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -15,7 +15,7 @@ import tuning.cli.explore as command
 from tests.linear_problem import LinearProblem
 from tuning.cli.explore import _bench, _forward
 from tuning.cli.log_options import BlockOptions, GridOptions
-from tuning.exploring.page.server import Server
+from tuning.exploring.page.session import Server
 
 
 def test_a_notebook_shows_the_page_in_a_frame_until_it_is_closed(as_python):

@@ -18,8 +18,8 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from tuning.cli import explore
-from tuning.exploring.page import server as module
-from tuning.exploring.page.server import LOOPBACK, Server
+from tuning.exploring.page import session as module
+from tuning.exploring.page.session import LOOPBACK, Server
 
 SCRIPT = "static/js/bokeh.min.js"
 
