@@ -14,8 +14,8 @@ from thruster_env.logs.write import write_columns
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.problem import log_problem
-from tuning.problems.log_problem import MEASURED
-from tuning.problems.model_problem import RunsProblem
+from tuning.problems.log_problem import MEASURED, LogProblem
+from tuning.problems.model_problem import RunsProblem, log_of
 from tuning.search.space import untuned_choice
 
 CART = affine_model(
@@ -112,3 +112,24 @@ def test_tune_offers_the_start_on_the_command_line_and_in_python(tmp_path, monke
     assert log_problem(files, model="own:model", start="measurement").digest == content["digest"]
     with pytest.raises(ValueError, match="start must come with a pair"):
         tuning.tune("mismatch", start="measurement")
+
+
+def test_the_robust_filter_begins_blocks_of_logs_where_their_first_measurement_does():
+    rng, logs = np.random.default_rng(2), []
+    for number in range(3):  # the cart goes further and further away from the prior
+        x, z = np.array([0.0, 0.5]), []
+        for _ in range(600):
+            z.append([x[0] + 0.2 * rng.normal()])
+            x = np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1]) + rng.normal(size=2) * [1e-2, 3e-2]
+        logs.append(log_of((np.ones((599, 1)), np.array(z)), CART, 0.1, f"log {number}"))
+    problem, measured = LogProblem(logs, CART, lead=20), LogProblem(logs, CART, lead=20, start="measurement")
+    by_prior = LogProblem(logs, CART, lead=20, start="prior")
+    choice = untuned_choice("ekf-robust", problem)
+    covs = [choice.filter(each).model.prior_cov for each in (problem, measured, by_prior)]
+    assert (covs[0] == covs[1]).all() and (covs[2] == CART.prior_cov).all() and covs[0][0, 0] > 100.0
+    assert (untuned_choice("ekf", problem).filter(problem).model.prior_cov == CART.prior_cov).all()
+    assert problem.digest == by_prior.digest != measured.digest
+    data = problem.data(problem.training_seeds(0, 32))
+    values = [evaluate(choice.filter(each), data, None) for each in (problem, by_prior)]
+    assert values[0].nis.value < 1.5 and values[1].nis.value > 10.0
+    assert values[0].log_likelihood > values[1].log_likelihood + 10.0

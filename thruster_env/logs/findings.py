@@ -18,7 +18,8 @@ each other and from those beyond: a jump or a peak of the signal is not an outli
 Bursts of outliers. BURST samples or more, none further than APART samples from the next, that are each above both
 of their neighbours, or below both, by more than SPIKE standard deviations of the noise, while no input changes
 beside them: a stretch of garbage, such as of a loose plug. It is at most a tenth of the channel, and the AROUND
-samples before and after it are calm: a plant that shakes more for long is no burst.
+samples before and after it are calm: a plant that shakes more for long is no burst. Outliers that are scattered
+over the log and happen to be near each other are none either: so many come by chance more often than LEVEL.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
 DAMAGED = "damaged"  # the file: of its messages some are not read
 CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
 SPOILING = (GAP, STALE, STUCK, SATURATED, OUTLIER)  # what moves estimates
+OUTLIERS = ("kept", "missing")  # whether a study takes them as measurements or leaves them out
 LEVEL = 1e-4
 SHORTEST = 8  # samples: a run of equal ones that is worth a word
 COMMON = 0.1  # of neighbours that are equal: the channel is quantised
@@ -48,7 +50,8 @@ OFTENER = 4.0
 SPIKE, ALONE = 7.0, 2.0
 AROUND = 25  # samples before and after, whose differences tell the noise, too
 NORMAL = 1.4826  # standard deviation over the median of magnitudes
-BURST, APART = 4, 5  # samples of a burst, at least, and the distance of two of them, at most
+BURST, APART = 4, 10  # samples of a burst, at least, and the distance of two of them, at most
+WILDER = 4.0  # mean size of its steps over the noise before and after it
 LONGEST = 0.1  # share of a channel's samples that a burst may have
 BESIDE = 0.1  # of an input's range: a larger change explains a peak of the sensor
 LISTED = 3  # findings of one kind and channel that are said one by one
@@ -309,19 +312,40 @@ def _heights(steps: np.ndarray) -> np.ndarray:
 def _bursts(log: Log, rows: np.ndarray, values: np.ndarray, angle: bool) -> list[tuple[int, int]]:
     """The first and last index of each burst of outliers among the samples of a channel."""
     steps, noise = _steps_and_noise(values, angle)
-    high = np.flatnonzero((_heights(steps) > SPIKE * noise) & ~_explained(log, rows)) + 1
-    bursts = []
+    high, explained, bursts = np.flatnonzero(_heights(steps) > SPIKE * noise) + 1, _explained(log, rows), []
     for group in np.split(high, np.flatnonzero(np.diff(high) > APART) + 1):
-        if len(group) < BURST or len(group) > LONGEST * len(values):
+        count = int((~explained[group - 1]).sum())
+        if count < BURST or _scattered(count, int(np.ptp(group)), len(high), len(values)):
             continue
         begin, end = int(group[0]), int(group[-1])
         beside = [abs(steps[max(begin - 1 - AROUND, 0) : begin - 1]), abs(steps[end + 1 : end + 1 + AROUND])]
         calm = [NORMAL * np.median(part) / np.sqrt(2.0) for part in beside if len(part)]
         if end - begin < LONGEST * len(values) and all(
-            abs(steps[begin - 1 : end + 1]).mean() > SPIKE * part for part in calm
+            abs(steps[begin - 1 : end + 1]).mean() > WILDER * part for part in calm
         ):
-            bursts.append((begin, end))
+            to_end = _edge(values[end:], noise, angle)
+            bursts.append((begin - _edge(values[begin::-1], noise, angle), end + to_end))
     return bursts
+
+
+def _edge(values: np.ndarray, noise: float, angle: bool) -> int:
+    """How many of the APART samples after the first one are still far from those behind them."""
+    near, behind = values[1 : APART + 1], values[APART + 1 : APART + 1 + AROUND]
+    if not len(behind):
+        return 0
+    away, spread = (abs(difference(part[:, None], np.median(behind), (angle,))[:, 0]) for part in (near, behind))
+    far = np.flatnonzero(away > SPIKE * max(noise, NORMAL * float(np.median(spread))))
+    return int(far[-1]) + 1 if len(far) else 0
+
+
+def _scattered(count: int, span: int, total: int, samples: int) -> bool:
+    """Whether so many peaks within a span of samples are explained by the frequency of peaks elsewhere.
+
+    total P(Poisson(span (total - count)/samples) >= count - 1) >= LEVEL
+    """
+    mean = span * max(total - count, 1) / samples
+    at_most = np.exp(-mean) * np.cumsum(np.append(1.0, np.cumprod(mean / np.arange(1.0, count - 1))))[-1]
+    return total * (1.0 - at_most) >= LEVEL
 
 
 def _explained(log: Log, rows: np.ndarray) -> np.ndarray:

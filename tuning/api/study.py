@@ -275,6 +275,7 @@ def tune(
     lead: int | None = None,
     hold_gaps: bool | None = None,
     start: str | None = None,
+    outliers: str | None = None,
 ) -> Study:
     """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
@@ -333,7 +334,9 @@ def tune(
         blocks: number of blocks per recorded run.
         lead: rows at the beginning of a block that are not scored.
         hold_gaps: hold the last input over gaps of a log; by default runs are split there.
-        start: initial state of blocks of logs: "prior", or "measurement", from their first measurement.
+        start: initial state of blocks of logs: "prior", or "measurement", from their first measurement, as
+            ekf-robust does by default.
+        outliers: samples that the findings in logs call outliers: "kept", or "missing", which leaves them out.
 
     Returns:
         `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
@@ -351,6 +354,7 @@ def tune(
     of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
     of_logs |= {"grid": None if grid else False, "stamps": stamps}
     of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
+    of_logs |= {"outliers": outliers}
     unknown = unknowns_of(augment)
     problems = tuple(augmented(base, unknown) for base in problems_of(problem, preset, **of_logs))
     if objective is None:

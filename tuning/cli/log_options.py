@@ -13,6 +13,7 @@ import typer
 
 from filters.starts import STARTS
 from thruster_env.core.checks import short_repr
+from thruster_env.logs.findings import OUTLIERS
 from thruster_env.logs.recorders.one_clock import STAMPS
 from tuning.cli.options import (
     A_LOG,
@@ -174,8 +175,18 @@ class BlockOptions:
         str | None,
         typer.Option(
             "--start",
-            help="Initial state of blocks: prior, or measurement, from their first measurement.",
+            help="Initial state of blocks: prior, or measurement, from their first measurement, the default of "
+            "ekf-robust.",
             callback=spelt(STARTS),
+            rich_help_panel=INPUT,
+        ),
+    ] = None
+    outliers: Annotated[
+        str | None,
+        typer.Option(
+            "--outliers",
+            help="Samples that thruster log calls outliers: kept, or missing, which leaves them out.",
+            callback=spelt(OUTLIERS),
             rich_help_panel=INPUT,
         ),
     ] = None
@@ -183,7 +194,7 @@ class BlockOptions:
     def named(self) -> dict[str, Any]:
         """Other arguments of `tuning.logs.problem.log_problem`; None where an option is not given."""
         cuts = {"held_out": self.held_out, "blocks": self.blocks, "lead": self.lead, "start": self.start}
-        return {**cuts, "hold_gaps": self.hold_gaps or None}
+        return {**cuts, "hold_gaps": self.hold_gaps or None, "outliers": self.outliers}
 
 
 # Recorded logs as the problem of a study: from the options of a command, or as a tuned file names them.

@@ -7,7 +7,7 @@ their expected values are the number of states and the number of measured channe
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from thruster_env.model.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data, estimates_in_parts
+
+if TYPE_CHECKING:
+    from tuning.evaluation.outliers import UnevenNis
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)
@@ -64,6 +67,7 @@ class Evaluation(NamedTuple):
     restarts: Restarts | None = None  # the first restart, and why; None if there is none
     state_nees: np.ndarray | None = None  # (n,), means of e_i^2 / P_ii, expected value 1; NaN where there is none
     time_constants: TimeConstants | None = None  # of its gain; None without one, and where nobody asked for them
+    uneven: UnevenNis | None = None  # a mean NIS that a few blocks of logs carry; None if none do, or if not asked
 
     @property
     def has_truth(self) -> bool:

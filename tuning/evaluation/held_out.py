@@ -31,6 +31,7 @@ from tuning.evaluation.evaluate import (
     likelihood_gain,
     score_ratio,
 )
+from tuning.evaluation.outliers import uneven_nis
 from tuning.evaluation.regression import gain_over_regression
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
@@ -134,7 +135,8 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     constants = time_constants_on(choice.filter(scenario), scenario, seed)
     if constants is not None:
         constants = with_oracle_and_advice(constants, choice, scenario, seed)
-    tuned = tuned._replace(time_constants=constants)
+    uneven = uneven_nis(choice.filter(scenario), scenario, seed)
+    tuned = tuned._replace(time_constants=constants, uneven=uneven)
     bound, rule, lacks = scenario.bound(data), rule_label(scenario), scenario.lacks_ranges
     over_regression = NOTHING
     if data.states is None:

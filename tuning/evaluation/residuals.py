@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, i
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.evaluation.outliers import heavy_tails
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
@@ -43,6 +45,7 @@ class Estimated(NamedTuple):
     process_correlation: np.ndarray | None = None  # (n,), of each w_k with w_{k+1}: noise that is white has none
     measurement_correlation: np.ndarray | None = None  # (m,)
     reason: str = ""
+    tails: Mapping[str, float] = {}  # heavy ones, "v of thrust": share beyond four robust standard deviations
 
 
 def residuals(model: StateSpaceModel, data: Data) -> Residuals:
@@ -105,7 +108,13 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
     if not _is_regular(r):
         return Estimated(reason="the measurements have no noise")
     means = (rows.mean(axis=0) for rows in model_residuals[:2])
-    return Estimated(q, r, *means, *(_correlation(rows) for rows in model_residuals[2:]))
+    names = (
+        [f"w of {state.symbol}" for state in model.states],
+        [f"v of {channel.symbol}" for channel in model.measurements],
+    )
+    w, v = (heavy_tails(*pair) for pair in zip(model_residuals[:2], names, strict=True))
+    correlations = (_correlation(rows) for rows in model_residuals[2:])
+    return Estimated(q, r, *means, *correlations, tails={**(w if q.any() else {}), **v})
 
 
 @lru_cache(maxsize=16)

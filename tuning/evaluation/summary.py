@@ -22,6 +22,7 @@ from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import Scaled, baseline_size, rule_label, rule_of_thumb, scaled_rule
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.outliers import UnevenNis
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.problem import Problem
 from tuning.search.parameters import size_ladder
@@ -61,6 +62,7 @@ def summary(evaluation: Evaluation) -> dict:
         "divergences": evaluation.divergences,
         **({"time_constants": _time_constants(evaluation.time_constants)} if evaluation.time_constants else {}),
         **({"restarts": evaluation.restarts._asdict()} if evaluation.restarts else {}),
+        **({"uneven": evaluation.uneven._asdict()} if evaluation.uneven else {}),
     }
 
 
@@ -100,6 +102,7 @@ def summarised(
         mean_squares=np.array([[value.value**2 for value in rmse]]),
         log_score=as_interval(data.get("log_score")),
         time_constants=_as_time_constants(data.get("time_constants")),
+        uneven=_uneven(data.get("uneven")),
         scale=np.array([math.nan] * len(rmse) if problem.scale is None else problem.scale, dtype=np.float64),
     )
 
@@ -125,6 +128,13 @@ def _restarts(data: Mapping | None) -> Restarts | None:
         return None
     counts = {name: int(data[name]) for name in ("times", "runs", "of_runs", "run", "step")}
     return Restarts(**counts, states=tuple(map(str, data["states"])), cause=str(data["cause"]))
+
+
+def _uneven(data: Mapping | None) -> UnevenNis | None:
+    """A mean NIS that a few blocks carry from plain numbers; None of a file that says nothing of it."""
+    if data is None:
+        return None
+    return UnevenNis(**{**data, "spans": tuple(map(str, data["spans"]))})
 
 
 def _time_constants(constants: TimeConstants) -> dict:

@@ -340,6 +340,7 @@ LATER = (
     "time_constants",
     "oracle",
     "advised",
+    "uneven",
 )  # keys that older files lack
 
 

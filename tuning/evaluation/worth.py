@@ -14,6 +14,7 @@ from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.outliers import uneven_sentence
 from tuning.problems.problem import Problem
 from tuning.search.forgetting import TOLERANCE
 
@@ -48,14 +49,18 @@ def tuning_effect(comparison: Comparison, what: str = "the score") -> str:
 
 
 def warnings_of(evaluation: Evaluation, problem: Problem, forget: float | None = None) -> list[str]:
-    """What a headline warns of in a filter: a NEES that is far off, and a gain that hardly moves the estimate.
+    """What a headline warns of in a filter.
+
+    It is a NEES that is far off, a gain that hardly moves the estimate, and a mean NIS that a few blocks carry.
 
     Args:
         evaluation: of the filter.
         problem: on which it was evaluated.
         forget: the longest time constant that was allowed [s]; None for a fifth of a run.
     """
-    return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem, forget)]
+    channels = len(problem.quantities.measurements)
+    uneven = [] if evaluation.uneven is None else [uneven_sentence(evaluation.uneven, channels)]
+    return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem, forget), *uneven]
 
 
 def _nees_warning(evaluation: Evaluation) -> list[str]:

@@ -235,7 +235,8 @@ class Family:
         return self._model(self.choice_at(point))
 
     def _model(self, choice: Choice) -> StateSpaceModel:
-        return make_filter(choice.name, self._problem.model(**choice.model)).kernel_model
+        model = self._problem.started_for(choice.name, self._problem.model(**choice.model))
+        return make_filter(choice.name, model).kernel_model
 
 
 def symmetric_units(size: int) -> np.ndarray:

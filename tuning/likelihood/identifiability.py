@@ -10,6 +10,7 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
+from tuning.evaluation.outliers import heavy_innovations, tails_in_words
 from tuning.likelihood.family import known_information
 from tuning.problems.data import Data, estimates_in_parts, where_true
 from tuning.problems.problem import Problem
@@ -35,6 +36,7 @@ class Identifiability(NamedTuple):
     most_likely: np.ndarray  # (p,), under which the innovations are most likely
     cov: np.ndarray  # (p, p)
     identified: np.ndarray  # (p,) bool, as `is_identified` says
+    tails: Mapping[str, float] = {}  # of innovations at the most likely values, if heavy: then all above is wrong
 
     @property
     def factors(self) -> np.ndarray:
@@ -107,7 +109,11 @@ def identify(
     known = known_information(choice, scenarios, data, names, np.exp(best), where)
     cov = covariance(curvatures(log_likelihoods, best) if known is None else known)
     identified = is_identified(log_likelihoods, best, cov, bounds)
-    return Identifiability(names, tuned, np.exp(best), cov, identified)
+    tails: dict[str, float] = {}
+    for scenario, runs in zip(scenarios, data, strict=True):
+        most_likely = {**parameters, **dict(zip(names, np.exp(best).tolist(), strict=True))}
+        tails |= heavy_innovations(choice_of(choice.name, most_likely, scenario, where).filter(scenario), [runs])
+    return Identifiability(names, tuned, np.exp(best), cov, identified, tails)
 
 
 def _in_run(data: Data, log_likelihoods: np.ndarray) -> np.ndarray:
@@ -245,6 +251,12 @@ def sentences(result: Identifiability) -> list[str]:
     rows = list(zip(result.names, result.identified, result.factors, strict=True))
     known = [f"{name} within a factor of {factor:.3g}" for name, known, factor in rows if known]
     loose = [name for name, known, _ in rows if not known]
+    if result.tails:
+        return [
+            "How well the innovations of the training runs determine Q and R is not stated: that is known for "
+            f"normal innovations, and these have heavy tails, {tails_in_words(result.tails)}. A few outliers may "
+            "raise Q or R for all samples; --filter ekf-robust gives them less weight."
+        ]
     lines = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
     if loose:
         parts = [f"{name} x {factor:.2g}" for name, factor in result.least_determined.items()]
@@ -257,10 +269,14 @@ def sentences(result: Identifiability) -> list[str]:
 
 
 def as_data(result: Identifiability) -> dict:
-    """The result as plain data, by parameter."""
+    """The result as plain data, by parameter; factors are None for innovations with heavy tails."""
     columns = result.names, result.most_likely.tolist(), result.factors.tolist(), result.identified.tolist()
     return {
-        name: {"most_likely": best, "known_within_a_factor_of": factor, "determined": known}
+        name: {
+            "most_likely": best,
+            "known_within_a_factor_of": None if result.tails else factor,
+            "determined": known and not result.tails,
+        }
         for name, best, factor, known in zip(*columns, strict=True)
     }
 

@@ -21,7 +21,7 @@ from tuning.problems.problem import Problem
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "stamps")  # of `read_named`
 
 
-CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start")
+CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start", "outliers")
 
 
 def log_problem(
@@ -31,6 +31,7 @@ def log_problem(
     lead: int | None = None,
     hold_gaps: bool = False,
     start: str | None = None,
+    outliers: str | None = None,
     *,
     apart: bool = True,
     **options: Any,
@@ -46,6 +47,7 @@ def log_problem(
         lead: rows of a block's lead-in.
         hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
         start: where blocks begin, "prior" or "measurement", as `LogProblem` takes it.
+        outliers: "kept" or "missing", likewise.
         apart: whether to check that held-out runs are not among the others; a tuned file's digests have settled
             it.
         **options: options of `read_named`.
@@ -64,7 +66,7 @@ def log_problem(
     runs = {log.name: runs[log.name] for log in recorded}
     model = read_for(recorded[0], pairs[0][1])[1]()
     cuts: dict[str, Any] = {"held_out": held_names, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
-    cuts["start"] = start
+    cuts |= {"start": start, "outliers": outliers}
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
     return LogProblem(recorded, model, **cuts, apart=apart, content=_content(runs, options, cuts))
 

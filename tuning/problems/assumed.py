@@ -522,6 +522,10 @@ class AugmentedProblem(Problem):
         """Those of the problem."""
         return self.problem.logs_of(seeds)
 
+    def started_for(self, name: str, model: StateSpaceModel) -> StateSpaceModel:
+        """As the problem does."""
+        return self.problem.started_for(name, model)
+
     def run_label(self, seed: int) -> str:
         """That of the problem."""
         return self.problem.run_label(seed)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from filters.consistency.time_constants import Run
-from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
+from filters.starts import MEASUREMENT, STARTS, cov_of_measured_starts
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.findings import has_outliers, remarks_on
+from thruster_env.logs.findings import OUTLIERS, has_outliers, remarks_on
+from thruster_env.logs.findings import outliers as rows_of_outliers
 from thruster_env.logs.log import Log
 from thruster_env.logs.steps import as_rows, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
@@ -24,6 +26,8 @@ from tuning.problems.digest import digest_of
 from tuning.problems.log_parts import Parts, check_apart, checked_logs, parts_of
 from tuning.problems.parameter import Parameter
 
+ROBUST = ("ekf-robust",)  # filters that take measurements far from the prior for outliers
+
 AT_GAPS = (
     "Runs are cut at gaps: no block has rows from both sides (--hold-gaps, hold_gaps=True, does not cut)",
     "At gaps the last input is held (--hold-gaps, in Python hold_gaps=True)",
@@ -33,10 +37,14 @@ ON_STAMPS = (
     "Logs are on their own stamps: Q of a step is in proportion to its length, and true states are not used."
 )
 
-OUTLIERS = (
-    "Outliers raise R for all samples: --filter ekf-robust gives them less weight; otherwise delete these samples "
-    "from the log (an empty cell is a missing one)."
-)
+KEPT, MISSING = OUTLIERS
+OF_OUTLIERS = {
+    KEPT: "Outliers raise R for all samples: --outliers missing (outliers='missing' in Python) leaves them out, "
+    "--filter ekf-robust gives them less weight; or delete these samples from the log (an empty cell is a "
+    "missing one).",
+    MISSING: "Outliers are left out, as missing measurements (--outliers missing): a filter in use meets them, "
+    "and needs a gate or less weight for them, as ekf-robust has.",
+}
 
 MEASURED = (
     "Each block begins where its first measurement says: the prior covariance is wide where a measurement sees "
@@ -65,8 +73,11 @@ class LogProblem(AssumedProblem):
         lead: steps of a lead-in; 50 if None, of short logs fewer.
         blocks: number of blocks of each run; if None there are about 72 of one length in all.
         hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
+        outliers: whether samples that the logs' findings call outliers are "kept" or "missing".
         start: where blocks begin: "prior", as the model's prior says, or "measurement", where their first
-            measurement does (`filters.starts.cov_of_measured_starts`), the prior elsewhere.
+            measurement does (`filters.starts.cov_of_measured_starts`), the prior elsewhere. If None it is the
+            prior, but for ekf-robust: most blocks begin in the middle of a run, where the prior is off, and that
+            filter would take their first measurements for outliers.
         held_out: names of the held-out runs; if None every third run, or every third block of fewer than three
             runs.
         truth: whether the logs' true states are used, if each log has all of them, at some steps at least.
@@ -90,7 +101,8 @@ class LogProblem(AssumedProblem):
         lead: int | None = None,
         blocks: int | None = None,
         hold_gaps: bool = False,
-        start: str = PRIOR,
+        outliers: str = KEPT,
+        start: str | None = None,
         held_out: Collection[str] | None = None,
         truth: bool = True,
         apart: bool = True,
@@ -105,9 +117,12 @@ class LogProblem(AssumedProblem):
         """Cut the logs into blocks; see the class for the arguments."""
         self.recorded = self.logs = checked_logs(logs)
         self._in_steps = self.logs[0].stamps is not None
+        self._outliers = one_of("outliers", outliers, OUTLIERS)
+        if outliers == MISSING:
+            self.logs = tuple(map(without_outliers, self.recorded))
         if self._in_steps:
-            self.logs = tuple(map(as_rows, self.recorded))
-        self._start, self._first = one_of("start", start, STARTS), None
+            self.logs = tuple(map(as_rows, self.logs))
+        self._start, self._first = None if start is None else one_of("start", start, STARTS), None
         cut = partial(
             parts_of, self.logs, lead, blocks, held_out, hold_gaps=hold_gaps, sizes=True, shortest=shortest
         )
@@ -150,7 +165,12 @@ class LogProblem(AssumedProblem):
             self._first = _first_measured(self.data(self.parts.training).seen.measurements)
             self.model()  # an error on a start that nothing sees
         digests, parts = tuple(log.digest for log in self.logs), self.parts
-        of_blocks = parts.blocks, len(parts.training), self._states is None, *([] if start == PRIOR else [start])
+        of_blocks = (
+            parts.blocks,
+            len(parts.training),
+            self._states is None,
+            *([start] if start == MEASUREMENT else []),
+        )
         self._digest = digest_of(digests, *of_blocks, self.assumptions)  # before anything remembers a run
 
     @property
@@ -163,7 +183,7 @@ class LogProblem(AssumedProblem):
         """Findings in the logs, and their rows that are in no block."""
         remarks = remarks_on(self.recorded)
         if has_outliers(self.recorded):
-            remarks.append(OUTLIERS)
+            remarks.append(OF_OUTLIERS[self._outliers])
         if self._in_steps:
             remarks.append(ON_STAMPS)
         if any(len(log.pieces) > 1 for log in self.logs):
@@ -183,6 +203,16 @@ class LogProblem(AssumedProblem):
         if self._first is None:
             return model
         return model.replace(prior_cov=cov_of_measured_starts(model, self._first))
+
+    def started_for(self, name: str, model: StateSpaceModel) -> StateSpaceModel:
+        """The model with a prior that is wide where a measurement sees it, for `ROBUST` filters; see the class."""
+        if name not in ROBUST or self._start is not None:
+            return model
+        first = _first_measured(self.data(self.parts.training).seen.measurements)
+        try:
+            return model.replace(prior_cov=cov_of_measured_starts(model, first))
+        except ValueError:  # no measurement sees a state at the prior mean
+            return model
 
     def training_seeds(self, seed: int, count: int) -> range:
         """Numbers of all training blocks, for any count."""
@@ -234,10 +264,13 @@ class LogProblem(AssumedProblem):
     def run_label(self, seed: int) -> str:
         """The log of a block, and the times of its scored rows by the log's own clock."""
         block = self.parts.blocks[seed]
-        log, times = self.recorded[block.run], self.recorded[block.run].times
+        return self.span_label(block.run, block.first + self.parts.lead, block.first + block.rows - 1)
+
+    def span_label(self, run: int, first: int, last: int) -> str:
+        """A log by its number, and the times of two of its rows by the log's own clock."""
+        log, times = self.recorded[run], self.recorded[run].times
         if self._in_steps:  # whose rows have step ratios, and may stand between two stamps
-            times = log.dt * np.append(0.0, np.cumsum(self.logs[block.run].inputs[:, -1]))
-        first, last = block.first + self.parts.lead, block.first + block.rows - 1
+            times = log.dt * np.append(0.0, np.cumsum(self.logs[run].inputs[:, -1]))
         start, end = (log.start + times[row] for row in (first, last))
         return f"{log.name} from {start:.6g} to {end:.6g} s"
 
@@ -304,6 +337,14 @@ class LogProblem(AssumedProblem):
         if self._content is None:
             return None
         return {"logs": [{"file": log.name, "digest": log.digest} for log in self.logs], **self._content}
+
+
+def without_outliers(log: Log) -> Log:
+    """The log with the samples that its findings call outliers as missing ones."""
+    measurements = log.measurements.copy()
+    for column, quantity in enumerate(log.measured):
+        measurements[rows_of_outliers(log, f"measurement:{quantity.symbol}"), column] = np.nan
+    return replace(log, measurements=measurements)
 
 
 def _name(logs: Sequence[Log]) -> str:

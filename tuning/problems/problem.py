@@ -98,6 +98,10 @@ class Problem(ABC):
         """The names of the logs, by the numbers of `logs_of`; none without logs."""
         return ()
 
+    def started_for(self, name: str, model: StateSpaceModel) -> StateSpaceModel:
+        """The model with the prior with which a filter of this name begins its runs: the model's own."""
+        return model
+
     def run_label(self, seed: int) -> str:
         """A run in a sentence: "seed 1007", or the log and the times of a block."""
         return f"seed {seed}"

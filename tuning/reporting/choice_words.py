@@ -18,6 +18,7 @@ from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, TUNED, called
 from tuning.evaluation.evaluate import is_beyond
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.outliers import tails_in_words
 from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation
 from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
@@ -341,6 +342,15 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     w = _told(model.states, noise.process_cov, noise.process_mean, noise.process_correlation)
     v = _told(model.measurements, noise.measurement_cov, noise.measurement_mean, noise.measurement_correlation)
     parts = [f"{what} {', '.join(remarks)}" for what, remarks in (("w of", w), ("v of", v)) if remarks]
+    wrong = {f"{what} {remark.partition(' (')[0]}" for what, each in (("w of", w), ("v of", v)) for remark in each}
+    heavy, tails = {name: share for name, share in noise.tails.items() if name not in wrong}, []
+    if heavy:
+        tails = [
+            f"The residuals of the true states have heavy tails, {tails_in_words(heavy)}: outliers raise Q "
+            "or R of noise estimation for all samples; --filter ekf-robust gives them less weight."
+        ]
+    if not parts and tails:
+        return tails
     if not parts:
         return [
             "The residuals of the true states, w = x' - f(x, u) and v = z - h(x), look like white noise: each "
@@ -349,7 +359,8 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     return [
         f"The residuals of the true states, w = x' - f(x, u) and v = z - h(x), are not zero-mean white noise: "
         f"{'; '.join(parts)} (mean over standard deviation; correlation with the next step). The model is wrong "
-        "there, and no Q and R make up for it."
+        "there, and no Q and R make up for it.",
+        *tails,
     ]
 
 

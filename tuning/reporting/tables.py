@@ -119,11 +119,15 @@ def _number(value: float | None) -> str:
 
 def known_table(result: Identifiability) -> Table:
     """The parameters as the innovations determine them."""
-    columns = result.names, result.tuned, result.most_likely, result.factors, result.identified
+    identified = result.identified & (not result.tails)
+    columns = result.names, result.tuned, result.most_likely, result.factors, identified
     rows = [
         [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
         for name, tuned, best, factor, known in zip(*columns, strict=True)
     ]
+    if result.tails:
+        rows = [row[:3] for row in rows]
+        return Table("Parameters by maximum likelihood", ["", "tuned", "maximum likelihood"], rows)
     header = ["", "tuned", "maximum likelihood", "known within a factor of", "determined"]
     return Table(
         "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows

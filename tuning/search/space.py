@@ -41,7 +41,8 @@ class Choice(NamedTuple):
     def filter(self, problem: Problem) -> Filter:
         """The filter of this choice, with the problem's assumed model."""
         try:
-            return make_filter(self.name, problem.model(**self.model), **self.numbers)
+            model = problem.started_for(self.name, problem.model(**self.model))
+            return make_filter(self.name, model, **self.numbers)
         except ValueError:
             if is_trained(self.name) and Path(self.name).is_file():  # what differs, by the presets' names
                 problem.check_tuned_for(estimator_named(self.name).training.get("plant"), self.name)

@@ -129,6 +129,10 @@ def test_a_run_of_outliers_is_a_burst_and_a_plant_that_shakes_is_none(count):
     for row in range(300, 900):  # of a plant that shakes for long, and with its input
         table["tach"][row] += 20.0 * (-1.0) ** row
     assert [finding.count for finding in found(table)[1].findings if finding.kind == "outlier"] in ([1], [])
+    for seed in range(10):  # scattered over the log, one sample in twenty
+        scattered, draws = recorded(seed=seed), np.random.default_rng(seed)
+        scattered["tach"] += 5.0 * (draws.random(1000) < 0.05) * draws.choice([-1.0, 1.0], 1000)
+        assert not any("burst" in finding.sentence for finding in found(scattered)[1].findings)
     driven = recorded()
     driven["voltage"][400:460] = (-1.0) ** np.arange(60)
     driven["tach"][401:461] += 10.0 * driven["voltage"][400:460]
