@@ -47,8 +47,6 @@ COMMANDS = (THRUST, *PLANES)
 ATTITUDE_INPUTS = STATES[6:8]
 """Roll and pitch where they are told from outside."""
 
-CURRENT_INPUTS = (*CURRENT_STATES, Quantity("current down", "c_z", "m/s"))
-
 
 class Instrument(NamedTuple):
     """A sensor, its noise and its rate.

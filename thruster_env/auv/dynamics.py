@@ -23,7 +23,7 @@ import numpy as np
 from thruster_env.auv.forces import accelerated, forces, forces_tangent
 from thruster_env.auv.parameters import VehicleParameters, derive_constants
 from thruster_env.core.compiled import inlined
-from thruster_env.core.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
+from thruster_env.core.integration import runge_kutta
 from thruster_env.core.streams import cosine_and_sine
 
 # Attitude and path of a vehicle: Euler angles, transformations between body and earth, their tangents.
@@ -278,9 +278,6 @@ def drifting_rates_tangent(x, dx, u, c):
     )
 
 
-velocity_substep = runge_kutta(velocity_rates, 6)
-"""`velocity_substep(x, u, c)`: six velocities after c.substep seconds of constant input and attitude."""
-
 motion_substep = runge_kutta(motion_rates, 8)
 """`motion_substep(x, u, c)`: velocities, roll and pitch after c.substep seconds of constant input."""
 
@@ -289,25 +286,6 @@ navigation_substep = runge_kutta(navigation_rates, 12)
 
 current_substep = runge_kutta(current_rates, 12)
 """`current_substep(x, u, c)`: the same in a current, the last three inputs."""
-
-drifting_substep = runge_kutta(drifting_rates, 14)
-"""`drifting_substep(x, u, c)`: the same with the current among the states."""
-
-velocity_jacobian = runge_kutta_jacobian(velocity_rates, velocity_rates_tangent, 6)
-motion_jacobian = runge_kutta_jacobian(motion_rates, motion_rates_tangent, 8)
-navigation_jacobian = runge_kutta_jacobian(navigation_rates, navigation_rates_tangent, 12)
-drifting_jacobian = runge_kutta_jacobian(drifting_rates, drifting_rates_tangent, 14)
-
-velocity_euler = euler(velocity_rates, 6)
-"""`velocity_euler(x, u, c)`: `velocity_substep` by Euler's method, as the papers have it; ..."""
-
-motion_euler = euler(motion_rates, 8)
-navigation_euler = euler(navigation_rates, 12)
-drifting_euler = euler(drifting_rates, 14)
-velocity_euler_jacobian = euler_jacobian(velocity_rates_tangent, 6)
-motion_euler_jacobian = euler_jacobian(motion_rates_tangent, 8)
-navigation_euler_jacobian = euler_jacobian(navigation_rates_tangent, 12)
-drifting_euler_jacobian = euler_jacobian(drifting_rates_tangent, 14)
 
 
 # Operating range of a vehicle: the thrust of a speed, the range of its states, the integration step.

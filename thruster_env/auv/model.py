@@ -34,6 +34,7 @@ from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
 from thruster_env.core.checks import covariance, one_of, positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.equal_functions import makes_functions
+from thruster_env.core.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.matrices import scaled
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.env.copies import functions_of
@@ -76,42 +77,19 @@ def derivative_by_attitude(move: Callable, state: np.ndarray, inputs: list[float
 
 
 @dataclass(frozen=True)
-class Steps:
-    """The number of states of a model, and its functions among the equations of motion."""
+class Motion:
+    """The number of states of a model, and its equations of motion."""
 
     count: int
-    methods: dict[str, tuple[Callable, Callable]]  # the step by each method of integration, and its Jacobian
+    rates: Callable
+    tangent: Callable  # of the rates
 
 
 MODELS = {
-    "velocities": Steps(
-        6,
-        {
-            "runge-kutta": (dynamics.velocity_substep, dynamics.velocity_jacobian),
-            "euler": (dynamics.velocity_euler, dynamics.velocity_euler_jacobian),
-        },
-    ),
-    "motion": Steps(
-        8,
-        {
-            "runge-kutta": (dynamics.motion_substep, dynamics.motion_jacobian),
-            "euler": (dynamics.motion_euler, dynamics.motion_euler_jacobian),
-        },
-    ),
-    "navigation": Steps(
-        12,
-        {
-            "runge-kutta": (dynamics.navigation_substep, dynamics.navigation_jacobian),
-            "euler": (dynamics.navigation_euler, dynamics.navigation_euler_jacobian),
-        },
-    ),
-    "current": Steps(
-        14,
-        {
-            "runge-kutta": (dynamics.drifting_substep, dynamics.drifting_jacobian),
-            "euler": (dynamics.drifting_euler, dynamics.drifting_euler_jacobian),
-        },
-    ),
+    "velocities": Motion(6, dynamics.velocity_rates, dynamics.velocity_rates_tangent),
+    "motion": Motion(8, dynamics.motion_rates, dynamics.motion_rates_tangent),
+    "navigation": Motion(12, dynamics.navigation_rates, dynamics.navigation_rates_tangent),
+    "current": Motion(14, dynamics.drifting_rates, dynamics.drifting_rates_tangent),
 }
 """Models by name: the papers' six velocities; with roll and pitch; with yaw and position; with the current."""
 
@@ -123,7 +101,12 @@ ATTITUDES = ("input", "measured", "level")
 @makes_functions
 def transition_of(states: str, method: str, torque_is_input: bool, attitude: str) -> tuple[Callable, Callable]:
     """One step of a model, and its Jacobian, as functions of the model's own inputs."""
-    step, jacobian = MODELS[states].methods[method]
+    model = MODELS[states]
+    if method == "euler":
+        step, jacobian = euler(model.rates, model.count), euler_jacobian(model.tangent, model.count)
+    else:
+        step = runge_kutta(model.rates, model.count)
+        jacobian = runge_kutta_jacobian(model.rates, model.tangent, model.count)
     source = f"move(x, {tuple_of(forces_of(states, torque_is_input, attitude != 'level'))}, c)"
     return (
         written_out("transition", "x, u, c", source, move=step),
@@ -332,20 +315,11 @@ def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
 # The vehicle in continuous time: its rates and spectral densities, from which follows a model for any dt.
 
 
-RATES = {
-    "velocities": dynamics.velocity_rates,
-    "motion": dynamics.motion_rates,
-    "navigation": dynamics.navigation_rates,
-    "current": dynamics.drifting_rates,
-}
-"""By the states of `thruster_env.auv.model.MODELS`."""
-
-
 @makes_functions
 def rates_of(states: str, torque_is_input: bool, attitude_is_input: bool) -> Callable:
     """The rates of a model, as a function of its own inputs."""
     inputs = tuple_of(forces_of(states, torque_is_input, attitude_is_input))
-    return written_out("rates", "x, u, c", f"move(x, {inputs}, c)", move=RATES[states])
+    return written_out("rates", "x, u, c", f"move(x, {inputs}, c)", move=MODELS[states].rates)
 
 
 def continuous_auv(**arguments) -> ContinuousModel:

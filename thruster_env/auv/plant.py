@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,10 +24,17 @@ from thruster_env.auv.effects import VEHICLE_SENSOR_EFFECTS, Current, NearSurfac
 from thruster_env.auv.forces import Constants
 from thruster_env.auv.parameters import VehicleParameters, derive_constants
 from thruster_env.auv.presets import PRESETS, preset_parameters
-from thruster_env.core.checks import at_least, between, covariance, finite, one_of, positive, short_repr, vector
+from thruster_env.core.checks import at_least, between, finite, one_of, positive, short_repr
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SampleEvery
-from thruster_env.env.plant_data import Entries, check_same, mappings
+from thruster_env.env.plant_data import (
+    Entries,
+    check_same,
+    checked_noise,
+    data_of,
+    initial_distribution,
+    sensor_effects,
+)
 from thruster_env.model.quantities import Quantity
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
@@ -42,7 +48,6 @@ DEFAULT_INITIAL_VARIANCES = (0.05**2,) + (0.02**2,) * 5 + (0.01**2,) * 6  # abou
 SAMPLE_TIMES = (1e-9, 10.0)  # [s]
 THRUSTS = (1e-6, 1e6)  # [N]
 PLANES = (0.0, math.radians(90.0))  # [rad]
-LARGEST_STATE = 1e50  # its square of a variance
 STATES_COUNT = len(STATES)
 
 
@@ -144,7 +149,13 @@ def make_plant(
     max_plane = between("max_plane", max_plane, *PLANES, "rad")
     if propeller_torque is not None:
         propeller_torque = finite("propeller_torque", propeller_torque)
-    mean, cov = _initial_distribution(initial_state)
+    at_speed = np.eye(STATES_COUNT)[0]
+    mean, cov = initial_distribution(
+        initial_state,
+        (CRUISE_SPEED * at_speed, np.diag(DEFAULT_INITIAL_VARIANCES)),
+        *("twelve", "speed", "U"),
+        lambda speed: positive("the speed of initial_state", speed, zero_allowed=True) * at_speed,
+    )
     effects, instruments = _sensors(sensors, dt)
     if measurement_noise_cov is None:
         measurement_noise_cov = [instrument.deviation**2 for instrument in instruments.values()]
@@ -157,8 +168,8 @@ def make_plant(
         max_plane,
         propeller_torque,
         at_least("substeps", substeps, 1, 10_000),
-        covariance("process_noise_cov", process_noise_cov, STATES_COUNT, largest=LARGEST_STATE**2),
-        covariance("measurement_noise_cov", measurement_noise_cov, len(effects), largest=LARGEST_STATE**2),
+        checked_noise("process_noise_cov", process_noise_cov, STATES_COUNT),
+        checked_noise("measurement_noise_cov", measurement_noise_cov, len(effects)),
         mean,
         cov,
         effects,
@@ -183,14 +194,7 @@ def _sensors(sensors, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[st
         sensors = {name: _timing(default_instrument(name), dt) for name in known}
         if len(sensors) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
-    if not sensors:
-        raise ValueError("sensors must name at least one channel, but got none")
-    if len(sensors) > MAX_CHANNELS:
-        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(sensors)}")
-    effects = {
-        one_of("a channel of sensors", channel, tuple(CHANNELS)): VEHICLE_SENSOR_EFFECTS.make(effects)
-        for channel, effects in sensors.items()
-    }
+    effects = sensor_effects(sensors, CHANNELS, VEHICLE_SENSOR_EFFECTS, MAX_CHANNELS)
     return effects, {channel: default_instrument(channel) for channel in effects}
 
 
@@ -200,79 +204,18 @@ def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
     return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
 
 
-def _initial_distribution(initial_state) -> tuple[np.ndarray, np.ndarray]:
-    at_speed = np.eye(STATES_COUNT)[0]
-    fixed = np.zeros((STATES_COUNT, STATES_COUNT))
-    if initial_state is None:
-        return CRUISE_SPEED * at_speed, np.diag(DEFAULT_INITIAL_VARIANCES)
-    if not isinstance(initial_state, Mapping):
-        return state("initial_state", initial_state), fixed
-    if set(initial_state) == {"speed"}:
-        return positive("the speed of initial_state", initial_state["speed"], zero_allowed=True) * at_speed, fixed
-    if set(initial_state) == {"mean", "cov"}:
-        mean = state("the mean of initial_state", initial_state["mean"])
-        largest = LARGEST_STATE**2
-        return mean, covariance("the cov of initial_state", initial_state["cov"], STATES_COUNT, largest=largest)
-    raise ValueError(
-        "initial_state must be None, twelve numbers, {'speed': U} or {'mean': [..], 'cov': [..]}, "
-        f"but got {short_repr(initial_state)}"
-    )
-
-
-def state(name: str, value) -> np.ndarray:
-    """Return a state (12,); raise ValueError unless it is twelve numbers from which finite ones can follow."""
-    entries = vector(name, value, STATES_COUNT)
-    if np.abs(entries).max() > LARGEST_STATE:
-        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
-    return entries
-
-
 # A vehicle as data for JSON, for files that record their plant.
 
 
-ENTRIES = Entries(
-    ("preset", "dt", "sensors", "propeller_torque"),
-    (
-        "preset",
-        "parameters",
-        "dt",
-        "sensors",
-        "propeller_torque",
-        "max_thrust",
-        "max_plane",
-        "process_noise_cov",
-        "measurement_noise_cov",
-        "sensor_effects",
-        "current",
-        "propeller_lag",
-        "plane_lag",
-    ),
-    VehicleParameters._fields,
-)
+ESSENTIAL = "preset", "parameters", "dt", "sensors", "propeller_torque"
+BOUNDS_AND_NOISE = "max_thrust", "max_plane", "process_noise_cov", "measurement_noise_cov"
+DISTURBANCES = "sensor_effects", "current", "propeller_lag", "plane_lag"
+ENTRIES = Entries(ESSENTIAL, (*ESSENTIAL, *BOUNDS_AND_NOISE, *DISTURBANCES), VehicleParameters._fields)
 
 
 def plant_data(plant: Plant) -> dict:
-    """The data on which a filter's parameters depend: vehicle, sample time, sensors, noise, current and lags.
-
-    Initial state, task and seed are not part of it.
-    """
-    named = [name for name, parameters in PRESETS.items() if parameters == plant.parameters]
-    data = {
-        "preset": named[0] if named else None,
-        "parameters": plant.parameters._asdict(),
-        "dt": plant.dt,
-        "sensors": list(plant.channels),
-        "propeller_torque": plant.propeller_torque,
-        "max_thrust": plant.max_thrust,
-        "max_plane": plant.max_plane,
-        "process_noise_cov": plant.process_noise_cov.tolist(),
-        "measurement_noise_cov": plant.measurement_noise_cov.tolist(),
-        "sensor_effects": {channel: mappings(effects) for channel, effects in plant.sensors.items()},
-        "current": {direction: mappings(signals) for direction, signals in plant.current.items()},
-        "propeller_lag": plant.propeller_lag,
-        "plane_lag": plant.plane_lag,
-    }
-    return json.loads(json.dumps(data))  # lists for tuples, as a file has them
+    """The data on which a filter's parameters depend, see `thruster_env.env.plant_data.data_of`."""
+    return data_of(plant, ENTRIES, PRESETS)
 
 
 def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list[str]:

@@ -9,27 +9,16 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import options as checked_options
-from thruster_env.core.checks import short_repr, vector
 from thruster_env.core.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
 from thruster_env.core.memory import KEY_0, KEY_1, STEP, gathered, new_memory, scatter, set_row
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.streams import normal_block
 from thruster_env.core.threads import in_parts, worker_threads
+from thruster_env.env.plant_data import checked_state
 from thruster_env.model.quantities import Quantity
 
 THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
-
-
-LARGEST_STATE = 1e50  # in SI units: beyond it floating point may overflow; its square of a variance
-
-
-def checked_state(name: str, value, count: int) -> np.ndarray:
-    """Return a state (count,); raise ValueError unless it is so many numbers from which finite ones can follow."""
-    entries = vector(name, value, count)
-    if np.abs(entries).max() > LARGEST_STATE:
-        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
-    return entries
 
 
 class PlantCopies:

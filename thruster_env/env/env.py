@@ -19,6 +19,7 @@ from thruster_env.core.sources import written_out
 from thruster_env.core.streams import draw_key
 from thruster_env.env.commands import one_number, some_numbers
 from thruster_env.env.copies import PlantCopies
+from thruster_env.env.plant_data import as_json
 from thruster_env.model.quantities import Quantity
 
 # Rendering, common to all envs of plants.
@@ -330,16 +331,3 @@ class PlantEnv(RenderedEnv):
                 return self._observation_buffer.copy()  # twice as fast as a new array of one number
         report = self._report.tolist()
         return observation_of([report[row] for row in self._observed])
-
-
-def as_json(value):
-    """An argument of an env for JSON, effects and parameters as mappings of plain numbers."""
-    if hasattr(value, "as_mapping"):
-        return value.as_mapping()
-    if hasattr(value, "_asdict"):
-        return value._asdict()
-    if isinstance(value, Mapping):
-        return {key: as_json(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [as_json(entry) for entry in value]
-    return value

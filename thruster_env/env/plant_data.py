@@ -1,14 +1,85 @@
-"""A plant as JSON data, for files that record their plant, and differences between two plants."""
+"""A plant from plain arguments and as JSON data: what all plants share.
+
+Sensors and initial state of arguments; data for files that record their plant, and differences between two plants.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from thruster_env.core.checks import short_repr
-from thruster_env.effects.effects import Effect
+import numpy as np
+
+from thruster_env.core.checks import covariance, one_of, short_repr, vector
+from thruster_env.effects.effects import Registry
+
+LARGEST_STATE = 1e50  # in SI units: beyond it floating point may overflow; its square of a variance
+
+
+def checked_state(name: str, value, count: int) -> np.ndarray:
+    """Return a state (count,); raise ValueError unless it is so many numbers from which finite ones can follow."""
+    entries = vector(name, value, count)
+    if np.abs(entries).max() > LARGEST_STATE:
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
+    return entries
+
+
+def checked_noise(name: str, value, count: int) -> np.ndarray:
+    """A covariance (count, count) from a matrix or from variances; zero is allowed."""
+    return covariance(name, value, count, largest=LARGEST_STATE**2)
+
+
+def initial_distribution(
+    initial_state,
+    default: tuple[np.ndarray, np.ndarray],
+    count: str,
+    key: str,
+    letter: str,
+    mean_of: Callable,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n,) and covariance (n, n) of the initial state, from an env's argument.
+
+    Args:
+        initial_state: None, n numbers, a mapping with the plant's own key, or with "mean" and "cov".
+        default: mean and covariance for None.
+        count: n in words, for messages.
+        key: the plant's own key, "voltage".
+        letter: of its value in messages, "V".
+        mean_of: `mean_of(value)` is the state that the plant's own key fixes.
+
+    Raises:
+        ValueError: for another argument.
+    """
+    n = len(default[0])
+    fixed = np.zeros((n, n))
+    if initial_state is None:
+        return default
+    if not isinstance(initial_state, Mapping):
+        return checked_state("initial_state", initial_state, n), fixed
+    if set(initial_state) == {key}:
+        return mean_of(initial_state[key]), fixed
+    if set(initial_state) == {"mean", "cov"}:
+        mean = checked_state("the mean of initial_state", initial_state["mean"], n)
+        return mean, checked_noise("the cov of initial_state", initial_state["cov"], n)
+    raise ValueError(
+        f"initial_state must be None, {count} numbers, {{{key!r}: {letter}}} or {{'mean': [..], 'cov': [..]}}, "
+        f"but got {short_repr(initial_state)}"
+    )
+
+
+def sensor_effects(sensors: Mapping, channels: Mapping, registry: Registry, most: int) -> dict[str, tuple]:
+    """Effects of each measured channel, from a mapping of at most so many channels to lists of effects."""
+    if not sensors:
+        raise ValueError("sensors must name at least one channel, but got none")
+    if len(sensors) > most:
+        raise ValueError(f"sensors must name at most {most} channels, but got {len(sensors)}")
+    return {
+        one_of("a channel of sensors", channel, tuple(channels)): registry.make(effects)
+        for channel, effects in sensors.items()
+    }
 
 
 class Entries(NamedTuple):
@@ -17,6 +88,31 @@ class Entries(NamedTuple):
     essential: tuple[str, ...]  # what makes it another plant, on which Q and R mean nothing
     names: tuple[str, ...]  # all entries
     parameters: tuple[str, ...]  # names of the parameters
+
+
+def data_of(plant: Any, entries: Entries, presets: Mapping, **further) -> dict:
+    """The data on which a filter's parameters depend: plant, sample time, sensors, noise and disturbances.
+
+    Initial state, task and seed are not part of it. An entry is the plant's attribute of its name, unless
+    `further` has it.
+    """
+    preset = next((name for name, parameters in presets.items() if parameters == plant.parameters), None)
+    data = {"preset": preset, "sensors": plant.channels, "sensor_effects": plant.sensors, **further}
+    values = {name: as_json(data[name] if name in data else getattr(plant, name)) for name in entries.names}
+    return json.loads(json.dumps(values, default=np.ndarray.tolist))  # lists for tuples, as a file has them
+
+
+def as_json(value):
+    """An argument of an env for JSON, effects and parameters as mappings of plain numbers."""
+    if hasattr(value, "as_mapping"):
+        return value.as_mapping()
+    if hasattr(value, "_asdict"):
+        return value._asdict()
+    if isinstance(value, Mapping):
+        return {key: as_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_json(entry) for entry in value]
+    return value
 
 
 def check_same(entries: Entries, tuned_for: Mapping, data: Mapping, file: str | Path) -> list[str]:
@@ -53,11 +149,6 @@ def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str
     essential = [_both(name, then[name], now[name]) for name in differing if name in entries.essential]
     further = [_both(name, then[name], now[name]) for name in differing if name not in entries.essential]
     return _parameters_that_differ(entries.parameters, then, now) + essential, further
-
-
-def mappings(effects: tuple[Effect, ...]) -> list[dict]:
-    """Effects as mappings for JSON."""
-    return [effect.as_mapping() for effect in effects]
 
 
 def _parameters_that_differ(known: tuple[str, ...], then: Mapping, now: Mapping) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -12,18 +11,15 @@ import numpy as np
 from thruster_env.core.checks import (
     at_least,
     between,
-    covariance,
     finite,
-    one_of,
     positive,
     short_repr,
-    vector,
     within,
 )
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env import plant_data as data_of_plants
-from thruster_env.env.plant_data import Entries, mappings
+from thruster_env.env.plant_data import Entries, checked_noise, data_of, initial_distribution, sensor_effects
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import Constants
 from thruster_env.thruster.effects import (
@@ -55,7 +51,6 @@ DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"].variance  # [N^2]
 SAMPLE_TIMES = (1e-9, 10.0)  # [s]
 VOLTAGES = (1e-3, 1e6)  # [V]
 FASTEST_FLOW = 1e3  # [m/s]
-LARGEST_STATE = 1e50  # [rad/s], [m/s]; its square of a variance
 DEFAULT_INITIAL_VARIANCES = (1.0, 0.01)  # about rest, [(rad/s)^2, (m/s)^2]
 
 
@@ -142,7 +137,14 @@ def make_plant(
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
     max_voltage = between("max_voltage", positive("max_voltage", max_voltage), *VOLTAGES, "V")
     ambient_velocity = within("ambient_velocity", ambient_velocity, FASTEST_FLOW)
-    mean, cov = _initial_distribution(initial_state, parameters, ambient_velocity)
+    mean, cov = initial_distribution(
+        initial_state,
+        (np.zeros(2), np.diag(DEFAULT_INITIAL_VARIANCES)),
+        *("two", "voltage", "V"),
+        lambda voltage: np.array(
+            steady_state(parameters, finite("the voltage of initial_state", voltage), ambient_velocity)[:2]
+        ),
+    )
     sensors = _sensors(sensors)
     if "current" in sensors and parameters.load_gain == 0:
         raise ValueError("load_gain must be positive for a motor current to follow from it, but got 0.0")
@@ -164,8 +166,8 @@ def make_plant(
         max_voltage,
         ambient_velocity,
         substeps,
-        covariance("process_noise_cov", process_noise_cov, 2, largest=LARGEST_STATE**2),
-        covariance("measurement_noise_cov", measurement_noise_cov, len(sensors), largest=LARGEST_STATE**2),
+        checked_noise("process_noise_cov", process_noise_cov, 2),
+        checked_noise("measurement_noise_cov", measurement_noise_cov, len(sensors)),
         mean,
         cov,
         sensors,
@@ -188,39 +190,7 @@ def _sensors(sensors) -> dict[str, tuple[Effect, ...]]:
         sensors = {name: () for name in names if isinstance(name, str)}
         if len(sensors) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
-    if not sensors:
-        raise ValueError("sensors must name at least one channel, but got none")
-    if len(sensors) > MAX_CHANNELS:
-        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(sensors)}")
-    return {
-        one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
-        for channel, effects in sensors.items()
-    }
-
-
-def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[np.ndarray, np.ndarray]:
-    if initial_state is None:
-        return np.zeros(2), np.diag(DEFAULT_INITIAL_VARIANCES)
-    if not isinstance(initial_state, Mapping):
-        return state("initial_state", initial_state), np.zeros((2, 2))
-    if set(initial_state) == {"voltage"}:
-        voltage = finite("the voltage of initial_state", initial_state["voltage"])
-        return np.array(steady_state(parameters, voltage, ambient_velocity)[:2]), np.zeros((2, 2))
-    if set(initial_state) == {"mean", "cov"}:
-        mean = state("the mean of initial_state", initial_state["mean"])
-        return mean, covariance("the cov of initial_state", initial_state["cov"], 2, largest=LARGEST_STATE**2)
-    raise ValueError(
-        "initial_state must be None, two numbers, {'voltage': V} or {'mean': [..], 'cov': [..]}, "
-        f"but got {short_repr(initial_state)}"
-    )
-
-
-def state(name: str, value) -> np.ndarray:
-    """Return a state (2,); raise ValueError unless it is two numbers from which finite ones can follow."""
-    entries = vector(name, value, 2)
-    if np.abs(entries).max() > LARGEST_STATE:
-        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {short_repr(value)}")
-    return entries
+    return sensor_effects(sensors, CHANNELS, SENSOR_EFFECTS, MAX_CHANNELS)
 
 
 # A thruster as data for JSON, for files that record their plant.
@@ -228,44 +198,16 @@ def state(name: str, value) -> np.ndarray:
 
 # What makes it another plant, on which Q and R mean nothing. The rest disturbs or bounds the same plant.
 ESSENTIAL = ("preset", "system", "dt", "sensors")
-PLANT_ENTRIES = (
-    *ESSENTIAL,
-    "parameters",
-    "max_voltage",
-    "ambient_velocity",
-    "process_noise_cov",
-    "measurement_noise_cov",
-    "sensor_effects",
-    "flow",
-    "amplifier",
-    "uncertainty",
-)
-ENTRIES = Entries(ESSENTIAL, PLANT_ENTRIES, ThrusterParameters._fields)
+BOUNDS_AND_NOISE = "parameters", "max_voltage", "ambient_velocity", "process_noise_cov", "measurement_noise_cov"
+DISTURBANCES = "sensor_effects", "flow", "amplifier", "uncertainty"
+ENTRIES = Entries(ESSENTIAL, (*ESSENTIAL, *BOUNDS_AND_NOISE, *DISTURBANCES), ThrusterParameters._fields)
 
 
 def plant_data(plant: Plant) -> dict:
-    """What a filter's numbers depend on: the thruster, its sample time, sensors, noise and disturbances.
-
-    Initial state, task and seed are not among it.
-    """
+    """The data on which a filter's parameters depend, see `thruster_env.env.plant_data.data_of`."""
     linear = plant.linear
-    named = [name for name, parameters in PRESETS.items() if parameters == plant.parameters]
-    data = {
-        "preset": named[0] if named else None,
-        "parameters": plant.parameters._asdict(),
-        "system": None if linear is None else [matrix.tolist() for matrix in (linear.a, linear.b, linear.c)],
-        "dt": plant.dt,
-        "max_voltage": plant.max_voltage,
-        "ambient_velocity": plant.ambient_velocity,
-        "sensors": list(plant.channels),
-        "process_noise_cov": plant.process_noise_cov.tolist(),
-        "measurement_noise_cov": plant.measurement_noise_cov.tolist(),
-        "sensor_effects": {channel: mappings(effects) for channel, effects in plant.sensors.items()},
-        "flow": mappings(plant.flow),
-        "amplifier": mappings(plant.amplifier),
-        "uncertainty": {name: distribution.as_mapping() for name, distribution in plant.uncertainty.items()},
-    }
-    return json.loads(json.dumps(data))  # lists for tuples, as a file has them
+    system = None if linear is None else [matrix.tolist() for matrix in (linear.a, linear.b, linear.c)]
+    return data_of(plant, ENTRIES, PRESETS, system=system)
 
 
 def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list[str]:
