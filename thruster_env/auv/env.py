@@ -10,7 +10,7 @@ import numpy as np
 
 from thruster_env.auv import simulation as at
 from thruster_env.auv.plant import Plant, make_plant
-from thruster_env.auv.rendering.renderer import Moment, Renderer
+from thruster_env.auv.rendering import Moment, Renderer
 from thruster_env.auv.simulation import Copies
 from thruster_env.auv.task import make_depth_task, make_task
 from thruster_env.core.checks import arguments_of, takes_arguments_of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -58,10 +58,10 @@ def fitting_axis(values: np.ndarray, scale: float, top: float, height: float) ->
     values = np.clip(values[np.isfinite(values)], -MOST * scale, MOST * scale)
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     least = LEAST * scale if max(-low, high) < LEAST * scale else 0.0
-    return Axis(-_round_up(max(-low, least)), _round_up(max(high, least)), top, height)
+    return Axis(-round_up(max(-low, least)), round_up(max(high, least)), top, height)
 
 
-def _round_up(value: float) -> float:
+def round_up(value: float) -> float:
     """The next round number; 0 for what is not positive."""
     if not value > 0:
         return 0.0
@@ -72,6 +72,23 @@ def _round_up(value: float) -> float:
 def _digits(value: float) -> int:
     """Digits after the point that a round number needs."""
     return 0 if value == round(value) else max(1, 1 - math.floor(math.log10(abs(value))))
+
+
+def draw_gauge_frames(canvas: Canvas, middles: Iterable[float], top: float, height: float) -> None:
+    """Draw the frames of gauges about their middles [px]."""
+    for middle in middles:
+        canvas.box(middle - 7, top - 2, 14, height + 4, WHITE, 3)
+        canvas.box(middle - 7, top - 2, 14, height + 4, (196, 206, 214), 3, 1)
+
+
+def draw_gauge(canvas: Canvas, title: str, x: float, axis: Axis, value: float) -> None:
+    """Draw a gauge's title and, if the value is finite, a bar from zero to it."""
+    zero = axis.y(0.0)
+    canvas.text(title, (x, axis.top - 13), 11, INK, 0.5)
+    if math.isfinite(value):
+        y = min(max(axis.y(value), axis.top), axis.top + axis.height)
+        canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
+        canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
 
 
 # The last time steps of an episode, with the estimates of a filter.
@@ -188,12 +205,12 @@ class Charts:
         axis = fitting_axis(values, strip.scale, strip.top + 2, strip.height - 4)._replace(downward=strip.downward)
 
         def line(values, colour, width):
-            for run in _runs(np.isfinite(values)):
+            for run in runs(np.isfinite(values)):
                 canvas.lines(np.stack((x[run], axis.y(values[run])), axis=-1), colour, width)
 
         canvas.clip(LEFT, strip.top, RIGHT - LEFT, strip.height)
         low, high = axis.y(estimate - SIGMAS * std), axis.y(estimate + SIGMAS * std)
-        for run in _runs(np.isfinite(low)):
+        for run in runs(np.isfinite(low)):
             outline = np.concatenate((low[run], high[run][::-1]))
             canvas.polygon(np.stack((np.concatenate((x[run], x[run][::-1])), outline), axis=-1), BAND)
         canvas.box(LEFT, axis.y(0.0) - 0.5, RIGHT - LEFT, 1, (170, 182, 192))
@@ -246,7 +263,7 @@ class Charts:
             x -= 28
 
 
-def _runs(drawn: np.ndarray) -> Iterator[slice]:
+def runs(drawn: np.ndarray) -> Iterator[slice]:
     """Slices of a boolean array that are true."""
     edges = np.flatnonzero(np.diff(np.concatenate(((False,), drawn, (False,)))))
     return (slice(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True))

@@ -29,34 +29,46 @@ MODES = ("human", "rgb_array")
 class PlantRenderer:
     """Draws an episode: `begin` it, `add` every moment from the reset's on, `draw` where a frame is wanted.
 
-    A plant's class calls `_set_up` with its own arguments, makes its pictures in `_make_pictures` and draws them
-    in `_draw`. pygame is imported with the first renderer.
+    A plant's class makes its pictures in `_make_pictures`, from `arguments`, and draws them in `_draw`. pygame is
+    imported with the first renderer.
 
     Attributes:
         caption: of the window.
+        moment: the NamedTuple of the truth at the end of a step.
+        overlay: the NamedTuple of a filter's label and estimate.
+        positive: names of the plant's arguments that must be positive numbers.
         remembered: names of attributes that a copy keeps, beside the history.
     """
 
     caption: ClassVar[str]
+    moment: ClassVar[Any]
+    overlay: ClassVar[Any]
+    positive: ClassVar[tuple[str, ...]] = ()
     remembered: ClassVar[tuple[str, ...]] = ()
 
-    def _set_up(self, made_with: dict[str, Any], moment: tuple[str, ...], overlay: tuple[str, ...]) -> None:
+    def __init__(
+        self, mode: str, *, dt: float, frames_per_second: float, size: tuple[int, int] | None = None, **of_plant
+    ):
         """Load pygame and draw what never moves.
 
         Args:
-            made_with: arguments of `__init__` by name; `mode` is "human" (a window) or "rgb_array" (arrays),
-                `frames_per_second` how many calls of `draw` a second a window keeps to [1/s], `size` that of the
-                picture [px], 640 x 400 if None.
-            moment: names of a moment's entries.
-            overlay: names of an overlay's, behind its label.
+            mode: "human" (a window) or "rgb_array" (arrays).
+            dt: sample time [s].
+            frames_per_second: how many calls of `draw` a second a window keeps to [1/s].
+            size: of the picture [px]; 640 x 400 if None.
+            **of_plant: the plant's arguments, see its class.
 
         Raises:
             ValueError: for a mode that is not one of the two, or a number that is not positive.
             DependencyNotInstalled: if pygame is missing.
         """
-        self._made_with = made_with
-        self.mode = one_of("mode", made_with["mode"], MODES)
-        frame_time = 1.0 / positive("frames_per_second", made_with["frames_per_second"])
+        self.arguments = {
+            "mode": mode, "dt": dt, "frames_per_second": frames_per_second, "size": size, **of_plant
+        }  # fmt: skip
+        for name in (*self.positive, "dt"):
+            positive(name, self.arguments[name])
+        self.mode = one_of("mode", mode, MODES)
+        frame_time = 1.0 / positive("frames_per_second", frames_per_second)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it would greet on standard output
         try:
             import pygame  # noqa: F401
@@ -64,14 +76,13 @@ class PlantRenderer:
             raise DependencyNotInstalled(
                 f"rendering needs pygame, which is not installed: {to_install('render')}"
             ) from error
-        from thruster_env.render.canvas import SIZE, Canvas
+        from thruster_env.render.canvas import Canvas
 
-        size = made_with.get("size") or SIZE
-        self._canvas = Canvas(size)
+        self._canvas = Canvas(size or SIZE)
         self._make_pictures()
         self._canvas.keep()
-        self._window = Window(frame_time, self.caption, size) if self.mode == "human" else None
-        self._history = History(moment, overlay)
+        self._window = Window(frame_time, self.caption, size or SIZE) if mode == "human" else None
+        self._history = History(self.moment._fields, self.overlay._fields[1:])
         self.begin()
 
     def _make_pictures(self) -> None:
@@ -84,12 +95,12 @@ class PlantRenderer:
 
     def __getstate__(self) -> tuple[dict, dict]:
         """Its arguments and history; pygame's surfaces cannot be copied."""
-        return self._made_with, {name: getattr(self, name) for name in ("_history", *self.remembered)}
+        return self.arguments, {name: getattr(self, name) for name in ("_history", *self.remembered)}
 
     def __setstate__(self, state: tuple[dict, dict]) -> None:
         """Redraw the pictures from the history."""
-        made_with, remembered = state
-        type(self).__init__(self, **made_with)
+        arguments, remembered = state
+        type(self).__init__(self, **arguments)
         vars(self).update(remembered)
 
     def begin(self) -> None:

@@ -20,7 +20,7 @@ from thruster_env.thruster.linear.analysis import state_range
 from thruster_env.thruster.linear.published import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.rendering.renderer import Moment, Renderer
+from thruster_env.thruster.rendering import Moment, Renderer
 from thruster_env.thruster.simulation import (
     AMBIENT,
     COMMAND,

@@ -24,7 +24,7 @@ from thruster_env.logs.log import Log
 from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
 from thruster_env.thruster.control.controllers import PIController
 from thruster_env.thruster.env import renderer_of
-from thruster_env.thruster.rendering.renderer import Moment, Overlay
+from thruster_env.thruster.rendering import Moment, Overlay
 from tuning.cli.options import (
     FILTER,
     FILTER_HELP,

@@ -17,7 +17,7 @@ from thruster_env.auv.rendering import Moment, Overlay, Renderer
 
 pytest.importorskip("pygame")
 
-from thruster_env.auv.rendering.view import HULL, PROJECTION, attitude
+from thruster_env.auv.rendering import HULL, PROJECTION, attitude
 from thruster_env.render.canvas import BAND, ESTIMATE, INK, REFERENCE  # noqa: E402
 
 ARGUMENTS = {

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.render import renderer as video
 from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.rendering.renderer import Moment, Overlay
+from thruster_env.thruster.rendering import Moment, Overlay
 from tuning.cli import play as episodes
 
 
@@ -63,10 +63,8 @@ def spy(function, seen):
 def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatch):  # noqa: F811
     thruster("simulate", "--out", "run.csv", "--steps", 30, "--voltage", 9)
     shown = []
-    monkeypatch.setattr(
-        "thruster_env.thruster.rendering.renderer.Renderer.add", lambda self, *both: shown.append(both)
-    )
-    monkeypatch.setattr("thruster_env.thruster.rendering.renderer.Renderer.draw", lambda self: np.zeros((2, 2, 3)))
+    monkeypatch.setattr("thruster_env.thruster.rendering.Renderer.add", lambda self, *both: shown.append(both))
+    monkeypatch.setattr("thruster_env.thruster.rendering.Renderer.draw", lambda self: np.zeros((2, 2, 3)))
     assert as_json("play", "--log", "run.csv", "--out", "x.gif")["steps"] == 30
     table = np.genfromtxt("run.csv", delimiter=",", names=True)
     moment, overlay = shown[20]

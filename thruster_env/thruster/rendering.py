@@ -1,12 +1,22 @@
-"""The upper half of the picture: the hull cut through at the thruster, and the propeller seen from port.
+"""Pictures of the thruster at work, 640 x 400 pixels: in a window (`human`) or as arrays (`rgb_array`).
 
-One looks forward, port on the left. The motor stands above the tunnel and turns the propeller through a
-right-angle gear. Positive flow goes to starboard and pushes the ship to port. This is a scheme, not to scale.
+Above, the hull cut through at the thruster, with the propeller turning and arrows of the flow and of the push on
+the ship; below, strip charts of the last 500 steps and gauges of thrust and voltage, with truth and measurement.
+One step is one frame, so `render_fps = 1/dt` shows true speed.
+
+The common parts of all plants' pictures, and how a filter shows its estimate, are in
+`thruster_env.render`.
+
+The upper half is a scheme, not to scale. One looks forward, port on the left. The motor stands above the tunnel
+and turns the propeller through a right-angle gear. Positive flow goes to starboard and pushes the ship to port.
+
+Needs pygame (the extra `render`), which is imported when a `Renderer` is made.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,9 +34,103 @@ from thruster_env.render.canvas import (
     number,
     with_band,
 )
-from thruster_env.render.charts import Axis, newest
-from thruster_env.thruster.rendering.propeller import end_view, side_view
-from thruster_env.thruster.rendering.renderer import Moment
+from thruster_env.render.charts import ABSURD, Axis, Charts, Strip, draw_gauge, draw_gauge_frames, newest
+from thruster_env.render.renderer import PlantRenderer
+
+# Contents of a picture: the truth at each step, and the estimate of a filter.
+
+
+class Moment(NamedTuple):
+    """The truth at the end of a step, one entry of the strip charts."""
+
+    time: float  # since the start of the episode [s]
+    omega_m: float  # motor speed [rad/s]
+    U_a: float  # section-average flow velocity [m/s]
+    thrust: float  # [N]
+    measured_thrust: float  # [N]
+    reference: float | None  # thrust to hold [N]
+    voltage: float  # [V]
+    ambient_velocity: float = 0.0  # U_0 [m/s]
+
+
+class Overlay(NamedTuple):
+    """The estimate of a filter at a step; None where it has none."""
+
+    label: str  # name of the filter in the legend
+    thrust: float | None = None  # [N]
+    thrust_std: float | None = None  # standard deviation [N]
+    omega_m: float | None = None  # [rad/s]
+    omega_m_std: float | None = None  # [rad/s]
+    U_a: float | None = None  # [m/s]
+    U_a_std: float | None = None  # [m/s]
+
+
+class Renderer(PlantRenderer):
+    """Draws an episode: `begin` it, `add` every moment from the reset's on, `draw` where a frame is wanted.
+
+    Its arguments, beside those of `PlantRenderer`, are gear_ratio, motor speed over propeller speed; diameter, of
+    the propeller [m]; max_voltage, full scale of the voltage gauge [V]; and thrust_scale, speed_scale and
+    flow_scale, thrust [N], motor speed [rad/s] and flow velocity [m/s] at full voltage, to which arrows are in
+    proportion.
+    """
+
+    caption = "Bow thruster"
+    moment, overlay = Moment, Overlay
+    positive = "gear_ratio", "diameter", "max_voltage", "thrust_scale", "speed_scale", "flow_scale"
+    remembered = "_angle", "_angle_of_frame", "_angle_of_last_frame", "_count_of_frame", "_omega_m"
+
+    def _make_pictures(self) -> None:
+        canvas, arguments = self._canvas, self.arguments
+        thrust, speed, flow = (arguments[f"{name}_scale"] for name in ("thrust", "speed", "flow"))
+        self._scene = Scene(canvas, arguments["diameter"], arguments["gear_ratio"], thrust, flow)
+        strips = (
+            Strip("thrust", "thrust [N]", 1, 207, 66, thrust, "measured_thrust", "reference", False),
+            Strip("omega_m", "motor speed [rad/s]", 1, 292, 38, speed),
+            Strip("U_a", "flow [m/s]", 2, 349, 34, flow),
+        )
+        self._charts = Charts(canvas, strips, top=HEIGHT, dt=arguments["dt"])
+        self._gauges = Gauges(canvas, arguments["max_voltage"])
+
+    @property
+    def blade_angle(self) -> float:
+        """Angle that the propeller has turned since the episode began [rad]."""
+        return self._angle
+
+    def begin(self) -> None:
+        """Start an episode: the strip charts are empty and a blade points up."""
+        super().begin()
+        self._angle = self._angle_of_frame = self._angle_of_last_frame = 0.0
+        self._count_of_frame = 0
+        self._omega_m = 0.0
+
+    def add(self, moment: Moment, overlay: Overlay | None = None) -> None:
+        """Note a moment, dt after the one before; the first of an episode is that of the reset.
+
+        Where the truth is not known, NaN, the propeller turns and the water flows as the filter believes.
+        """
+        omega_m = moment.omega_m
+        if math.isnan(omega_m) and overlay is not None and overlay.omega_m is not None:
+            omega_m = overlay.omega_m
+        omega_m = omega_m if abs(omega_m) < ABSURD else 0.0
+        if self._history.count:
+            self._angle += 0.5 * (self._omega_m + omega_m) * self.arguments["dt"] / self.arguments["gear_ratio"]
+        self._omega_m = omega_m
+        super().add(moment, overlay)
+
+    def _draw(self, columns: dict[str, np.ndarray], count: int, label: str) -> None:
+        """Draw the newest moment, the propeller blurred by the angle that it turned since the last frame."""
+        if count > self._count_of_frame:
+            self._count_of_frame = count
+            self._angle_of_last_frame, self._angle_of_frame = self._angle_of_frame, self._angle
+        moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        believed = {name: newest(columns, f"estimated_{name}") for name in ("omega_m", "U_a", "thrust")}
+        moment = moment._replace(**{name: b for name, b in believed.items() if math.isnan(getattr(moment, name))})
+        self._scene.draw(moment, self._angle_of_last_frame, self._angle_of_frame)
+        self._gauges.draw(columns, self._charts.draw(columns, count - 1, label)[0])
+
+
+# The upper half of the picture: the hull cut through at the thruster, and the propeller seen from port.
+
 
 HEIGHT = 186  # [px]
 MIDDLE = 250  # the ship's centre line [px]
@@ -50,15 +154,15 @@ IN_TUNNEL, OUTSIDE, AMBIENT_LENGTH, FORCE_LENGTH = 76, 100, 80, 130  # arrows at
 class Scene:
     """Hull, tunnel, propeller and arrows."""
 
-    def __init__(
-        self, canvas: Canvas, *, diameter: float, gear_ratio: float, thrust_scale: float, flow_scale: float
-    ):
+    def __init__(self, canvas: Canvas, diameter: float, gear_ratio: float, thrust_scale: float, flow_scale: float):
         """Draw what never moves onto the canvas, and the blades into tables; scales are for arrows [m, N, m/s]."""
         self._canvas = canvas
         self._diameter = diameter
         self._gear_ratio = gear_ratio
         self._thrust_scale = thrust_scale
         self._flow_scale = flow_scale
+        from thruster_env.thruster.propeller import end_view, side_view  # which import pygame
+
         self._side = side_view(PROPELLER_RADIUS)
         self._end = end_view(PORTHOLE_RADIUS - 4)
         self._draw_sea()
@@ -202,9 +306,7 @@ class Gauges:
         """Draw what never moves; max_voltage is the gauge's full scale [V]."""
         self._canvas = canvas
         self._voltage_axis = Axis(-max_voltage, max_voltage, TOP, GAUGE_HEIGHT)
-        for middle in (THRUST, VOLTAGE):
-            canvas.box(middle - 7, TOP - 2, 14, GAUGE_HEIGHT + 4, WHITE, 3)
-            canvas.box(middle - 7, TOP - 2, 14, GAUGE_HEIGHT + 4, (196, 206, 214), 3, 1)
+        draw_gauge_frames(canvas, (THRUST, VOLTAGE), TOP, GAUGE_HEIGHT)
 
     def draw(self, columns, thrust_axis: Axis) -> None:
         """Draw the newest values; the thrust gauge has the ends of the thrust chart."""
@@ -225,12 +327,8 @@ class Gauges:
 
     def _draw_truth(self, title: str, x: float, axis: Axis, value: float) -> None:
         """A bar from zero, with the axis left of it."""
-        canvas, zero = self._canvas, axis.y(0.0)
-        canvas.text(title, (x, TOP - 13), 11, INK, 0.5)
-        if math.isfinite(value):
-            y = min(max(axis.y(value), TOP), TOP + GAUGE_HEIGHT)
-            canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
-            canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
+        canvas = self._canvas
+        draw_gauge(canvas, title, x, axis, value)
         for tick in {axis.low, axis.low / 2, 0.0, axis.high / 2, axis.high}:
             canvas.box(x - 10, axis.y(tick) - 0.5, 3, 1, SOFT_INK)
         axis.label(canvas, x - 17)

@@ -1,16 +1,19 @@
-"""The path in three dimensions: one looks north-east and down, at a box of water with a grid on its bottom.
+"""Pictures of the vehicle on its way, 640 x 400 pixels: in a window (`human`) or as arrays (`rgb_array`).
 
-North runs to the upper right, east to the lower right. The grid lies below everything shown; a plumb line and
-shadows on it show the depth. The box grows by round steps as the vehicle leaves it.
+Above, the last 500 steps of its path in three dimensions beside the path to follow, and its attitude seen from
+port, from astern and from above; below, strip charts of depth and speed, and gauges of thrust and planes. An
+estimate is blue, with its band of two standard deviations; a filter without a position shows in charts and
+attitude only. The common parts of all plants' pictures, and how a filter shows its estimate, are in
+`thruster_env.render`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.auv.rendering.renderer import Moment
 from thruster_env.render.canvas import (
     BAND,
     ESTIMATE,
@@ -25,7 +28,103 @@ from thruster_env.render.canvas import (
     Canvas,
     number,
 )
-from thruster_env.render.charts import ROUND, Axis, newest
+from thruster_env.render.charts import (
+    Axis,
+    Charts,
+    Strip,
+    draw_gauge,
+    draw_gauge_frames,
+    newest,
+    round_up,
+    runs,
+)
+from thruster_env.render.renderer import PlantRenderer
+
+# The contents of a picture: moments, and a filter's estimates of them.
+
+
+class Moment(NamedTuple):
+    """The truth at the end of a step, one entry of the strip charts."""
+
+    time: float  # since the start of the episode [s]
+    x: float  # north [m]
+    y: float  # east [m]
+    depth: float  # [m]
+    phi: float  # [rad]
+    theta: float  # [rad]
+    psi: float  # [rad]
+    u: float  # [m/s]
+    measured_depth: float | None  # None where the sensors have none
+    measured_u: float | None
+    reference_depth: float  # of the path abreast [m]
+    reference_u: float  # [m/s]
+    thrust: float  # [N]
+    stern: float  # [rad]
+    rudder: float  # [rad]
+
+
+class Overlay(NamedTuple):
+    """A filter's estimate of a moment; None for states that it does not estimate."""
+
+    label: str  # name of the filter in the legend
+    x: float | None = None  # [m]
+    x_std: float | None = None
+    y: float | None = None
+    y_std: float | None = None
+    depth: float | None = None
+    depth_std: float | None = None
+    phi: float | None = None  # [rad]
+    theta: float | None = None
+    psi: float | None = None
+    u: float | None = None  # [m/s]
+    u_std: float | None = None
+
+
+BOTTOM_OF_VIEW = 230  # where the lower part of the picture begins [px]
+
+
+class Renderer(PlantRenderer):
+    """Draws an episode: `begin` it, `add` every moment from the reset's on, `draw` where a frame is wanted.
+
+    Its arguments, beside those of `PlantRenderer`, are path, points (K, 3) of the path to follow, north, east,
+    down [m]; max_thrust, full scale of the thrust's gauge [N]; and max_plane, that of the planes' gauges [rad].
+    """
+
+    caption = "Underwater vehicle"
+    moment, overlay = Moment, Overlay
+    positive = ("max_thrust",)
+
+    def _make_pictures(self) -> None:
+        canvas, arguments, top = self._canvas, self.arguments, BOTTOM_OF_VIEW
+        strips = (
+            Strip("depth", "depth [m]", 2, 254, 54, 100.0, *_named("depth"), says_numbers=False, downward=True),
+            Strip("u", "speed ahead [m/s]", 2, 330, 52, 1.0, *_named("u")),
+        )
+        self._view = View(canvas, arguments["path"])
+        self._dials = Dials(canvas, top)
+        self._charts = Charts(canvas, strips, top=top, dt=arguments["dt"])
+        self._gauges = Gauges(canvas, arguments["max_thrust"], arguments["max_plane"])
+
+    def _draw(self, columns: dict[str, np.ndarray], count: int, label: str) -> None:
+        path = self.arguments["path"]
+        moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        offset = moment.reference_depth - float(path[0, 2]) if len(path) == 2 else 0.0
+        self._view.draw(columns, moment, offset)
+        self._dials.draw(columns, moment)
+        self._charts.draw(columns, count - 1, label)
+        self._gauges.draw(moment)
+
+
+def _named(name: str) -> tuple[str, str]:
+    """Columns of a quantity's measurement and reference."""
+    return f"measured_{name}", f"reference_{name}"
+
+
+# The path in three dimensions: one looks north-east and down, at a box of water with a grid on its bottom.
+#
+# North runs to the upper right, east to the lower right. The grid lies below everything shown; a plumb line and
+# shadows on it show the depth. The box grows by round steps as the vehicle leaves it.
+
 
 WIDTH, HEIGHT = 498, 230  # [px]
 MARGIN = 30  # [px]
@@ -90,7 +189,7 @@ class View:
         low, high = flat.min(axis=0), flat.max(axis=0)
         room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
         size = float(np.max((high - low) * room[0] / room))
-        self._scale = room[0] / _rounded(max(size, LEAST_SIZE))
+        self._scale = room[0] / round_up(max(size, LEAST_SIZE))
         self._middle = np.array([WIDTH, HEIGHT]) / 2 - self._scale * (low + high) / 2
 
     def _at(self, points: np.ndarray) -> np.ndarray:
@@ -101,7 +200,7 @@ class View:
         return self._at(np.asarray(points) * [1.0, 1.0, 0.0] + [0.0, 0.0, floor])
 
     def _draw_grid(self, low: np.ndarray, high: np.ndarray, floor: float) -> None:
-        canvas, step = self._canvas, _rounded(60.0 / self._scale)
+        canvas, step = self._canvas, round_up(60.0 / self._scale)
         first, last = np.floor(low[:2] / step) * step - step, np.ceil(high[:2] / step) * step + step
         corners = [(first[0], first[1]), (last[0], first[1]), (last[0], last[1]), (first[0], last[1])]
         canvas.polygon(self._at(np.array([(*corner, floor) for corner in corners])), BOTTOM)
@@ -186,15 +285,7 @@ def _part_in_view(path: np.ndarray, visited: np.ndarray) -> np.ndarray:
 
 def _runs(points: np.ndarray) -> list[np.ndarray]:
     """Runs of points (K, 3) without NaN."""
-    present = np.isfinite(points).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate(((False,), present, (False,)))))
-    return [points[start:stop] for start, stop in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _rounded(value: float) -> float:
-    """The next round number."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in ROUND if step * power >= value), 10.0 * power)
+    return [points[run] for run in runs(np.isfinite(points).all(axis=1))]
 
 
 # Right of path and charts: the attitude on three dials, and the action of propeller and planes.
@@ -285,21 +376,15 @@ class Gauges:
             STERN: Axis(-top, top, TOP, GAUGE_HEIGHT),
             RUDDER: Axis(-top, top, TOP, GAUGE_HEIGHT),
         }
-        for middle in self._axes:
-            canvas.box(middle - 7, TOP - 2, 14, GAUGE_HEIGHT + 4, WHITE, 3)
-            canvas.box(middle - 7, TOP - 2, 14, GAUGE_HEIGHT + 4, (196, 206, 214), 3, 1)
+        draw_gauge_frames(canvas, self._axes, TOP, GAUGE_HEIGHT)
 
     def draw(self, moment: Moment) -> None:
         """Draw thrust and planes at a moment."""
         values = {THRUST: moment.thrust, STERN: math.degrees(moment.stern), RUDDER: math.degrees(moment.rudder)}
         for (x, axis), title in zip(self._axes.items(), ("thrust", "stern", "rudder"), strict=True):
-            canvas, value, zero = self._canvas, values[x], axis.y(0.0)
-            if math.isfinite(value):
-                y = min(max(axis.y(value), TOP), TOP + GAUGE_HEIGHT)
-                canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
-                canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
-            canvas.box(x - 7, zero - 0.4, 14, 0.8, SOFT_INK)
-            canvas.text(title, (x, TOP - 13), 11, INK, 0.5)
+            canvas, value = self._canvas, values[x]
+            draw_gauge(canvas, title, x, axis, value)
+            canvas.box(x - 7, axis.y(0.0) - 0.4, 14, 0.8, SOFT_INK)
             text = number(value, 2) + " N" if x == THRUST else number(value, 1) + "\u00b0"
             canvas.text(text, (x, TOP + GAUGE_HEIGHT + 14), 11, INK, 0.5)
 
