@@ -19,9 +19,8 @@ from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
 from thruster_env.effects.effects import Context, chain_of, dropping_channels, encoded
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env.copies import BLOCK, Channel, PlantCopies, add_noise, machine_code_of, reader_of
-from thruster_env.env.env import PlantEnv, ReportRows
+from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv
-from thruster_env.env.vector_env import PlantVectorEnv
 from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity
 

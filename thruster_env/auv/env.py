@@ -15,9 +15,8 @@ from thruster_env.auv.simulation import Copies
 from thruster_env.auv.task import make_depth_task, make_task
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
-from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
+from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv, Split, split
-from thruster_env.env.vector_env import PlantVectorEnv
 from thruster_env.render.renderer import MODES
 
 # What every env and vector env of the vehicle offers to filters.
@@ -72,58 +71,10 @@ class ModelledVehicle(ModelledEnv):
         return Overlay(label, **values, **spreads)
 
 
-# How a vehicle env draws itself.
-
-
-class RenderedVehicle(RenderedEnv):
-    """An env with a vehicle as `plant` and a path in its `task`."""
-
-    task: Any
-    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
-
-    def make_renderer(self) -> Renderer:
-        """The renderer of the vehicle and its path."""
-        assert self.render_mode is not None  # a renderer is made for a mode only
-        return Renderer(
-            self.render_mode,
-            path=self.task.path.points,
-            max_thrust=self.plant.max_thrust,
-            max_plane=self.plant.max_plane,
-            dt=self.plant.dt,
-            frames_per_second=self.metadata["render_fps"],
-            size=self.render_size,
-        )
-
-    def moment_of(self, report: list[float]) -> Moment:
-        """The renderer's input from a report: truth, measurements, the path abreast and the actuators."""
-        channels, state = self.plant.channels, report[at.STATE : at.STATE + at.N]
-
-        def measured(symbol: str) -> float | None:
-            return report[at.READINGS + channels.index(symbol)] if symbol in channels else None
-
-        return Moment(
-            time=report[TIME],
-            x=state[at.X],
-            y=state[at.Y],
-            depth=state[at.Z],
-            phi=state[at.PHI],
-            theta=state[at.THETA],
-            psi=state[at.PSI],
-            u=state[at.U],
-            measured_depth=measured("z"),
-            measured_u=measured("u"),
-            reference_depth=state[at.Z] - report[at.TRUE_ERRORS + 1],
-            reference_u=self.task.speed,
-            thrust=report[at.INPUTS],
-            stern=report[at.INPUTS + 2],
-            rudder=report[at.INPUTS + 3],
-        )
-
-
 # `SegorogeniAUV-v0`: thrust and two planes in, noisy measurements out, the state hidden.
 
 
-class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
+class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
     """An autonomous underwater vehicle: go straight north at a depth and a speed, by propeller and two planes.
 
     ## Action space
@@ -187,6 +138,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
     go by name. A wrong value raises a ValueError.
     """
 
+    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
     observes_errors = False
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"])
@@ -219,6 +171,44 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
     def copies_of(self, count: int) -> Copies:
         """Return `count` vehicles with the env's task."""
         return Copies(self.plant, self.task, count)
+
+    def make_renderer(self) -> Renderer:
+        """The renderer of the vehicle and its path."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
+        return Renderer(
+            self.render_mode,
+            path=self.task.path.points,
+            max_thrust=self.plant.max_thrust,
+            max_plane=self.plant.max_plane,
+            dt=self.plant.dt,
+            frames_per_second=self.metadata["render_fps"],
+            size=self.render_size,
+        )
+
+    def moment_of(self, report: list[float]) -> Moment:
+        """The renderer's input from a report: truth, measurements, the path abreast and the actuators."""
+        channels, state = self.plant.channels, report[at.STATE : at.STATE + at.N]
+
+        def measured(symbol: str) -> float | None:
+            return report[at.READINGS + channels.index(symbol)] if symbol in channels else None
+
+        return Moment(
+            time=report[TIME],
+            x=state[at.X],
+            y=state[at.Y],
+            depth=state[at.Z],
+            phi=state[at.PHI],
+            theta=state[at.THETA],
+            psi=state[at.PSI],
+            u=state[at.U],
+            measured_depth=measured("z"),
+            measured_u=measured("u"),
+            reference_depth=state[at.Z] - report[at.TRUE_ERRORS + 1],
+            reference_u=self.task.speed,
+            thrust=report[at.INPUTS],
+            stern=report[at.INPUTS + 2],
+            rudder=report[at.INPUTS + 3],
+        )
 
 
 def action_space(plant: Plant) -> gym.spaces.Box:

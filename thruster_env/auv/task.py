@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 from thruster_env.auv.paths import STRAIGHT_AHEAD, Path, make_path
 from thruster_env.auv.plant import CRUISE_SPEED
-from thruster_env.core.checks import between, positive, within
+from thruster_env.core.checks import between, positive, takes_arguments_of, within
 from thruster_env.core.compiled import inlined
+from thruster_env.env.plant_data import checked_weights
 
 DEFAULT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # cross-track, vertical, speed, planes
-LARGEST_WEIGHT = 1e9
 LARGEST_DEPTH = 1e4  # [m]
 HOLD_TIMES = (1e-3, 1e6)  # [s]
 
@@ -22,7 +22,7 @@ class Task(NamedTuple):
     speed: float  # along the body [m/s]
     step_size: float = 0.0  # of the depth [m]
     hold_time: float = 15.0  # between two steps of the depth [s]
-    weights: tuple[float, float, float, float] = DEFAULT_WEIGHTS
+    weights: tuple[float, ...] = DEFAULT_WEIGHTS
 
 
 @inlined
@@ -59,50 +59,22 @@ def make_task(
     Raises:
         ValueError: if an argument is wrong; the message states the rule and the value.
     """
-    weights = {
-        "cross_track": cross_track_weight,
-        "vertical": vertical_weight,
-        "speed": speed_weight,
-        "plane": plane_weight,
-    }
-    cross_track, vertical, speed_error, planes = (
-        within(f"{name}_weight", positive(f"{name}_weight", value, zero_allowed=True), LARGEST_WEIGHT)
-        for name, value in weights.items()
+    weights = checked_weights(
+        cross_track=cross_track_weight, vertical=vertical_weight, speed=speed_weight, plane=plane_weight
     )
-    checked = cross_track, vertical, speed_error, planes
     depth = within("depth", depth, LARGEST_DEPTH)
-    return Task(make_path(path, depth), positive("speed", speed, zero_allowed=True), weights=checked)
+    return Task(make_path(path, depth), positive("speed", speed, zero_allowed=True), weights=weights)
 
 
-def make_depth_task(
-    step_size: float = 2.0,
-    hold_time: float = 15.0,
-    depth: float = 6.0,
-    speed: float = CRUISE_SPEED,
-    cross_track_weight: float = DEFAULT_WEIGHTS[0],
-    vertical_weight: float = DEFAULT_WEIGHTS[1],
-    speed_weight: float = DEFAULT_WEIGHTS[2],
-    plane_weight: float = DEFAULT_WEIGHTS[3],
-) -> Task:
+@takes_arguments_of(make_task, leaving_out=["path"], defaults={"depth": 6.0})
+def make_depth_task(step_size: float = 2.0, hold_time: float = 15.0, **arguments) -> Task:
     """The same for steps of the depth on a straight course north.
 
     Args:
         step_size: by which the depth goes up or down [m], at random, within twice of it about `depth`.
         hold_time: between two steps [s].
-        depth: where it begins [m].
-        speed: as for `make_task`, and so are the weights.
-        cross_track_weight: see `make_task`.
-        vertical_weight: see `make_task`.
-        speed_weight: see `make_task`.
-        plane_weight: see `make_task`.
+        **arguments: those of `make_task`, without path; the depth, where it begins, is 6 m by default.
     """
-    task = make_task(
-        depth=depth,
-        speed=speed,
-        cross_track_weight=cross_track_weight,
-        vertical_weight=vertical_weight,
-        speed_weight=speed_weight,
-        plane_weight=plane_weight,
-    )
+    task = make_task(**arguments)
     size = within("step_size", positive("step_size", step_size, zero_allowed=True), LARGEST_DEPTH)
     return task._replace(step_size=size, hold_time=between("hold_time", hold_time, *HOLD_TIMES, "s"))

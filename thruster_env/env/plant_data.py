@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.checks import covariance, one_of, short_repr, vector
+from thruster_env.core.checks import covariance, one_of, positive, short_repr, vector, within
 from thruster_env.effects.effects import Registry
 
+LARGEST_WEIGHT = 1e9
 LARGEST_STATE = 1e50  # in SI units: beyond it floating point may overflow; its square of a variance
 
 
@@ -67,6 +68,14 @@ def initial_distribution(
     raise ValueError(
         f"initial_state must be None, {count} numbers, {{{key!r}: {letter}}} or {{'mean': [..], 'cov': [..]}}, "
         f"but got {short_repr(initial_state)}"
+    )
+
+
+def checked_weights(**weights: float) -> tuple[float, ...]:
+    """The weights of a reward's terms by name; ValueError for a negative one, or one above LARGEST_WEIGHT."""
+    return tuple(
+        within(f"{name}_weight", positive(f"{name}_weight", value, zero_allowed=True), LARGEST_WEIGHT)
+        for name, value in weights.items()
     )
 
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from thruster_env.core.checks import arguments_of, finite, takes_arguments_of
 from thruster_env.core.memory import KEY_0, KEY_1, TIME
-from thruster_env.env.env import PlantEnv, RenderedEnv, ReportRows
+from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv
-from thruster_env.env.vector_env import PlantVectorEnv
 from thruster_env.render.renderer import MODES
 from thruster_env.thruster.effects import Constant, drawn_parameters
 from thruster_env.thruster.linear.analysis import state_range
@@ -91,37 +90,10 @@ def renderer_of(
     )
 
 
-class RenderedThruster(RenderedEnv):
-    """An env with a thruster as `plant`, and a `_memory` of one copy."""
-
-    _memory: np.ndarray
-    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
-
-    def make_renderer(self) -> Renderer:
-        """What draws the thruster in its water."""
-        assert self.render_mode is not None  # a renderer is made for a mode only
-        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"], self.render_size)
-
-    def moment_of(self, report: list[float]) -> Moment:
-        """What the renderer adds of a report: truth, measured thrust, reference and voltage."""
-        channels = self.plant.channels
-        measured = report[READINGS + channels.index("thrust")] if "thrust" in channels else math.nan
-        return Moment(
-            time=report[TIME],
-            omega_m=report[OMEGA],
-            U_a=report[FLOW],
-            thrust=report[THRUST],
-            measured_thrust=measured,
-            reference=report[REFERENCE],
-            voltage=float(self._memory[0, COMMAND, 0]),
-            ambient_velocity=report[AMBIENT],
-        )
-
-
 # `BowThruster-v0`: voltage in, noisy thrust out, the state hidden.
 
 
-class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
+class BowThrusterEnv(ModelledThruster, PlantEnv):
     """A ship's bow thruster: hold a thrust by the voltage of the motor, seeing the measured thrust only.
 
     ## Action space
@@ -168,6 +140,7 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
     raises a ValueError.
     """
 
+    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
     inputs = INPUTS
     observes_reference = False
 
@@ -197,6 +170,26 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
     def copies_of(self, count: int) -> Copies:
         """Return `count` thrusters with the env's task."""
         return Copies(self.plant, self.task, count)
+
+    def make_renderer(self) -> Renderer:
+        """What draws the thruster in its water."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
+        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"], self.render_size)
+
+    def moment_of(self, report: list[float]) -> Moment:
+        """What the renderer adds of a report: truth, measured thrust, reference and voltage."""
+        channels = self.plant.channels
+        measured = report[READINGS + channels.index("thrust")] if "thrust" in channels else math.nan
+        return Moment(
+            time=report[TIME],
+            omega_m=report[OMEGA],
+            U_a=report[FLOW],
+            thrust=report[THRUST],
+            measured_thrust=measured,
+            reference=report[REFERENCE],
+            voltage=float(self._memory[0, COMMAND, 0]),
+            ambient_velocity=report[AMBIENT],
+        )
 
     def _reference_signals(self, reference):
         return [Constant(thrust=half_thrust(self.plant) if reference is None else finite("reference", reference))]

@@ -6,15 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.checks import positive, within
 from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect
+from thruster_env.env.plant_data import checked_weights
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.linear.analysis import equilibrium, state_range, steady_state
 from thruster_env.thruster.plant import Plant
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
-LARGEST_WEIGHT = 1e9
 ABSURD = 100.0  # a state this many times its range away from rest ends the episode
 
 
@@ -25,7 +24,7 @@ class Task(NamedTuple):
     """
 
     reference: tuple[Effect, ...] = ()
-    weights: tuple[float, float, float] = DEFAULT_WEIGHTS
+    weights: tuple[float, ...] = DEFAULT_WEIGHTS
 
 
 @inlined
@@ -52,12 +51,8 @@ def make_task(
     Raises:
         ValueError: if an argument is wrong; the message states the rule and the value.
     """
-    weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
-    tracking, energy, voltage_rate = (
-        within(f"{name}_weight", positive(f"{name}_weight", value, zero_allowed=True), LARGEST_WEIGHT)
-        for name, value in weights.items()
-    )
-    return Task(REFERENCE_SIGNALS.make(reference), (tracking, energy, voltage_rate))
+    weights = checked_weights(tracking=tracking_weight, energy=energy_weight, voltage_rate=voltage_rate_weight)
+    return Task(REFERENCE_SIGNALS.make(reference), weights)
 
 
 def thrust_scale(plant: Plant) -> float:

@@ -16,7 +16,6 @@ from thruster_env.thruster.linear.analysis import (
     frequency_response,
     jacobians,
     linear_model,
-    response_figure,
     response_grids,
     state_range,
     steady_state,
@@ -25,6 +24,7 @@ from thruster_env.thruster.linear.analysis import (
 )
 from thruster_env.thruster.linear.published import PUBLISHED, SAMPLE_TIME, published_for
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
+from tuning.cli.inspect import response_figure
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 every_print = pytest.mark.parametrize("name", PUBLISHED)
