@@ -52,7 +52,6 @@ def part_that_is_kept(name: str, value) -> float:
 
 # The variational Bayesian filter: an extended Kalman filter with an inverse Wishart belief of R.
 
-
 MOST_ITERATIONS = 50  # which programs repeat without a loop
 
 
@@ -117,7 +116,6 @@ class VariationalBayesFilter(PageFilter):
     iterations: int = 3
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         factor = part_that_is_kept("forgetting_factor", self.forgetting_factor)
         object.__setattr__(self, "forgetting_factor", factor)
         object.__setattr__(self, "prior_weight", positive("prior_weight", self.prior_weight))
@@ -191,7 +189,6 @@ class RobustExtendedKalmanFilter(PageFilter):
     iterations: int = 5
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "degrees_of_freedom", positive("degrees_of_freedom", self.degrees_of_freedom))
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 
@@ -265,7 +262,6 @@ class SageHusaFilter(PageFilter):
     process_forgetting_factor: float = 1.0
 
     def __post_init__(self):
-        """Check the factors; raise ValueError that states the rule and the value."""
         for name in ("forgetting_factor", "process_forgetting_factor"):
             object.__setattr__(self, name, part_that_is_kept(name, getattr(self, name)))
 

@@ -132,10 +132,7 @@ def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
 def _filler(form, count: int, positions: tuple[int, ...]) -> Callable:
     """Return `fill(t, c)`: the model's constants, t at these positions and c at the others."""
     if constants_are_array(form):
-        lines = (
-            f"filled = c[:{count}].copy()",
-            *(f"filled[{i}] = t[{q}]" for q, i in enumerate(positions)),
-        )
+        lines = (f"filled = c[:{count}].copy()", *(f"filled[{i}] = t[{q}]" for q, i in enumerate(positions)))
         return written_out("fill", "t, c", *lines, "filled")
     values = [f"t[{positions.index(i)}]" if i in positions else f"c[{i}]" for i in range(count)]
     source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"

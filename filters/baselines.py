@@ -37,23 +37,13 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
     replaced = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
 
     @inlined
-    def misfit_of_number(x, v, z, c):
-        return observe(replaced(x, v), c)[channel] - z
+    def misfit(x, v, z, c):
+        off = observe(replaced(x, v), c)[channel] - z
+        return wrapped(off) if angle else off
 
     @inlined
-    def misfit_of_angle(x, v, z, c):
-        return wrapped(observe(replaced(x, v), c)[channel] - z)
-
-    @inlined
-    def crossing_of_number(before, after):
-        return (after > 0.0) != (before > 0.0)
-
-    @inlined
-    def crossing_of_angle(before, after):
-        return (after > 0.0) != (before > 0.0) and abs(after - before) < math.pi
-
-    misfit = misfit_of_angle if angle else misfit_of_number
-    crossing = crossing_of_angle if angle else crossing_of_number
+    def crossing(before, after):
+        return (after > 0.0) != (before > 0.0) and (not angle or abs(after - before) < math.pi)
 
     @inlined
     def halved(x, z, c, near, far, misfit_near):
@@ -101,18 +91,6 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
     return solve
 
 
-@inlined
-def blend_numbers(y, z, share):
-    """The output of a low-pass filter, with this share of its last output y, for a measurement z."""
-    return share * y + (1.0 - share) * z
-
-
-@inlined
-def blend_angles(y, z, share):
-    """`blend_numbers` of angles: from y the short way towards z."""
-    return wrapped(y + (1.0 - share) * wrapped(z - y))
-
-
 @lru_cache(maxsize=64)
 def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, int] | None) -> Kernels:
     """Kernels of all baselines for a model's functions and shape.
@@ -127,25 +105,21 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     layout, source, first_parameter = memory_places(n, m), number_places(n, m), own_place(shape)
     substeps_place, step_place, likelihood_place = source.substeps, layout.step, layout.log_likelihood
-    smooth_place, known_place, reach_place, share_place = (
-        layout.extras + n,
-        layout.extras + n + 1,
-        first_parameter,
-        first_parameter + 1,
-    )
+    smooth_place, known_place = layout.extras + n, layout.extras + n + 1
+    reach_place, share_place = first_parameter, first_parameter + 1
     read_open, store_open = vector_reader(n, layout.extras), vector_writer(n, layout.extras)
     (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    prior_mean, constants, control = (
-        vector_reader(n, source.prior_mean),
-        constants_reader(shape),
-        vector_reader(shape.inputs),
-    )
+    prior_mean, control = vector_reader(n, source.prior_mean), vector_reader(shape.inputs)
+    constants = constants_reader(shape)
     measured, difference = vector_reader(m), innovation_of(shape)
     component, channel = inverted or (0, 0)
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     solve = component_solver(observe, n, component, channel, angle)
-    blend = blend_angles if angle else blend_numbers
     no_cov, no_s = zeros_of(n, n), zeros_of(m, m)
+
+    @inlined
+    def blend(y, z, share):  # the low-pass filter; of angles from y the short way towards z
+        return wrapped(y + (1.0 - share) * wrapped(z - y)) if angle else share * y + (1.0 - share) * z
 
     @inlined
     def estimate(row, numbers):
@@ -242,7 +216,6 @@ class Inversion(OpenLoop):
     reach: float | None = None
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         model = self.model
         i = place_of("inverted", self.inverted, model.n)
         object.__setattr__(self, "inverted", i)
@@ -292,7 +265,6 @@ class LowPass(Inversion):
     time_constant: float = 2.0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "time_constant", positive("time_constant", self.time_constant))
 

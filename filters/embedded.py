@@ -95,12 +95,8 @@ def _embedded_matrices(
 ) -> AffineModel:
     """The embedded model of an affine model: affine itself, so its filters need no operating point."""
     a, b, offset, c, shift = model.matrices()
-    whole_a, whole_b, whole_offset, whole_c = (
-        np.eye(n),
-        np.zeros((n, b.shape[1])),
-        np.zeros(n),
-        np.zeros((model.m, n)),
-    )
+    whole_a, whole_b = np.eye(n), np.zeros((n, b.shape[1]))
+    whole_offset, whole_c = np.zeros(n), np.zeros((model.m, n))
     at = list(positions)
     whole_a[np.ix_(at, at)], whole_b[at], whole_offset[at], whole_c[:, at] = a, b, offset, c
     return affine_model(

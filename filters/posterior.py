@@ -165,12 +165,9 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
 
 def has_bound(process_noise_cov: np.ndarray) -> bool:
     """Whether a Q has a posterior bound: the recursion needs its inverse, which rounding must not make up."""
-    return _least_direction(process_noise_cov) > SINGULAR
-
-
-def _least_direction(q: np.ndarray) -> float:
-    """The least eigenvalue of Q, its variances scaled to 1; 0 if one of these is 0."""
-    return float(np.linalg.eigvalsh(correlations(q)[0])[0]) if np.diag(q).all() else 0.0
+    if not np.diag(process_noise_cov).all():
+        return False
+    return bool(np.linalg.eigvalsh(correlations(process_noise_cov)[0])[0] > SINGULAR)
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
@@ -197,10 +194,8 @@ def _square(root: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=64)
 def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition = shape.n, shape.m, functions.transition
-    transition_matrix, observation_matrix = (
-        transition_slopes(functions, shape),
-        observation_slopes(functions, shape),
-    )
+    transition_matrix = transition_slopes(functions, shape)
+    observation_matrix = observation_slopes(functions, shape)
     (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
     state, store_state = vector_reader(n), vector_writer(n)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
@@ -209,10 +204,8 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     times, identity = multiplier(n, n, n), matrix_reader(n, n)
     read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
     quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
-    accumulate, move_mean = (
-        _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n),
-        _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n),
-    )
+    accumulate = _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n)
+    move_mean = _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n)
     less_mean = _from_mean(n, functions.transition_jacobian is None)
     fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
 

@@ -21,7 +21,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 # Restarts from the prior, in words: how many, the first step and state, and the likely cause.
 
-
 Flaw = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
 Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
 UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
@@ -123,7 +122,6 @@ class FirstRestart:
     """
 
     def __init__(self, filter_: Filter):
-        """Begin before the first measurement."""
         self._filter, self._step = filter_, 0
         self._before: list[Moments] | None = None
         self.event: tuple[int, tuple[str, ...], str] = 0, (), "it did not occur when the run was repeated"
@@ -153,7 +151,6 @@ class FirstRestarts:
     """The first restarts of N copies of a filter."""
 
     def __init__(self, filter_: Filter, count: int):
-        """Begin before the first measurements."""
         n = filter_.kernel_model.n
         self._filter, self._counts, self._steps = filter_, np.zeros(count), np.zeros(count, dtype=int)
         self._means, self._covs = np.zeros((count, n)), np.zeros((count, n, n))
@@ -312,7 +309,6 @@ def _kind(values: np.ndarray) -> str:
 
 
 # Where the trajectories of a batch begin, if that is not the model's prior; and a prior that is wide.
-
 
 PRIOR, MEASUREMENT = "prior", "measurement"
 STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin

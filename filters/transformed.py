@@ -99,7 +99,6 @@ class _OfStates:
         return {name: as_made(value) for name, value in vars(self).items()}
 
     def __setstate__(self, state: dict) -> None:
-        """The function made again."""
         vars(self).update({name: as_function(value) for name, value in state.items()})
 
 

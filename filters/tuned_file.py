@@ -23,7 +23,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 # The model of a tuned file, as data, and its comparison with another one.
 
-
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)
 
@@ -92,7 +91,6 @@ def _listed(entries: list) -> str:
 
 
 # The tuned file as every program reads it: data, checked entry by entry, that can name no code.
-
 
 FILE_FORMAT = "tuned filter"
 OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3

@@ -135,12 +135,7 @@ def operation(shape: Callable, symmetric: Callable = never, *, reduces: bool = F
 
 
 def input_matrix(
-    name: Any,
-    shape: tuple[int, ...],
-    *,
-    symmetric: bool = False,
-    member: bool = False,
-    like: Matrix | None = None,
+    name: Any, shape: tuple[int, ...], *, symmetric: bool = False, member: bool = False, like: Matrix | None = None
 ) -> Matrix:
     """An input of a graph, called `name`; `like` is another matrix of the same graph."""
     matrix = Matrix(name, (), shape, symmetric, None if like is None else like._made)

@@ -128,7 +128,6 @@ def stretches(before, after, part):
 
 # Operations on vectors of members as loops over arrays (n, columns), for `calls`: a column per member.
 
-
 Kinds = tuple[tuple[tuple[int, ...], bool], ...]  # of arguments: the shape, and whether each member has one
 
 

@@ -98,7 +98,6 @@ def weighted_covariance(x, w):
 
 # Log densities of innovations, and their derivatives along a parameter.
 
-
 LEVEL = 0.5 * math.log(2.0 * math.pi)
 
 

@@ -115,12 +115,7 @@ GAPS = " Rows that are\n   missing by their times are predicted, as in `thruster
 
 
 def log_program(
-    name: str,
-    programs: FilterPrograms,
-    *,
-    single: bool = False,
-    tested: bool = False,
-    dt: float | None = None,
+    name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False, dt: float | None = None
 ) -> str:
     """The source of the program for a filter in C of this name.
 

@@ -173,7 +173,6 @@ class TestsWriter:
     """Writes the parts of a filter's files that test its innovations."""
 
     def __init__(self, monitor: Monitor, name: str, m: int, single: bool):
-        """Take the tests, the filter's name, and how many channels it has."""
         reference, cusum, glr, low, high, block, stuck, missing, *of_outliers = monitor.limits(m).tolist()
         self._monitor, self._name, self._numbers = monitor, name, (cusum, glr, low, high, of_outliers)
         real = {"reference": reference, "cusum": cusum, "glr": glr * glr, "low": low, "high": high, "zero": 0.0}

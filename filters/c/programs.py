@@ -40,7 +40,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 # Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
 
-
 KEYWORDS = frozenset(  # of C99 to C23 and C++20, and tokens that C++ writes as words
     "alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class "
     "co_await co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype "
@@ -116,7 +115,6 @@ def _strip_comments(text: str) -> str:
 
 
 # A page's stages as programs in C: a model's numbers are constants in them, so that zeros and ones vanish.
-
 
 NIS = -1  # its place in a row, where machine code has none
 RESERVED = frozenset(  # names in the struct of every filter in C, and of its tests

@@ -23,7 +23,6 @@ from thruster_env.core.files import check_target, write_whole
 
 # NAME.hpp: a filter in C as a class of C++.
 
-
 CLASS = """\
 /* The filter {name} as a class of C++11; link with {name}.c, which a compiler of C makes. */
 #ifndef {guard}_HPP
@@ -98,7 +97,6 @@ def class_of(name: str, programs: FilterPrograms, *, single: bool = False, teste
 
 # NAME.h and NAME.c of a filter.
 
-
 STAND_IN = "another_name"  # of a filter whose own words are asked for
 
 
@@ -159,7 +157,6 @@ def c_filter(
 
 # Bytes of a filter in C according to gcc: its struct, its stack and its code.
 
-
 CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
 COMPILERS = {"gcc": "", "arm-none-eabi-gcc": CORTEX_M4}  # with arguments
 ONE = '#include "{name}.h"\n\nextern {name} a_filter;\n{name} a_filter;\n'  # a global, which is its size
@@ -213,7 +210,6 @@ def sizes_of(generated: CFilter, compiler: str = "gcc") -> Sizes | None:
 
 
 # A Cortex-M4 that QEMU emulates, for a program that filters a log: start-up code, memory map, and commands.
-
 
 BOARD = """\
 extern void _start(void);
@@ -270,7 +266,6 @@ On a Cortex-M4 that QEMU emulates (gcc-arm-none-eabi and qemu-system-arm of Debi
 
 
 # A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them.
-
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.10)
@@ -346,6 +341,8 @@ def write_project(
     generated, programs = c_filter(filter_, name, single=single, monitor=watch), programs_of(filter_)
     model = programs.model
     predict, update = programs.operations
+    build = BUILD.format(name=generated.name, flags="-std=c99 -O2")
+    board_text = BOARD_README.format(build=build, emulate=EMULATE.format(name=generated.name))
     sizes = {
         compiler: measured for compiler in COMPILERS if (measured := sizes_of(generated, compiler)) is not None
     }
@@ -367,7 +364,7 @@ def write_project(
         "update": update,
         "draws": DRAWS.format(name=generated.name, members=programs.members) if programs.members else "",
         "alarms": "" if watch is None else TestsWriter(watch, generated.name, model.m, single).readme,
-        "board": _board_section(generated.name) if board else "",
+        "board": board_text if board else "",
     }
     texts = {
         f"{generated.name}.h": generated.header,
@@ -384,8 +381,3 @@ def write_project(
     for file, text in zip(files, texts.values(), strict=True):
         write_whole(file, text)
     return files
-
-
-def _board_section(name: str) -> str:
-    build = BUILD.format(name=name, flags="-std=c99 -O2")
-    return BOARD_README.format(build=build, emulate=EMULATE.format(name=name))

@@ -24,7 +24,6 @@ from thruster_env.model.shape import LANES, padded
 
 # NAME.h and NAME.c of a filter of mean and covariance.
 
-
 LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
 TEST_ANEW = "    {name}_test_anew(filter);\n"
 TEST_UPDATE = "    test_update(filter, z);\n"
@@ -45,7 +44,6 @@ class Writer:
     of_key = by_key = ""
 
     def __init__(self, name: str, programs: FilterPrograms, single: bool, tests: TestsWriter | None):
-        """Take a filter."""
         self.name, self.programs, self.single, self.tests = name, programs, single, tests
         self.model, self.real = programs.model, "float" if single else "double"
         self.of_u = f", const {self.real} *u" if self.model.inputs else ""
@@ -275,7 +273,6 @@ def _plain(text: str) -> str:
 
 # NAME.h and NAME.c of an ensemble filter: loops over its members, and the normals that they are moved by.
 
-
 DRAW = """\
 /* Philox4x32-10 of a counter and a key (Salmon, Moraes, Dror, Shaw 2011). */
 static void philox(uint32_t counter[4], uint32_t key_0, uint32_t key_1)
@@ -320,7 +317,6 @@ class EnsembleWriter(Writer):
     by_key = "    filter->key[0] = key_0;\n    filter->key[1] = key_1;\n    filter->step = 0;\n"
 
     def __init__(self, name: str, programs: FilterPrograms, single: bool, tests: TestsWriter | None):
-        """Take a filter."""
         super().__init__(name, programs, single, tests)
         self._width = padded(programs.members, LANES)  # so that normals are those of Python
         self._rows = {"table": ("filter->members", programs.members), "draws": ("filter->normals", self._width)}

@@ -18,7 +18,6 @@ from thruster_env.core.threads import spread
 
 # Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions.
 
-
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
 
@@ -164,7 +163,6 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
 
 # Do innovations contain anything that the filter could have predicted? Their correlation over time.
 
-
 LAGS = 20
 
 
@@ -245,7 +243,6 @@ def _all_pairs(mask: np.ndarray, lags: int) -> np.ndarray:
 
 
 # Does a model blow up between samples? Then its predictions are off by more than any Q or R explains.
-
 
 BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
 

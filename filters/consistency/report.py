@@ -129,17 +129,12 @@ def joined(parts: Sequence[Findings]) -> Findings:
     """Findings of all runs, from parts in their order."""
     present = [part.present for part in parts if part.present is not None]
     return Findings(
-        _join_residuals([part.errors for part in parts]),
-        _join_residuals([part.innovations for part in parts]),
+        Residuals(*map(np.concatenate, zip(*(part.errors for part in parts), strict=True))),
+        Residuals(*map(np.concatenate, zip(*(part.innovations for part in parts), strict=True))),
         np.concatenate(present) if present else None,
         np.concatenate([part.divergences for part in parts]),
         None if any(part.repeats is None for part in parts) else np.concatenate([part.repeats for part in parts]),
     )
-
-
-def _join_residuals(parts: Sequence[Residuals]) -> Residuals:
-    values, whitened_ones, deviations = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Residuals(values, whitened_ones, deviations)
 
 
 def _residuals(values: np.ndarray, covs: np.ndarray, mask: np.ndarray | None) -> Residuals:

@@ -15,7 +15,6 @@ from filters.consistency.report import ConsistencyReport
 
 # Symptoms in the innovations that no Q and R can cure, and their remedies.
 
-
 HEAVY = 6.0  # kurtosis of innovations; of Laplace's distribution
 STUCK = 40  # equal readings in a row, beyond what a quantised sensor at rest gives for long
 
@@ -101,7 +100,7 @@ def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
     """The verdict of a mean NEES or NIS on the covariance."""
     if np.isnan(mean.value):
         return f"No {name}: the filter gives no covariance, or a singular one."
-    return f"{_capital(confidence(mean, dimension))}: mean {name} {_span(mean)} where {dimension:.3g} is right."
+    return f"{confidence(mean, dimension).capitalize()}: mean {name} {_span(mean)} where {dimension:.3g} is right."
 
 
 def squares_sentence(check: SquaresCheck, runs: int) -> str:
@@ -309,7 +308,3 @@ def rounded(value: float) -> str:
 
 def _span(value: Interval) -> str:
     return f"{rounded(value.value)} [{rounded(value.low)}, {rounded(value.high)}]"
-
-
-def _capital(words: str) -> str:
-    return words[0].upper() + words[1:]

@@ -31,7 +31,6 @@ class Memory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        """Take the sizes, and the page of the filter."""
         n, m, layout = shape.n, shape.m, number_places(shape.n, shape.m)
         tail = layout.constants + shape.constants
         self.tail, self.predicted_tail = tail, tail + m + 2

@@ -38,7 +38,6 @@ from thruster_env.model.shape import (
 
 # The sum over a filter's steps, with its slopes: densities of innovations, or scores of true states.
 
-
 LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
 
 

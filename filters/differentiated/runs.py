@@ -30,7 +30,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 # The filters that have derivatives: those with a page, but for a schedule of gains and the steady one.
 
-
 KINDS: tuple[type[PageFilter], ...] = (
     KalmanFilter,
     ExtendedKalmanFilter,

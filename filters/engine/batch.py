@@ -183,7 +183,6 @@ def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
 
 # Batch session: one belief for each copy of a vector env, all advanced in place by one compiled call.
 
-
 THREADED_COPIES = 256  # one thread runs fewer copies before a second one has woken up
 IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # the task of a copy in a call
 
@@ -207,7 +206,6 @@ class Beliefs:
         return self._filter, self._rows, self._tables
 
     def __setstate__(self, state: tuple) -> None:
-        """Continue from the beliefs."""
         filter_, rows, tables = state
         type(self).__init__(self, filter_, len(rows))
         self._rows[:], self._tables[:] = rows, tables

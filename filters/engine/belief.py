@@ -122,11 +122,6 @@ def memory_places(n: int, m: int) -> MemoryPlaces:
     return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
-def mean_writer(shape: Shape) -> Callable:
-    """Return `store(row, x)`: write the mean, its angles in (-pi, pi]."""
-    return angle_writer(memory_places(shape.n, shape.m).mean, shape.state_angles)
-
-
 @lru_cache(maxsize=64)
 def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
@@ -142,7 +137,7 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     layout = memory_places(n, m)
     return (
         (vector_reader(n, layout.mean), matrix_reader(n, n, layout.cov)),
-        (mean_writer(shape), matrix_writer(n, n, layout.cov)),
+        (angle_writer(layout.mean, shape.state_angles), matrix_writer(n, n, layout.cov)),
         (vector_writer(m, layout.innovation), matrix_writer(m, m, layout.innovation_cov)),
     )
 
@@ -153,7 +148,6 @@ def own_place(shape: Shape) -> int:
 
 
 # Checks of the arguments of filters: beliefs, keys, inputs and measurements.
-
 
 FEW = 4  # states, up to which Python checks a belief faster than NumPy
 
@@ -290,7 +284,6 @@ def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> boo
 
 
 # Restart of a belief that has diverged (not finite, or with a negative variance): it becomes the prior.
-
 
 LARGEST = 1e300  # of the sum of a belief's absolute numbers
 

@@ -96,7 +96,6 @@ class Session:
         return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
 
     def __setstate__(self, state: tuple) -> None:
-        """Continue from the belief."""
         filter_, divergences, arrays = state
         type(self).__init__(self, filter_)
         self._go_on(divergences, arrays)
@@ -327,7 +326,6 @@ class GatedSession(Session):
     """
 
     def __init__(self, filter_: Filter, gate: float):
-        """Allocate the memory of a filter; `gate` is in standard deviations."""
         super().__init__(filter_)
         self.gate = positive("gate", gate)
         if not filter_.has_covariance:
@@ -355,7 +353,6 @@ class GatedSession(Session):
         return super().__getstate__(), self.gate, self.rejected
 
     def __setstate__(self, state: tuple) -> None:
-        """Continue from the belief."""
         of_session, gate, rejected = state
         filter_, divergences, arrays = of_session
         GatedSession.__init__(self, filter_, gate)

@@ -259,7 +259,6 @@ class EnsembleFilter(FilterWithPage):
     least_deviation: float = 0.0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2, LARGEST_ENSEMBLE)
         for name, number in {"ensemble_size": size, **checked(self)}.items():
             object.__setattr__(self, name, number)

@@ -324,7 +324,6 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     window: int = 0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
         object.__setattr__(self, "window", at_least("window", self.window, 0, LONGEST_WINDOW))

@@ -128,7 +128,6 @@ class SerialSquareRootFilter(LocalisedByParts):
 
 # The finite-size ensemble Kalman filter: inflation that follows from the innovation and the number of members.
 
-
 ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
 FLATTEST = 0.25  # smallest slope by which a round divides
 
@@ -200,7 +199,6 @@ class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
     certainty: float = 1.0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "certainty", positive("certainty", self.certainty))
 

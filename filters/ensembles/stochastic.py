@@ -20,7 +20,6 @@ from thruster_env.core.streams import FILTER_ROTATION, fill_normals
 
 # Localisation: distant states and channels count as uncorrelated, so few members are enough for many states.
 
-
 SUPPORT = (10.0 / 3.0) ** 0.5  # half the range of a taper, over its radius
 
 
@@ -50,7 +49,6 @@ class LocalisedFilter(EnsembleFilter):
     radius: float = 0.0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "radius", positive("radius", self.radius, zero_allowed=True))
         if self.radius and self.model.positions is None:
@@ -118,7 +116,6 @@ class EnsembleKalmanFilter(LocalisedFilter):
     centred_perturbations: int = 0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         switch("centred_perturbations", self.centred_perturbations)
 
@@ -224,7 +221,6 @@ class DeterministicUpdateFilter(EnsembleFilter):
     rotations: int = 0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         switch("rotations", self.rotations)
 

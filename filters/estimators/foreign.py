@@ -42,7 +42,6 @@ class ForeignFilter(Filter):
     label: str = ""
 
     def __post_init__(self):
-        """Read the estimator's declarations."""
         estimator = self.estimator
         if not is_estimator(estimator):
             raise ValueError(

@@ -43,7 +43,6 @@ class FilterPyEstimator(Estimator):
         update_arguments: Mapping | None = None,
         name: str | None = None,
     ):
-        """Keep the filter as it is given; see the class."""
         self.name = name or f"filterpy {type(filter).__name__}"
         self._original, self._predict = filter, predict or _predict
         self._arguments = dict(update_arguments or {})
@@ -187,7 +186,6 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
 
 # Stone Soup's predictors and updaters as an estimator.
 
-
 START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 
 
@@ -218,7 +216,6 @@ class StoneSoupEstimator(Estimator):
         set_input: Callable | None = None,
         name: str | None = None,
     ):
-        """Keep the arguments; see the class."""
         self.name = name or f"stonesoup {type(updater).__name__}"
         self._predictor, self._updater, self._prior = predictor, updater, prior
         self._dt, self._set_input = dt, set_input

@@ -65,12 +65,10 @@ class ExtendedKalmanFilter(PageFilter):
     form: str = "covariance"
 
     def __post_init__(self):
-        """Check the form; raise ValueError that states the rule and the value."""
         one_of("form", self.form, self.known_forms)
 
 
 # The iterated extended Kalman filter: each iteration linearises the measurement at the last estimate.
-
 
 MOST_ITERATIONS = 20
 
@@ -119,7 +117,6 @@ class IteratedExtendedKalmanFilter(PageFilter):
     iterations: int = 5
 
     def __post_init__(self):
-        """Check the number of iterations."""
         iterations = at_least("iterations", self.iterations, 1, MOST_ITERATIONS)
         object.__setattr__(self, "iterations", iterations)
 
@@ -156,7 +153,6 @@ class FadingMemoryFilter(PageFilter):
     fading: float = 1.01
 
     def __post_init__(self):
-        """Check the number; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "fading", between("fading", self.fading, 1.0, 10.0))
 
 
@@ -199,7 +195,6 @@ class SchmidtKalmanFilter(PageFilter):
     considered: Any = ()
 
     def __post_init__(self):
-        """Check the indices; raise ValueError that states the rule and the value."""
         considered = places_of("considered", self.considered, self.model.n)
         object.__setattr__(self, "considered", considered)
 
@@ -249,7 +244,6 @@ class HInfinityFilter(PageFilter):
     scale: Any = None
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "theta", positive("theta", self.theta))
         if self.scale is not None:
             scale = vector("scale", self.scale, self.model.n)

@@ -86,7 +86,6 @@ class AffineFilter(PageFilter):
     any_step: ClassVar[bool] = False  # A and B hold for one sample time
 
     def __post_init__(self):
-        """Raise ValueError if a nonlinear model comes without an operating point."""
         point = self.model.operating_state, self.model.operating_input
         if any(part is None for part in point) and not isinstance(self.model, AffineModel):
             raise ValueError(
@@ -135,7 +134,6 @@ class KalmanFilter(AffineFilter):
     schedule: int = 1
 
     def __post_init__(self):
-        """Check the model, the form and the schedule."""
         super().__post_init__()
         one_of("form", self.form, self.known_forms)
         object.__setattr__(self, "schedule", at_least("schedule", self.schedule, 1, MOST_POINTS))
@@ -175,7 +173,6 @@ class KalmanFilter(AffineFilter):
 
 
 # The steady-state Kalman filter: one gain for all steps, from Riccati's equation.
-
 
 STABLE = 1.0 - 1e-7  # upper limit of |eigenvalues| of A (I - K C): errors decay within ten million steps
 
@@ -220,7 +217,6 @@ class SteadyStateKalmanFilter(AffineFilter):
     varying_noise: ClassVar[bool] = False
 
     def __post_init__(self):
-        """Check the model, and solve for the gain."""
         super().__post_init__()
         a, _, _, c, _ = self.kernel_model.matrices()
         try:

@@ -334,9 +334,6 @@ def mixture_kernels(
     )
 
 
-__all__ = ["MixtureFilter", "MixturePage"]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MixtureFilter(Filter):
     """Base of filters that have a page for the parts of a mixture.
@@ -370,10 +367,8 @@ class MixtureFilter(Filter):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        model, shapes = (
-            self.kernel_model,
-            tuple((name, np.shape(array)) for name, array in self.parameters.items()),
-        )
+        model = self.kernel_model
+        shapes = tuple((name, np.shape(array)) for name, array in self.parameters.items())
         count, *own_shape = np.shape(self.of_parts)
         return mixture_kernels(self.written_page, model.functions, model.shape, shapes, count, tuple(own_shape))
 
@@ -437,7 +432,6 @@ class GaussianSumFilter(MixtureFilter):
     component: int = -1
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
         object.__setattr__(self, "component", place_of("component", self.component, self.model.n))
 
@@ -463,7 +457,6 @@ class GaussianSumFilter(MixtureFilter):
 
 
 # The Takagi-Sugeno fuzzy Kalman filter: one Kalman filter a rule, blended by memberships of the state.
-
 
 BLENDINGS = ("weights", "moments", "output")
 
@@ -536,7 +529,6 @@ class FuzzyKalmanFilter(MixtureFilter):
     rule_estimates = MixtureFilter.part_estimates
 
     def __post_init__(self):
-        """Check the range and the choices; raise ValueError that states the rule and the value."""
         one_of("blending", self.blending, BLENDINGS)
         if not isinstance(self.offsets, bool):
             raise ValueError(f"offsets must be True or False, but got {short_repr(self.offsets)}")

@@ -239,7 +239,6 @@ class MultipleModelFilter(Filter):
     absent: Any = None
 
     def __post_init__(self):
-        """Check the modes; raise ValueError that states the rule and the value."""
         _ = self.p, self.transition_matrix
 
     @property
@@ -437,7 +436,6 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
     outlier_rate: float = 0.05
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
         for name, check in (("stay", between), ("outlier_rate", between), ("outlier_scale", positive)):
             ends = (0.0, 1.0) if check is between else ()
             object.__setattr__(self, name, check(name, getattr(self, name), *ends))
@@ -464,7 +462,6 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
 
 
 # Multiple model adaptive estimation: which one of several models is right.
-
 
 USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 

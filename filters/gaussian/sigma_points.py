@@ -160,7 +160,6 @@ class UnscentedKalmanFilter(PageFilter):
     form: str = "covariance"
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         n = self.model.n
         alpha, beta, kappa = positive("alpha", self.alpha), finite("beta", self.beta), finite("kappa", self.kappa)
         if n + kappa <= 0:
@@ -251,7 +250,6 @@ class CubatureKalmanFilter(PageFilter):
 
 
 # Rules of a fuzzy filter: a model's affine approximations at the corners of a range of its states.
-
 
 MOST_STATES = 8  # premises, for 256 rules
 

@@ -74,7 +74,6 @@ class MovingHorizonFilter(Filter):
     disturbance_limit: float = math.inf
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "horizon", at_least("horizon", self.horizon, 1, MOST_STEPS))
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
         one_of("loss", self.loss, LOSSES)

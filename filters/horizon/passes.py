@@ -26,13 +26,7 @@ PATIENCE = 3  # passes without fewer wrong bounds, after which bounds change one
 
 @lru_cache(maxsize=64)
 def horizon_kernels(
-    functions: Functions,
-    shape: Shape,
-    *,
-    room: int,
-    loss: str,
-    bounds: tuple[Bound, ...],
-    limited: bool,
+    functions: Functions, shape: Shape, *, room: int, loss: str, bounds: tuple[Bound, ...], limited: bool
 ) -> Kernels:
     """Kernels for model functions and sizes, with room for `room` + 1 steps.
 

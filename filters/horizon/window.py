@@ -18,17 +18,7 @@ from typing import NamedTuple
 
 from filters.algebra.blocks import careful
 from filters.algebra.matrices import shifted
-from filters.algebra.operations import (
-    divide,
-    eye,
-    joseph,
-    only,
-    present,
-    quotient,
-    sym,
-    uncorrelated,
-    wrap,
-)
+from filters.algebra.operations import divide, eye, joseph, only, present, quotient, sym, uncorrelated, wrap
 from filters.algebra.samples import dot
 from filters.algebra.scalars import choose, constant, count, exceeds, logarithm
 from filters.engine.belief import memory_places
@@ -136,11 +126,8 @@ def correct(model, x, d, P, z, fresh, loss):
     measured = present(z)
     H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
     residual = only(measured, wrap(z - model.h(x), model.measurement_angles))
-    v, square, limit = (
-        residual - H @ d,
-        dot(residual, divide(residual, R)),
-        model.own.threshold * model.own.threshold,
-    )
+    v, square = residual - H @ d, dot(residual, divide(residual, R))
+    limit = model.own.threshold * model.own.threshold
     cost = loss_of(square, measured, limit, loss)
     if loss != QUADRATIC:
         S = sym(H @ P @ H.T + R)
@@ -209,11 +196,7 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
             stored(propagate_jacobian(model, mean, F, memory.u), (mean, F)),
             stored((noise * 0.0, model.Q), (noise, noise_cov)),
             stored(
-                (
-                    F @ updated_d + jump + noise,
-                    sym(F @ updated_P @ F.T) + noise_cov,
-                    cost_of(jump, model.Q),
-                ),
+                (F @ updated_d + jump + noise, sym(F @ updated_P @ F.T) + noise_cov, cost_of(jump, model.Q)),
                 (next_d, next_P, at.moved_cost),
             ),
             stored(

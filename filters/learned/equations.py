@@ -26,7 +26,6 @@ class Equations:
     """
 
     def __init__(self, model: StateSpaceModel):
-        """Take the model; ValueError for one whose steps have any length."""
         if isinstance(model, AnyStepModel):
             raise ValueError("a learned estimator must have steps of one length, but got a model of any step")
         self.model = model

@@ -38,7 +38,6 @@ class TrainedEstimator:
     """
 
     def __init__(self, path: str | Path):
-        """Read a file; ValueError if it is not one of a trained estimator."""
         from safetensors import SafetensorError, safe_open
 
         self.path = str(path)

@@ -49,7 +49,6 @@ class GainNetwork(nn.Module):
     """
 
     def __init__(self, n: int, m: int, outputs: int):
-        """Make the layers, the last one with weights of zero."""
         super().__init__()
         states, channels = n * n, m * m
         self.of_moved, self.of_corrected = dense(n, INPUT_WIDTH * n), dense(n, INPUT_WIDTH * n)

@@ -28,10 +28,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 
 def by_the_clock(
-    filter_: Filter,
-    key: np.ndarray,
-    log: Log,
-    noise: Callable[[float], np.ndarray] | None,
+    filter_: Filter, key: np.ndarray, log: Log, noise: Callable[[float], np.ndarray] | None
 ) -> tuple[Estimates, Restarts | None]:
     """The estimates of a log on its own stamps, in the form of `filters.run`, and the restarts.
 

@@ -37,7 +37,6 @@ from thruster_env.logs.columns import OUTPUT, STATE
 
 # How each filter is drawn: one colour and one dash, the same in every picture.
 
-
 SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
 TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
 MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}

@@ -123,7 +123,6 @@ def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
 
 # The results of a filter's run over a log, in words.
 
-
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 
 

@@ -94,7 +94,6 @@ class Monitor:
     memory: int = 50
 
     def __post_init__(self):
-        """Check the attributes."""
         steps = positive("steps_between", self.steps_between)
         if not 100.0 <= steps <= 1e12:
             raise ValueError(f"steps_between must be from 100 to 1e12, but got {short_repr(self.steps_between)}")
@@ -193,7 +192,6 @@ class Watch:
     """
 
     def __init__(self, monitor: Monitor, channels: int):
-        """Begin."""
         self.monitor, self._limits = monitor, monitor.limits(channels)
         shape = len(TESTS), channels
         self._out = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
@@ -236,7 +234,6 @@ class Watch:
 
 
 # A monitor in a tuned file: its attributes as data, and the thresholds that follow from them.
-
 
 SAFELY = 2  # times the longest run of equal, or missing, readings of what is healthy
 THRESHOLDS = "thresholds"

@@ -132,7 +132,6 @@ def new_state(channels: int, window: int) -> np.ndarray:
 
 # Thresholds of tests on innovations, from how many steps shall lie between two false alarms of each.
 
-
 NODES = 80  # of the integral equation
 LARGEST_THRESHOLD = 60.0  # of thresholds, in standard deviations
 

@@ -229,7 +229,6 @@ class PagedModel:
     """
 
     def __init__(self, memory: NumbersMemory):
-        """Take where the model's numbers lie."""
         shape, self._constants = memory.shape, memory.constants
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
@@ -314,12 +313,8 @@ class Equations(PagedModel):
             for part, shape in zip(parts, shapes, strict=False)
         ]
         value, matrix, by_constants, slope, *curved = operations
-        value.name, matrix.name, by_constants.name, slope.name = (
-            name,
-            name.upper(),
-            f"{name}_c",
-            f"d{name.upper()}",
-        )
+        value.name, matrix.name = name, name.upper()
+        by_constants.name, slope.name = f"{name}_c", f"d{name.upper()}"
         if not trace:
             self.called |= dict(zip(operations, parts, strict=True))
 

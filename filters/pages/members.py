@@ -36,7 +36,6 @@ class MembersMemory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        """Take the sizes."""
         row = memory_places(shape.n, shape.m)
         x = input_matrix(Place("table", 0), (shape.n,), member=True)
         p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)

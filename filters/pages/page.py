@@ -48,10 +48,9 @@ class Page(NamedTuple):
 
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
         """`model.own` of pages: `read(offset, shape)` of each parameter, and the fixed values."""
-        values, offset = [], 0
-        for _, shape in self.own:
-            values.append(read(offset, shape))
-            offset += prod(shape)
+        values = [
+            read(at, shape) for at, (_, shape) in zip(self.parameter_offsets(0).values(), self.own, strict=True)
+        ]
         names = tuple(name for name, _ in (*self.own, *self.fixed))
         return _own_class(names)(*values, *(value for _, value in self.fixed))
 
@@ -87,7 +86,6 @@ class NumbersMemory:
     """
 
     def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, first_parameter: int):
-        """Take the sizes, matrices that stand for a belief, and the offset of the filter's first parameter."""
         n, m = shape.n, shape.m
         layout, row = number_places(n, m), memory_places(n, m)
         self.belief = Place("rows", row.mean), Place("rows", row.cov)

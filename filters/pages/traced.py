@@ -40,7 +40,6 @@ class Traced:
     """
 
     def __init__(self, function: Callable, jacobian: Callable | None, input_count: int, shape: Shape):
-        """Take the function, its Jacobian or None, and how many arguments follow x: two (u, c), or one (c)."""
         self._function, self._input_count, self._shape = traced(function), input_count, shape
         self._jacobian = None if jacobian is None or by_complex_step(jacobian) else traced(jacobian)
         self.parts = self._value, self._matrix, self._by_constants, self._slope

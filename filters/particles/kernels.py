@@ -59,7 +59,6 @@ class Layout:
     """
 
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
-        """Lay out the page's matrices in the memory, and set the model's extras."""
         n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.kept = Place("rows", first), {}
@@ -132,7 +131,6 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
 
 # Systematic resampling of columns of a table, by weights in one of its rows.
 
-
 SCRATCH_ROWS = 3
 
 
@@ -192,12 +190,8 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     works = works_of(page, functions, shape, stages_of, layout.rows + 1)
     row_layout, source, scratch = memory_places(n, m), number_places(n, m), layout.rows + 1
     step, key_0, key_1, likelihood = row_layout.step, row_layout.key_0, row_layout.key_1, row_layout.log_likelihood
-    innovation, cov, r_place, mean_place = (
-        row_layout.innovation,
-        row_layout.innovation_cov,
-        source.r,
-        row_layout.mean,
-    )
+    innovation, cov = row_layout.innovation, row_layout.innovation_cov
+    r_place, mean_place = source.r, row_layout.mean
     logarithm, size_place = n, layout.size.at
     threshold = page.parameter_offsets(own_place(shape)).get("resampling_threshold", 0)
     move = systematic_resampler(n + 1 if page.lookahead else layout.rows, layout.weight.at, scratch)

@@ -114,8 +114,12 @@ class AuxiliaryParticleFilter(WeightedFilter):
 
 def initial_optimal(model, w):
     """Draw a particle from the prior; its noise and the covariance of that are zero."""
-    x, extras = initial_auxiliary(model, w)
-    return x, {"noise_cov": sym(zeros(model.Q, len(w), len(w))), **extras}
+    return weighted.initial_weighted(model, w), no_noise(model, len(w))
+
+
+def no_noise(model, n):
+    """Noise of zero, and a covariance of zero."""
+    return {"noise_cov": sym(zeros(model.Q, n, n)), "noise": zeros(model.Q, n)}
 
 
 def add_process_noise_optimal(model, x, w):
@@ -144,13 +148,7 @@ def update_optimal(model, x, log_w, z, e):
     """Draw particles given the measurement z, and weigh them; NaN marks missing channels."""
     _, v, S = expect(model, x, log_w, z)
     x, d, level = propose(model, x, model.extras["noise"], model.extras["noise_cov"], z, e)
-    return (
-        x,
-        log_w + level,
-        v,
-        S,
-        {"noise": zeros(model.Q, len(x)), "noise_cov": sym(zeros(model.Q, len(x), len(x)))},
-    )
+    return x, log_w + level, v, S, no_noise(model, len(x))
 
 
 OPTIMAL = Page(
@@ -233,7 +231,6 @@ class ParticleFilter(ResampledFilter):
     smoothed: Any = ()
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         one_of("proposal", self.proposal, PROPOSALS)
         one_of("resampling", self.resampling, RESAMPLINGS)
@@ -376,7 +373,6 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
     sampled: Any = (0,)
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         indices = places_of("sampled", self.sampled, self.model.n)
         if not indices:

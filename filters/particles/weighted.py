@@ -93,7 +93,6 @@ class WeightedFilter(FilterWithPage):
     regularisation: float = 0.0
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2)
         if size > LARGEST_ENSEMBLE:
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
@@ -144,7 +143,6 @@ class ResampledFilter(WeightedFilter):
     resampling_threshold: float = 0.5
 
     def __post_init__(self):
-        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         threshold = finite("resampling_threshold", self.resampling_threshold)
         if not 0.0 <= threshold <= 1.0:

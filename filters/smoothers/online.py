@@ -48,7 +48,6 @@ class WithSmoother:
         return vars(self) | {"_passes": None}
 
     def __setstate__(self, state: dict) -> None:
-        """Continue from the attributes."""
         vars(self).update(state)
 
     def __getattr__(self, name: str):

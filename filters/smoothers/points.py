@@ -15,24 +15,17 @@ from filters.algebra.blocks import careful
 from filters.algebra.operations import quotient, sym
 from filters.algebra.points import root, square, units, without_first
 from filters.filter import Filter
-from filters.gaussian import sigma_points as cubature
-from filters.gaussian import sigma_points as unscented
+from filters.gaussian import sigma_points
 from filters.gaussian.extended import ExtendedKalmanFilter, IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
-from filters.gaussian.sigma_points import (
-    CubatureKalmanFilter,
-    UnscentedKalmanFilter,
-    propagate_points,
-    scatter,
-    unscented_moments,
-)
+from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter, propagate_points, scatter
 from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation
 
 
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
     g, w, L, U = model.own.spread, model.own.weight, root(P), without_first(units(x))
-    mean, s, D = unscented_moments(model, X, model.state_angles)
+    mean, s, D = sigma_points.unscented_moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(scatter(model, D, s) + model.Q))
     left = scatter(model, (L * g) @ U - G @ D, G @ s)
@@ -42,14 +35,14 @@ def link_unscented(model, x, P, X):
 def link_cubature(model, x, P, X):
     """The link of a cubature filter."""
     (g, w), L, U = model.own, root(P), without_first(units(x))
-    mean, D = cubature.cubature_moments(model, X, model.state_angles)
+    mean, D = sigma_points.cubature_moments(model, X, model.state_angles)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(square(D) * w + model.Q))
     return mean, G, square((L * g) @ U - G @ D) * w + sym(G @ model.Q @ G.T)
 
 
-UNSCENTED = Relation(unscented.represent_unscented, propagate_points, link_unscented)
-CUBATURE = Relation(cubature.represent_cubature, propagate_points, link_cubature)
+UNSCENTED = Relation(sigma_points.represent_unscented, propagate_points, link_unscented)
+CUBATURE = Relation(sigma_points.represent_cubature, propagate_points, link_cubature)
 
 
 # Filters that have a smoother of Rauch, Tung and Striebel.

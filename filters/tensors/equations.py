@@ -29,7 +29,6 @@ from thruster_env.model.shape import Shape, constants_are_array
 
 # Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
 
-
 WORK: dict[str, Callable] = {
     "+": operator.add,
     "-": operator.sub,
@@ -66,22 +65,12 @@ HAS_SLOPE: dict[str, Callable] = {
 OF_ZERO = frozenset(HAS_SLOPE) - {"arccosh", "arctanh"}  # of these, operations that have one of a positive number
 
 
-def _divisor(number: Number) -> Number:
-    """The number that decides whether an operation has a finite slope."""
-    return number.of[-1 if number.operation == "/" else 0]
-
-
 def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
     """The result of an operation; a constant where it has no finite slope."""
     known = [a.detach() if isinstance(a, Tensor) else a for a in arguments]
     has_slope = HAS_SLOPE[operation](*known)
     moving = function(*(torch.where(has_slope, a, 1.0) if isinstance(a, Tensor) else a for a in arguments))
     return torch.where(has_slope, moving, function(*known))
-
-
-def order_of(wanted: Sequence[Number]) -> list[Number]:
-    """The numbers that `values_of` works out, in order."""
-    return needed_by(wanted)
 
 
 def values_of(
@@ -91,7 +80,7 @@ def values_of(
 
     Args:
         wanted: numbers of one graph.
-        order: `order_of(wanted)`.
+        order: `graphs.needed_by(wanted)`.
         known: tensors of the given numbers by their names; their shapes broadcast.
         like: a tensor of the dtype and on the device of all.
     """
@@ -107,7 +96,7 @@ def values_of(
         elif number.value is not None:
             values[number.place] = number.value if like.dtype == torch.float64 else as_single(number.value)
         elif number.operation in HAS_SLOPE and not (
-            number.operation in OF_ZERO and _divisor(number).sign == POSITIVE
+            number.operation in OF_ZERO and number.of[-1 if number.operation == "/" else 0].sign == POSITIVE
         ):
             function = WORK.get(number.operation) or getattr(torch, number.operation)
             values[number.place] = with_finite_slope(number.operation, function, [*map(tensor, arguments)])
@@ -132,7 +121,6 @@ class OfGraph:
     """An equation whose function can be traced; the Jacobian shares operations with the value."""
 
     def __init__(self, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape):
-        """Trace the function; raises any exception of the function."""
         value, matrix, *_ = Traced(function, jacobian, further_arguments, shape).parts
         graph = Graph(MOST)
         x, *rest = (
@@ -141,7 +129,7 @@ class OfGraph:
         )
         self._value = [graph.number(entry) for entry in value(x, *rest)]
         self._both = self._value + [graph.number(entry) for entry in matrix(x, None, *rest).ravel()]
-        self._orders = [order_of(wanted) for wanted in (self._value, self._both)]
+        self._orders = [needed_by(wanted) for wanted in (self._value, self._both)]
 
     def of_points(self, x: Tensor, *arguments: Tensor) -> Tensor:
         """The values (..., rows, points) at points (..., n, points)."""
@@ -161,16 +149,14 @@ class OfGraph:
 
 
 ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
-LEAVING = frozenset(
-    "tolist numpy __array__".split()
-)  # torch: a function of tensors may do so and give derivatives
+# Of torch: a function of tensors may do so and give derivatives.
+LEAVING = frozenset("tolist numpy __array__".split())
 
 
 class _NoNumberAsked(TorchFunctionMode):
     """Within this context no batch of tensors is asked for a number, and none that has derivatives for a float."""
 
     def __init__(self, asking: frozenset[str]):
-        """Take the names of what asks for one."""
         super().__init__()
         self._asking = asking
 
@@ -208,7 +194,6 @@ class Called:
     def __init__(
         self, name: str, function: Callable, jacobian: Callable | None, shape: Shape, of_floats: bool = False
     ):
-        """Take the function and its Jacobian, as a model has them; `of_floats` if it is meant for floats."""
         self._name, self._function, self._jacobian, self._shape = name, function, jacobian, shape
         self._unproven = {self._function, self._entries}  # functions that have not yet been called with a batch
         self._of_floats = of_floats

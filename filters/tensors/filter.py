@@ -151,13 +151,7 @@ def _symmetric(entries: Tensor, like: Tensor) -> Tensor | None:
     return 0.5 * (matrix + matrix.mT)  # halves beside the diagonal, for which there are two places
 
 
-DIMENSIONS = {
-    "process_noise_cov": 2,
-    "measurement_noise_cov": 2,
-    "prior_mean": 1,
-    "prior_cov": 2,
-    "constants": 1,
-}
+DIMENSIONS = {"process_noise_cov": 2, "measurement_noise_cov": 2, "prior_mean": 1, "prior_cov": 2, "constants": 1}
 """A filter's numbers, those of its model, and how many dimensions each has beside those of a batch."""
 
 
@@ -243,7 +237,6 @@ class TensorFilter:
         return {name: value for name, value in vars(self).items() if name not in ("_model", "_own", "_stages")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make the graphs."""
         vars(self).update(state)
         self._make()
 

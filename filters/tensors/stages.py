@@ -77,10 +77,6 @@ def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
     return solution.mT if dimensions == 2 else solution[..., 0]
 
 
-def _mask_missing(dimensions: int, mask: Tensor, a: Tensor) -> Tensor:
-    return torch.where(mask if dimensions == 1 else mask[..., None], a, 0.0)
-
-
 def wrapped_where(x: Tensor, angles: tuple[bool, ...]) -> Tensor:
     """Vectors x (..., n), their angles (flags) in (-pi, pi]."""
     return _on_one_branch(1, x, angles) if any(angles) else x
@@ -214,7 +210,7 @@ CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
     operations.quotient: _quotient,
-    operations.only: _mask_missing,
+    operations.only: lambda size, mask, a: torch.where(mask if size == 1 else mask[..., None], a, 0.0),
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
     members.on_one_branch: _on_one_side,
@@ -286,7 +282,6 @@ class TensorModel(PagedModel):
     """A model as a page sees it, whose equations are those of tensors."""
 
     def __init__(self, f: Equation, h: Equation, memory: NumbersMemory):
-        """Take the equations, and where all numbers lie."""
         super().__init__(memory)
         n, m = memory.shape.n, memory.shape.m
         self._f, self._h = _Operations(f, n, n), _Operations(h, m, n)
@@ -364,7 +359,6 @@ class Stages:
     memory: NumbersMemory
 
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
-        """Make graphs of matrices of the page."""
         self.memory = memory = RowMemory(shape, page)
         stages = stages_of(page, memory, TensorModel(f, h, memory))
         parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
@@ -408,7 +402,6 @@ class EnsembleStages(Stages):
     """The stages of an ensemble, which keeps its members (..., n, N)."""
 
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
-        """Make graphs of matrices of the page."""
         self.memory = memory = MembersMemory(shape, page)
         parts = {
             name: _Part(stage) for name, stage in members_stages(page, memory, TensorModel(f, h, memory)).items()

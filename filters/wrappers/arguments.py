@@ -273,7 +273,6 @@ def _box(name: str, space: gym.Space) -> gym.spaces.Box:
 
 # Measured inputs of a model, such as an attitude from an AHRS, appended to the action.
 
-
 HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 
 

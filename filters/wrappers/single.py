@@ -96,7 +96,6 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         smoothing_lag: int | None = None,
         **numbers,
     ):
-        """Build model and filter; see the class for the arguments."""
         model = model.content if isinstance(model, ModelInSpec) else model
         model_in_spec = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
         filter = filter.content if isinstance(filter, EstimatorInSpec) else filter

@@ -68,7 +68,6 @@ class EstimateStates(gym.vector.VectorWrapper):
         smoothing_lag: int | None = None,
         **numbers,
     ):
-        """Build model and filter; see the class for the arguments."""
         super().__init__(env)
         self._form = one_of("observation", observation, OBSERVATIONS)
         filter, tuned = given_filter(filter, tuned)

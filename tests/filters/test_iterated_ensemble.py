@@ -108,11 +108,7 @@ def test_iterations_end_at_the_most_probable_state():
         return (x[0] ** 3,)
 
     model = curved_model(
-        observe=cubed,
-        process_noise_cov=[0.0],
-        measurement_noise_cov=1e-2,
-        prior_mean=[1.0],
-        prior_cov=[0.04],
+        observe=cubed, process_noise_cov=[0.0], measurement_noise_cov=1e-2, prior_mean=[1.0], prior_cov=[0.04]
     )
     z, numbers = 2.5, {"ensemble_size": 40}
     forecast, analysis, _ = updated(IteratedEnsembleKalmanFilter, model, [z], iterations=10, **numbers)

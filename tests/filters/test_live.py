@@ -187,10 +187,7 @@ def started(**options):
         (lambda live: live.predict_to(math.inf, [4.0]), "time must be a finite number"),
         (lambda live: live.predict_to(1.03), "u must be 1 finite numbers, but got None"),
         (lambda live: live.update(1.0, "thrust", 0.1), "at most late = 0 s late, but one of 1 s came at 1.02 s"),
-        (
-            lambda live: live.update(1.02, "speed", 0.1),
-            "sensor must be .*thrust, but got 'speed'",
-        ),
+        (lambda live: live.update(1.02, "speed", 0.1), "sensor must be .*thrust, but got 'speed'"),
         (lambda live: live.update(1.02, None, [0.1, 0.2]), "z must have a number for each of thrust"),
     ],
 )

@@ -27,12 +27,7 @@ def decay(x, u, c):
 
 def curved(x, c):
     """What `data/dapper_localised.py` measures."""
-    return (
-        x[0] + 0.1 * x[0] * x[0],
-        x[2] + 0.1 * x[2] * x[2],
-        x[4] + 0.1 * x[4] * x[4],
-        x[6] + 0.1 * x[6] * x[6],
-    )
+    return (x[0] + 0.1 * x[0] * x[0], x[2] + 0.1 * x[2] * x[2], x[4] + 0.1 * x[4] * x[4], x[6] + 0.1 * x[6] * x[6])
 
 
 def ring(**changes):

@@ -123,10 +123,7 @@ def test_alarms_and_isolation_work_on_own_stamps():
 @pytest.mark.parametrize(
     "call, rule",
     [
-        (
-            lambda data: estimate(data, "ekf", thruster_model, grid=False, smoother=True),
-            "a smoother must run on",
-        ),
+        (lambda data: estimate(data, "ekf", thruster_model, grid=False, smoother=True), "a smoother must run on"),
         (lambda data: estimate(data, "kf", thruster_model, grid=False), "'kf' has the A and B of one dt"),
         (
             lambda data: estimate(data, "ekf", logged_model(lag={"thrust": 0.02}), grid=False),

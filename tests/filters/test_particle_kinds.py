@@ -260,8 +260,7 @@ def test_particles_that_expect_no_number_have_hardly_any_weight(name, numbers):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "numbers"),
-    [("rbpf", {}), ("pf", {"proposal": "optimal", "smoothed": (0,), "regularisation": 1.0})],
+    ("name", "numbers"), [("rbpf", {}), ("pf", {"proposal": "optimal", "smoothed": (0,), "regularisation": 1.0})]
 )
 def test_single_steps_and_batches_agree_to_the_last_bit(name, numbers):
     filter_ = make_filter(name, scalar_model(), ensemble_size=9, **numbers)

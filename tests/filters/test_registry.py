@@ -4,14 +4,7 @@ import json
 
 import pytest
 
-from filters import (
-    FILTERS,
-    EnsembleKalmanFilter,
-    ExtendedKalmanFilter,
-    KalmanFilter,
-    make_filter,
-    thruster_model,
-)
+from filters import FILTERS, EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, make_filter, thruster_model
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file, sealed
 from tests.models import TUNED

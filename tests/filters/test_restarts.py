@@ -257,10 +257,7 @@ def test_measured_inputs_are_known_to_the_cause():
         return 0.9 * x[0], x[1] + u[1] if x[1] < 5.0 else math.nan
 
     filter_ = make_filter("ekf", model(transition=transition, inputs=2))
-    single, copies = (
-        EstimateState(Measuring(), filter_),
-        EstimateStates(Copies([Measuring, Measuring]), filter_),
-    )
+    single, copies = (EstimateState(Measuring(), filter_), EstimateStates(Copies([Measuring, Measuring]), filter_))
     told = []
     for env, action in ((single, [0.0]), (copies, np.zeros((2, 1)))):
         env.reset(seed=0)

@@ -325,10 +325,7 @@ def if_fast(x, u, c):
         (lambda: plain().run(np.zeros((1, 3, 1)), np.zeros((1, 3, 1))), r"but got \(1, 3, 1\) and \(1, 3, 1\)"),
         (lambda: plain().run(np.zeros((1, 3, 1))), "measurements must be a tensor of numbers, but got None"),
         (lambda: plain().replace(prior_mean=[2.0]).log_likelihood(*DATA), "but got others: use run"),
-        (
-            lambda: deciding().run(np.zeros((2, 1, 1)), np.zeros((2, 2, 1))),
-            "transition must accept tensors",
-        ),
+        (lambda: deciding().run(np.zeros((2, 1, 1)), np.zeros((2, 2, 1))), "transition must accept tensors"),
     ],
 )
 def test_an_error_says_the_rule(make, message):

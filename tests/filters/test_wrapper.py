@@ -380,23 +380,11 @@ def test_a_filter_that_is_made_is_run_as_it_is():
         ({"filter": 3}, "filter must be a name, a filter that is made .*but got 3"),
         ({"observation": "state"}, "observation must be one of estimate, .*but got 'state'"),
         ({"filter": "enkf", "ensemble_size": 1}, "ensemble_size must be .*at least 2, but got 1"),
-        (
-            {"filter": "enkf", "size": 9},
-            "one of ensemble_size, .*model_arguments.*, but got 'size'",
-        ),
-        (
-            {"filter": "ekf", "ensemble_size": 9},
-            "one of form .* but got 'ensemble_size'",
-        ),
-        (
-            {"process_noise_cov": [1.0, 1.0]},
-            "go into model_arguments.*but got 'process_noise_cov'",
-        ),
+        ({"filter": "enkf", "size": 9}, "one of ensemble_size, .*model_arguments.*, but got 'size'"),
+        ({"filter": "ekf", "ensemble_size": 9}, "one of form .* but got 'ensemble_size'"),
+        ({"process_noise_cov": [1.0, 1.0]}, "go into model_arguments.*but got 'process_noise_cov'"),
         ({"model_arguments": [1]}, "model_arguments must be a mapping"),
-        (
-            {"model_arguments": {"alpha": 0.5}},
-            "a bow thruster's model must be among .*'alpha'",
-        ),
+        ({"model_arguments": {"alpha": 0.5}}, "a bow thruster's model must be among .*'alpha'"),
         (
             {"model_arguments": {"process_noise_cov": [-1.0, 1.0]}},
             "process_noise_cov must be positive semidefinite.*-1",

@@ -20,13 +20,12 @@ import numpy as np
 
 from filters import make_filter, run
 from filters.c.programs import _Single
-from filters.tensors.equations import order_of
 from filters.tensors.equations import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
 from thruster_env.core.compiled import compiled
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.c_source import statements_of
-from thruster_env.graphs.graphs import Graph, Number
+from thruster_env.graphs.graphs import Graph, Number, needed_by
 from thruster_env.graphs.programs import Place, Program, callable_of, program_of, values_of, work_names
 from thruster_env.graphs.python_floats import with_python_floats
 from thruster_env.graphs.tracing import traced
@@ -243,7 +242,7 @@ def traced_arithmetic(rng: np.random.Generator, seconds: float) -> str:
             python = [one.values(points) for one in expressions]
             single = np.array(_of_single(program, points))
         usual = ~(abs(points) > 1e100).any(axis=0)  # torch's fmod has NaN for rests of larger quotients
-        tensors = tensors_of(numbers, order_of(numbers), given, torch.tensor(0.0, dtype=torch.float64))
+        tensors = tensors_of(numbers, needed_by(numbers), given, torch.tensor(0.0, dtype=torch.float64))
         by_c = [in_c(program, points, single) for single in (False, True)] if shutil.which("gcc") else None
         for k, one in enumerate(expressions):
             expected, sizes = python[k]

@@ -277,7 +277,6 @@ def _root(entries: bytes, size: int) -> np.ndarray:
 
 # Arguments that are defined once: a function takes the arguments of other functions, names and defaults.
 
-
 Function = Callable[..., Any]
 
 

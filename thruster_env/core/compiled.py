@@ -40,7 +40,6 @@ from thruster_env.core.user_functions import OURS, code_text, codes_in, names_re
 
 # Where machine code is kept: beside the sources, in the user's cache, or, where both refuse it, a private folder.
 
-
 RULE = "machine code must be kept where it can be written: set NUMBA_CACHE_DIR to a folder of yours; "
 INSTALLED = {"site-packages", "dist-packages"}  # folders of what pip installs
 _changing_config = threading.Lock()
@@ -65,7 +64,6 @@ class Stores:
     """Several of numba's caches: all are read, at most the last is written."""
 
     def __init__(self, readable: list, writable):
-        """Take caches that are only read, and one that is written, or None."""
         self._readable, self._writable = [*readable, *([] if writable is None else [writable])], writable
 
     @property
@@ -292,11 +290,7 @@ def _teach_other(function: Callable, other: Callable, fastmath: set[str]) -> Non
     from numba.extending import overload
 
     plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
-    options: Any = {
-        "forceinline": function not in _called,
-        "no_cfunc_wrapper": True,
-        "fastmath": fastmath,
-    }
+    options: Any = {"forceinline": function not in _called, "no_cfunc_wrapper": True, "fastmath": fastmath}
     overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 
 
@@ -464,7 +458,6 @@ class CompiledOrPython:
     """A function compiled at its first call, or run as Python, with one warning, if numba refuses it."""
 
     def __init__(self, function: Callable):
-        """Take a plain function; nothing is compiled yet."""
         self._python, self._run = function, compiled(function)
         self._proven = self._run is function
         self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses

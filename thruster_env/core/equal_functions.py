@@ -391,7 +391,6 @@ def _content(cell: types.CellType) -> Any:
 
 # Numbers that functions hold in their closures, defaults and objects: listed, and replaced by others.
 
-
 MAPPINGS = dict, collections.OrderedDict, collections.defaultdict, types.MappingProxyType
 LARGEST_CAPTURED = 64  # entries of an array that are numbers of their own
 

@@ -23,7 +23,6 @@ class GlobalGenerators:
     """
 
     def __init__(self):
-        """Without a seed; see the class."""
         self._states: tuple | None = None
         self._within = False
 

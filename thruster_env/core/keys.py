@@ -24,7 +24,6 @@ class EpisodeKeys:
     """The keys that each copy's own generator draws, one an episode."""
 
     def __init__(self, count: int, make_generator: Callable[[int | None], np.random.Generator] = _of_env):
-        """Take the number of copies, and how a seed makes a generator; there are none before `seed`."""
         self._make_generator = make_generator
         self._generators: list[np.random.Generator | None] = [None] * count
         self._ahead = np.zeros((count, KEYS_AHEAD, 2))

@@ -22,7 +22,6 @@ from thruster_env.core.sources import Local, Source, is_array
 
 # Parameters multiplied by factors, for a filter that assumes another plant than the true one.
 
-
 Parameters = TypeVar("Parameters", bound=NamedTuple)
 
 
@@ -202,7 +201,6 @@ def solve_rows(b, factor):
 
 
 # Triangular factors of matrices of every size, and solutions with them.
-
 
 NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
 RESOLUTION = 1e-15  # of the difference of two float64, relative to them

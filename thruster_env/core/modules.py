@@ -19,7 +19,6 @@ from types import FrameType, ModuleType
 
 # Objects by "module:object": code, which only a user's own command line or call may have imported.
 
-
 SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
 
 
@@ -154,7 +153,6 @@ def as_module(name: str) -> list[str]:
 
 
 # How to install what is not in a plain installation: the optional dependencies of pyproject.toml.
-
 
 OF_ONE_PACKAGE = {
     "parquet": "pyarrow",

@@ -23,7 +23,6 @@ from thruster_env.core.compiled import inlined
 
 # Functions made of source text, which tracebacks and debuggers show under names that say their sizes.
 
-
 _shown: Counter[str] = Counter()  # files of texts, with the number of functions made of each
 _MAKERS = (__name__, "thruster_env.core.sources")  # of which the names do not tell anything
 

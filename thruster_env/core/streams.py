@@ -20,7 +20,6 @@ from thruster_env.core.compiled import inlined, overloaded, when_compiling
 
 # The normal distribution, for compiled code.
 
-
 HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
 
 
@@ -44,7 +43,6 @@ def quantile(share):
 
 
 # Moments of a truncated normal distribution.
-
 
 FAR = 5.0  # standard deviations, from which a continued fraction is used
 VERY_FAR = 100.0  # from which the moments are series, whose next terms are 1e-10 of them
@@ -91,7 +89,6 @@ def truncated_normal(low, high):
 
 # e^x of logarithms of weights, without branches and calls, so that loops over it become vector code.
 
-
 LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 LN_2, PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)
 ROUNDER = 1.5 * 2.0**52  # adding it leaves a whole number in the last bits
@@ -129,7 +126,6 @@ def exponential(x):
 
 
 # Sine and cosine in operators: vector code in loops, and the same source for floats, arrays and tensors.
-
 
 _PI, _PER_TURN = math.pi, 0.5 / math.pi
 

@@ -40,7 +40,6 @@ def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
 
 # Characters that a terminal lacks, in others that it has: no table ends in its middle.
 
-
 HANDLER = "thruster: other characters"  # name among Python's error handlers of encodings
 OTHERS = {"±": "+-", "×": "x", "µ": "u", "ω": "w", "–": "-", "—": "-", "−": "-", "•": "*", "‘": "'", "’": "'"}
 OTHERS |= dict(zip("▁▂▃▄▅▆▇█", "_.:-=+*#", strict=True))  # heights
@@ -91,7 +90,6 @@ def _in_ascii(character: str) -> str:
 
 # Tables of text: for the terminal, and as plain text.
 
-
 BEST = "bold green"  # style of rows that win
 
 console = Console(markup=False, highlight=False)
@@ -101,7 +99,6 @@ class WholeTable(Table):
     """A table whose title and caption use the width of the terminal rather than that of the table."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The title, the table, the caption."""
         title, caption = self.title, self.caption
         self.title = self.caption = None
         try:

@@ -49,7 +49,6 @@ def one_thread() -> Iterator[None]:
 
 # How worker threads wait for the next call: "active", spinning for half a millisecond, or "passive", asleep.
 
-
 VARIABLE = "THRUSTER_WAIT_POLICY"
 ACTIVE, PASSIVE = "active", "passive"
 
@@ -94,7 +93,6 @@ def waiting(policy: str) -> Iterator[None]:
 
 
 # Atomic flags with which compiled code synchronises several threads.
-
 
 LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
 CALL = 0  # index of the current call's number
@@ -190,17 +188,9 @@ def teach_numba() -> None:
 
     sched_yield = types.ExternalFunction("sched_yield", types.int32())
 
-    @overload(read)
-    def read_compiled(flags, index):
-        return lambda flags, index: load(flags, index)
-
-    @overload(post)
-    def post_compiled(flags, index, value):
-        return lambda flags, index, value: store(flags, index, value)
-
-    @overload(take)
-    def take_compiled(marks, index, mark):
-        return lambda marks, index, mark: exchange(marks, index, mark)
+    overload(read)(lambda flags, index: lambda flags, index: load(flags, index))
+    overload(post)(lambda flags, index, value: lambda flags, index, value: store(flags, index, value))
+    overload(take)(lambda marks, index, mark: lambda marks, index, mark: exchange(marks, index, mark))
 
     @overload(yield_core)
     def yield_core_compiled():
@@ -211,7 +201,6 @@ def teach_numba() -> None:
 
 
 # Work on all cores: calls in parts, and worker threads for calls that take some hundred microseconds.
-
 
 CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
 _of_thread = threading.local()  # whether a thread of the pool is at work on a part

@@ -227,7 +227,6 @@ class Module:
     """A module in which a function's copy finds other functions under some names."""
 
     def __init__(self, module: types.ModuleType, in_place_of: Callable[[types.ModuleType, str], Any]):
-        """Take the module, and what is found in it under a name."""
         self._module, self._in_place_of = module, in_place_of
 
     def __getattr__(self, name: str):
@@ -248,10 +247,7 @@ class Copies:
     """Copies of functions and of all plain functions that they call, which find others under some names."""
 
     def __init__(
-        self,
-        in_place_of: Callable[[types.ModuleType, str], Any],
-        names: Mapping[str, Any],
-        silent: bool = False,
+        self, in_place_of: Callable[[types.ModuleType, str], Any], names: Mapping[str, Any], silent: bool = False
     ):
         """Take what copies find in MODULES, by module and name, and in place of Python's functions.
 
@@ -318,7 +314,6 @@ def stands_for(value: Any) -> Any:
 
 
 # Recipes of functions that a maker returned: what is compared and pickled in their place.
-
 
 _MADE: WeakKeyDictionary[Callable, Made] = WeakKeyDictionary()
 

@@ -113,7 +113,6 @@ def _is_raised_there(error: Exception) -> bool:
 
 # Derivatives of graphs of Numbers, forwards: how results change as the numbers change that they are made of.
 
-
 Slope = Number | None  # None of a number that does not move
 
 

@@ -199,7 +199,6 @@ def _folded_choice(condition: Number | bool, a: Number, b: Number) -> Number:
 
 # Constants of a graph in single precision.
 
-
 SMALLEST = float(np.finfo(np.float32).tiny)  # normal
 
 

@@ -219,7 +219,6 @@ def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Fun
 
 # Loops over the members of an ensemble as instructions of LLVM, for eight members at a time.
 
-
 INT = ir.IntType(32)
 
 

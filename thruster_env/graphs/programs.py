@@ -154,7 +154,6 @@ class Text:
     """Lines of a program, and the Python function made from them at its first call."""
 
     def __init__(self, lines: list[str]):
-        """Take the lines."""
         self._lines = lines
         self._in_python: Callable | None = None
 

@@ -45,20 +45,7 @@ class Float(float, metaclass=_OfFloats):
 
     __slots__ = ()
 
-    def __floor__(self):
-        """A whole number; of what is not finite itself."""
-        return math.floor(float(self)) if math.isfinite(self) else self
-
-    def __ceil__(self):
-        """A whole number; of what is not finite itself."""
-        return math.ceil(float(self)) if math.isfinite(self) else self
-
-    def __trunc__(self):
-        """A whole number; of what is not finite itself."""
-        return math.trunc(float(self)) if math.isfinite(self) else self
-
     def __round__(self, digits=None):
-        """A rounded number; of what is not finite itself."""
         return _plain(round(float(self), digits)) if math.isfinite(self) else self
 
 
@@ -79,6 +66,13 @@ def _method(name: str) -> Callable:
     return method
 
 
+def _whole(rounding: Callable) -> Callable:
+    """A whole number; of what is not finite itself."""
+    return lambda self: rounding(float(self)) if math.isfinite(self) else self
+
+
+for _name in "floor ceil trunc".split():
+    setattr(Float, f"__{_name}__", _whole(getattr(math, _name)))
 for _name in "add sub mul truediv floordiv mod divmod pow".split():
     for _side in ("", "r"):
         setattr(Float, f"__{_side}{_name}__", _method(f"__{_side}{_name}__"))
@@ -154,7 +148,6 @@ class Floats(np.ndarray):
         return self._entry(entry) if isinstance(entry, np.generic) else entry
 
     def __iter__(self):
-        """Entries, or rows."""
         return map(self.__getitem__, range(len(self)))
 
     def __array_wrap__(self, array, context=None, return_scalar=False):

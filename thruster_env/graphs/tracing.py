@@ -26,13 +26,7 @@ from thruster_env.graphs.graphs import UNARY, Number, arctan2, where
 MOST_POINTS = 100  # of a table that is traced
 MOST_ROWS = 4  # of a matrix whose determinant is written out
 OTHER_NAMES = {
-    "atan": "arctan",
-    "atan2": "arctan2",
-    "asin": "arcsin",
-    "acos": "arccos",
-    "asinh": "arcsinh",
-    "acosh": "arccosh",
-    "atanh": "arctanh",
+    **{f"a{name}": f"arc{name}" for name in "tan tan2 sin cos sinh cosh tanh".split()},
     "fabs": "absolute",
     "abs": "absolute",
     "pow": "power",
@@ -56,18 +50,17 @@ def _numbers(*values) -> list[Number]:
     return [graph.number(value) for value in values]
 
 
-def _largest(*numbers):
-    largest, *rest = numbers[0] if len(numbers) == 1 else numbers
-    for number in rest:
-        largest = where(number > largest, number, largest)
-    return largest
+def _chosen_by(is_better: Callable) -> Callable:
+    def function(*numbers):
+        chosen, *rest = numbers[0] if len(numbers) == 1 else numbers
+        for number in rest:
+            chosen = where(is_better(number, chosen), number, chosen)
+        return chosen
+
+    return function
 
 
-def _smallest(*numbers):
-    smallest, *rest = numbers[0] if len(numbers) == 1 else numbers
-    for number in rest:
-        smallest = where(number < smallest, number, smallest)
-    return smallest
+_largest, _smallest = _chosen_by(operator.gt), _chosen_by(operator.lt)
 
 
 def _extreme(choose: Callable) -> Callable:

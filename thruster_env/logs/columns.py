@@ -17,7 +17,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 # Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
 
-
 WORDS = (
     *("V", "mV", "kV", "A", "mA", "W", "kW", "Hz", "kHz", "rpm", "rps", "rad", "mrad", "deg", "turn", "rev"),
     *("N", "mN", "kN", "kgf", "lbf", "Nm", "kg", "g", "Pa", "kPa", "bar", "K", "degC", "degF"),
@@ -334,8 +333,7 @@ def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str],
         for channel in remaining:
             name = plain(channel.quantity.name).lower()
             take(
-                channel.key,
-                [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name],
+                channel.key, [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name]
             )
         for channel in remaining:  # the whole header: what stands behind the line of "V_s" is no unit
             take(channel.key, by_header.get(plain(channel.quantity.symbol), []), without_unit=False)

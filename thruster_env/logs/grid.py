@@ -236,7 +236,6 @@ def at_own_stamps(
 
 # Time stamps: dates, as seconds since the first one, and the digits in which times are written.
 
-
 MISSING = "nan"
 SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
 SECOND = "s"

@@ -66,7 +66,6 @@ class Log:
     stamps: np.ndarray | None = None
 
     def __post_init__(self):
-        """Check shapes and numbers, and make the arrays read-only."""
         positive("dt of a log", self.dt)
         steps = len(self.inputs)
         wanted = {"inputs": (steps, len(self.input_quantities)), "measurements": (steps + 1, len(self.measured))}
@@ -254,7 +253,6 @@ def _with_column(rows: np.ndarray, column: int, values: np.ndarray) -> np.ndarra
 
 # Inputs that are held over a log, or over its end, because they have no samples there.
 
-
 LONG = 0.1  # of the log at its end
 LONGER = 10.0  # than the longest time between two samples of the input
 
@@ -285,7 +283,6 @@ def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: flo
 
 
 # Whether two recorded runs have rows in common, so that one cannot be held out of training on the other.
-
 
 WINDOW = 20  # rows in a row that are the same; of shorter logs half of them
 FEWEST = 4

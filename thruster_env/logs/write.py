@@ -13,18 +13,7 @@ import numpy as np
 from thruster_env.core.checks import as_floats
 from thruster_env.core.files import write_whole
 from thruster_env.core.modules import to_install
-from thruster_env.core.plots import (
-    BLUE,
-    DARK,
-    MUSTARD,
-    PLUM,
-    RUST,
-    WINE,
-    new_figure,
-    save_figure,
-    thinned,
-    tidy,
-)
+from thruster_env.core.plots import BLUE, DARK, MUSTARD, PLUM, RUST, WINE, new_figure, save_figure, thinned, tidy
 from thruster_env.logs.columns import TIME_NAMES, parted, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SATURATED, STUCK, outliers
 from thruster_env.logs.grid import digits_for
@@ -171,7 +160,6 @@ def _pyarrow():
 
 
 # A picture of a recorded run: every channel over time, with findings marked.
-
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -67,13 +67,13 @@ def test_values_and_slopes_are_those_of_python():
 
 def test_tensors_have_the_same_values_and_slopes():
     torch = pytest.importorskip("torch")
-    from filters.tensors.equations import order_of
     from filters.tensors.equations import values_of as tensors_of
+    from thruster_env.graphs.graphs import needed_by
 
     values, slopes = graph_of()
     given = {Place("numbers", k): torch.tensor(row, requires_grad=True) for k, row in enumerate(POINTS)}
     like = torch.tensor(0.0, dtype=torch.float64)
-    found = [torch.as_tensor(one).expand(5).double() for one in tensors_of(values, order_of(values), given, like)]
+    found = [torch.as_tensor(one).expand(5).double() for one in tensors_of(values, needed_by(values), given, like)]
     np.testing.assert_allclose(torch.stack(found).detach(), values_of(values, POINTS), rtol=1e-13, atol=1e-13)
     for i, one in enumerate(found):
         if one.requires_grad:

@@ -19,7 +19,6 @@ from thruster_env.logs.recorders.topics import Refused, check_bytes, package
 
 # How many messages a bag says it has, read apart from the messages: what is damaged has others.
 
-
 ROS1, MCAP, DB3 = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 REPAIRS = {ROS1: "rosbag reindex", MCAP: "mcap recover", DB3: "ros2 bag reindex"}  # the formats' own programs
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 3, 4, 5, 6, 7  # records of an MCAP file
@@ -264,7 +263,6 @@ def _check_whole(path: Path) -> None:
 
 
 # The files of a bag: one, or those that the metadata.yaml of a folder names, unpacked where they are packed.
-
 
 METADATA = "metadata.yaml"
 NEWEST = 9  # version of the metadata

@@ -94,7 +94,6 @@ class Contents:
     """
 
     def __init__(self, path: Path, wanted: Wanted):
-        """Nothing is read yet."""
         self.path, self._wanted, self._is_ros1 = path, wanted, is_ros1(path)
         self._room = package("rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2", KIND, path)
         self._types = package("rosbags.typesys", KIND, path)
@@ -167,7 +166,6 @@ class Decoder:
     """
 
     def __init__(self, types: Any, connection: Any, is_ros1: bool, pairs: Pairs):
-        """Find the fields that hold numbers, and the reasons why others are not read."""
         store = types.get_typestore(types.Stores.EMPTY)
         text, kind = connection.msgdef.data, connection.msgtype
         if text:
@@ -208,7 +206,6 @@ class Samples:
     """The numbers of a topic, as they come."""
 
     def __init__(self, leaves: Sequence[Leaf]):
-        """Start without samples."""
         self.leaves = leaves
         self.received, self.stamps = array("q"), array("q")
         self.numbers = [array("d") for _ in leaves]

@@ -26,7 +26,6 @@ from thruster_env.logs.recorders.topics import (
 
 # Arrays by name, as MATLAB and HDF5 keep them: which are channels, and which vector has their times.
 
-
 NUMERIC = "biuf"  # NumPy's kinds
 FEWEST = 2  # samples; what has fewer is a constant
 
@@ -54,7 +53,7 @@ def topics_of(
     sizes = {name: _size(array) for name, array in arrays.items()}
     vectors: dict[str, dict[str, int]] = {}  # of times, their lengths by group and name
     for name, size in sizes.items():
-        if size is not None and size[1] == 1 and _is_time(name):
+        if size is not None and size[1] == 1 and parted(name.rpartition(".")[2])[0] in TIME_NAMES:
             vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
     known: dict[str, tuple[np.ndarray | None, str]] = {}
     if wanted is None:
@@ -141,10 +140,6 @@ def _size(array: Any) -> tuple[int, int] | None:
     return max(sides), min(sides) if len(sides) == 2 else 1
 
 
-def _is_time(name: str) -> bool:
-    return parted(name.rpartition(".")[2])[0] in TIME_NAMES
-
-
 def _clocks(name: str, vectors: Mapping[str, Mapping[str, int]]) -> Iterator[tuple[str, int]]:
     """Vectors of times that may be those of an array, and their lengths: beside it, then in groups around it."""
     group = name
@@ -201,7 +196,6 @@ class Dataset:
     """A dataset in a file that another process reads."""
 
     def __init__(self, file: Opened, number: int, description: Mapping[str, Any]):
-        """Take its description; nothing is read."""
         self._file, self._number = file, number
         self.shape = tuple(int(side) for side in description["shape"])
         self.dtype = np.dtype(description["dtype"] if description["kind"] in NUMERIC else object)

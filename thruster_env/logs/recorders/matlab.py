@@ -200,7 +200,6 @@ def _text(data: bytes | bytearray, part: tuple[int, int, int]) -> str:
 
 # MATLAB's .mat files: version 5 to 7 by ourselves, version 7.3 by h5py.
 
-
 KIND = "MATLAB file"
 MAGIC = b"MATLAB "
 HDF5 = b"MATLAB 7.3"

@@ -28,7 +28,6 @@ class Opened:
     """
 
     def __init__(self, child: subprocess.Popen, form: str, path: Path):
-        """Open a file of a format."""
         self._child, self._path = child, path
         files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
         request = {"format": form, "path": str(path.absolute()), "files": [str(file.absolute()) for file in files]}

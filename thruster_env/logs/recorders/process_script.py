@@ -41,7 +41,6 @@ class Walk:
     """
 
     def __init__(self, file: Any, most_bytes: int):
-        """Collect all that the file has."""
         self.datasets: dict[str, tuple[Any, str | None] | str] = {}
         self._most, self._visited, self._count = most_bytes, {_address(file)}, 0
         self._file = file

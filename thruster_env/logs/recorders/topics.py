@@ -165,7 +165,6 @@ def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 # Transforms between frames: messages that hold arrays of them give one topic for each pair of frames.
 
-
 HEADER_TYPE = "std_msgs/msg/Header"
 STAMPED = "geometry_msgs/msg/TransformStamped"
 
@@ -201,7 +200,6 @@ class Pairs:
     """Names of the topics of pairs of frames: TOPIC/PARENT/CHILD, without slashes at the beginning of a frame."""
 
     def __init__(self, path: Path):
-        """Start without pairs; the path of the bag is for messages."""
         self._path = path
         self._pairs: dict[str, tuple[str, str, str]] = {}
 

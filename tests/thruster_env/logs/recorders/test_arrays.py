@@ -97,14 +97,7 @@ def test_attributes_of_cf_scale_shift_and_leave_out(tmp_path):
             {"scale_factor": [0.01], "add_offset": np.float32(2.5), "_FillValue": np.int16(7)}
         )
         file["force"] = stored.astype(float)
-        file["force"].attrs.update(
-            {
-                "Units": np.array(["kgf"], h5py.string_dtype()),
-                "missing_value": [
-                    -5.0,
-                ],
-            }
-        )
+        file["force"].attrs.update({"Units": np.array(["kgf"], h5py.string_dtype()), "missing_value": [-5.0]})
         file["plain"] = stored
         file["plain"].attrs["UNIT"] = "rpm"
     found = read(tmp_path / "a.h5", None)
