@@ -84,9 +84,8 @@ def places_within(states: tuple[Quantity, ...], among: tuple[Quantity, ...]) -> 
     for state, position in zip(states, positions, strict=True):
         if state.angle != among[position].angle:
             kinds = "an angle" if among[position].angle else "no angle"
-            raise ValueError(
-                f"{state.symbol} of a mode must be {kinds}, as in the model, but got angle={state.angle}"
-            )
+            rule = f"{state.symbol} of a mode must be {kinds}, as in the model"
+            raise ValueError(f"{rule}, but got angle={state.angle}")
     return positions
 
 

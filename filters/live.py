@@ -187,10 +187,8 @@ class Live:
         if time >= self.time - near:
             alarms = self._update(measured)
         elif time < self.time - self._late - near:
-            raise ValueError(
-                f"a sample must be at most late = {self._late:g} s late, but one of {time:.9g} s came at "
-                f"{self.time:.9g} s"
-            )
+            rule = f"a sample must be at most late = {self._late:g} s late"
+            raise ValueError(f"{rule}, but one of {time:.9g} s came at {self.time:.9g} s")
         else:
             alarms = self._insert(time, measured, near)
         if self.health is not None:

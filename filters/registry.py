@@ -128,10 +128,8 @@ class FilterType(NamedTuple):
         for number in numbers:
             one_of(f"a number of filter {self.name!r}", number, self.numbers)
         if isinstance(model, AnyStepModel) and not self.filter_class.any_step:
-            raise ValueError(
-                f"a filter on a log's own stamps must know steps of any length, but {self.name!r} does not: "
-                "'ekf' does"
-            )
+            rule = "a filter on a log's own stamps must know steps of any length"
+            raise ValueError(f"{rule}, but {self.name!r} does not: 'ekf' does")
         return self.filter_class(model=model, **numbers)
 
 

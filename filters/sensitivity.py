@@ -16,8 +16,6 @@ from filters.starts import Starts
 from thruster_env.core.checks import as_floats
 from thruster_env.model.state_space import StateSpaceModel
 
-__all__ = ["ModelSlopes", "Sensitivity", "sensitivity"]
-
 
 class Sensitivity(NamedTuple):
     """Log-likelihood of the innovations of B trajectories, its slopes along p parameters and their information."""

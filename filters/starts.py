@@ -387,10 +387,8 @@ def cov_of_measured_starts(model: StateSpaceModel, first: np.ndarray) -> np.ndar
     h = np.array(observation_slopes(model.functions, shape)(x, as_value(scales), c)).reshape(model.m, model.n)
     a = h * scales / deviations[:, None]
     if not (np.isfinite(a).all() and a.any()):
-        raise ValueError(
-            "a start from the first measurement needs a measurement that depends on a state at the prior mean, "
-            f"but dh/dx there is {h.tolist()}"
-        )
+        rule = "a start from the first measurement needs a measurement that depends on a state at the prior mean"
+        raise ValueError(f"{rule}, but dh/dx there is {h.tolist()}")
     inverse = np.linalg.pinv(a, rcond=FAINT)
     off = difference(first, np.array(model.functions.observe(x, c)), shape.measurement_angles) / deviations
     reach = scales * np.abs(np.where(np.isfinite(off), off, 0.0) @ inverse.T).max(axis=0, initial=0.0)

@@ -54,9 +54,8 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
     if then is not None and dt is not None and abs(then - dt) > 1e-9 * then:
         differing.append(f"dt {then:g} (here {dt:g})")
     if differing:
-        raise ValueError(
-            f"a tuned file must be for the model it is used with, but {file} was tuned for {', '.join(differing)}"
-        )
+        rule = "a tuned file must be for the model it is used with"
+        raise ValueError(f"{rule}, but {file} was tuned for {', '.join(differing)}")
 
 
 def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | None, file: str | Path) -> None:
@@ -138,10 +137,8 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"a tuned file must say format: {FILE_FORMAT!r}, but {path} does not")
     _check_version(path, content.get("version"))
     if content.get("hash") != sealed(content)["hash"]:
-        raise ValueError(
-            f"a tuned file must be unchanged, with the hash of its content, but {path} was edited: its hash is "
-            f"{short_repr(content.get('hash'))}"
-        )
+        rule = "a tuned file must be unchanged, with the hash of its content"
+        raise ValueError(f"{rule}, but {path} was edited: its hash is {short_repr(content.get('hash'))}")
     try:
         content = _upgraded(content)
         of_a_plant = content["version"] < FILE_VERSION or content.get("plant") is not None
@@ -190,10 +187,8 @@ def check_preset_file(options: Mapping[str, Any], user_preset: Any, path: str | 
     """
     preset = options.get("preset")
     if user_preset is None and isinstance(preset, str) and preset.endswith(".toml") and not Path(preset).is_file():
-        raise ValueError(
-            f"the preset of {path} must be where it was, but there is no file {preset}: say where it is "
-            "now (--preset FILE)"
-        )
+        rule = f"the preset of {path} must be where it was"
+        raise ValueError(f"{rule}, but there is no file {preset}: say where it is now (--preset FILE)")
 
 
 @contextmanager
@@ -229,9 +224,8 @@ def _check_version(path: str | Path, version) -> None:
     if isinstance(version, int):
         advice = ": update thruster-env" if version > FILE_VERSION else ": tune again"
     known = f"{', '.join(map(str, READ_VERSIONS[:-1]))} or {READ_VERSIONS[-1]}"
-    raise ValueError(
-        f"a tuned file must be of version {known}, but {path} is of version {short_repr(version)}{advice}"
-    )
+    rule = f"a tuned file must be of version {known}"
+    raise ValueError(f"{rule}, but {path} is of version {short_repr(version)}{advice}")
 
 
 def _check_filter(entry, known: tuple[str, ...] | None) -> None:
@@ -240,9 +234,8 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
     Arguments of the model are those that are known, or any names if None.
     """
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
-        raise ValueError(
-            f"a tuned file must have a filter with name, numbers and model, but got {short_repr(entry)}"
-        )
+        rule = "a tuned file must have a filter with name, numbers and model"
+        raise ValueError(f"{rule}, but got {short_repr(entry)}")
     name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS), LISTED)
     numbers = filter_type(name).numbers
     for key, value in _mapping("numbers", entry["numbers"]).items():

@@ -148,10 +148,8 @@ def c_filter(
     texts.append(class_of(STAND_IN, programs, single=single, tested=monitor is not None))
     texts.append(log_program(STAND_IN, programs, single=single, tested=monitor is not None))
     if is_taken(name, texts):
-        raise ValueError(
-            "a name in C must be one that neither its libraries nor the filter's own files use, but got "
-            f"{name!r}: take another one, such as {name}_filter"
-        )
+        rule = "a name in C must be one that neither its libraries nor the filter's own files use"
+        raise ValueError(f"{rule}, but got {name!r}: take another one, such as {name}_filter")
     return called(name)
 
 

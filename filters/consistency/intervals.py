@@ -112,9 +112,8 @@ def rmse_ratios(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None = None)
         ValueError: if their numbers of runs or states differ.
     """
     if np.shape(a) != np.shape(b):
-        raise ValueError(
-            f"a paired comparison needs the same runs and states, but got {np.shape(a)}, {np.shape(b)}"
-        )
+        rule = "a paired comparison needs the same runs and states"
+        raise ValueError(f"{rule}, but got {np.shape(a)}, {np.shape(b)}")
     ratios = np.sqrt(resampled_means(a, weights) / resampled_means(b, weights))
     values = np.sqrt(pooled_mean(a, weights) / pooled_mean(b, weights))
     return tuple(interval(values[i], ratios[:, i]) for i in range(len(values)))

@@ -171,9 +171,8 @@ def consistency_report(
         ValueError: if shapes do not fit or there is only one run.
     """
     if states is not None and np.shape(states) != estimates.means.shape:
-        raise ValueError(
-            f"states must have the shape of the estimates, {estimates.means.shape}, but got {np.shape(states)}"
-        )
+        rule = f"states must have the shape of the estimates, {estimates.means.shape}"
+        raise ValueError(f"{rule}, but got {np.shape(states)}")
     result = findings(estimates, states, measurements, first_step, angles, counted)
     if states is not None and counted is not None:
         states = np.where(counted[..., None], states, np.nan)

@@ -243,9 +243,8 @@ def forgetting_noise(
     block, scales, path = np.ix_(rest, rest), _scales(model, path)[rest], path.of_states(rest)
     basis, _ = observable_part(path, scales, r)
     if not basis.shape[1]:
-        raise ValueError(
-            "a filter that forgets (--forget) must observe a state, but its measurements tell of none"
-        )
+        rule = "a filter that forgets (--forget) must observe a state"
+        raise ValueError(f"{rule}, but its measurements tell of none")
     root = np.linalg.cholesky(r)
     f = basis.T @ (path.transitions / scales[:, None] * scales) @ basis
     h = np.linalg.solve(root, path.observations * scales) @ basis

@@ -146,16 +146,14 @@ def derivatives(
     model, page, own_parameters = differentiable(model, used)
     if model.functions != functions:  # those of an affine approximation, with constants of its own
         if wanted.constants:
-            raise ValueError(
-                "slopes along constants must be of a filter of the model itself, but got 'kf' of another"
-            )
+            rule = "slopes along constants must be of a filter of the model itself"
+            raise ValueError(f"{rule}, but got 'kf' of another")
         slopes = slopes._replace(constants=np.zeros((parameters, len(model.constants))))
     if own_slopes is None:
         own_slopes = np.zeros((parameters, len(own_parameters)))
     if own_slopes.shape != (parameters, len(own_parameters)):
-        raise ValueError(
-            f"own_slopes must have the shape {(parameters, len(own_parameters))}, but got {own_slopes.shape}"
-        )
+        rule = f"own_slopes must have the shape {(parameters, len(own_parameters))}"
+        raise ValueError(f"{rule}, but got {own_slopes.shape}")
     if isinstance(used, PageFilter) and used.follows_from:
         own_slopes = own_slopes + _following(used, given_model, slopes)
     wanted = wanted._replace(own=bool(own_slopes.any()))

@@ -132,10 +132,8 @@ def trajectories(
         np.require(_floats(name, value), np.float64, requirements) for name, value in arguments.items()
     )
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
-        raise ValueError(
-            "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
-            f"but got {keys.shape}, {inputs.shape}, {z.shape}"
-        )
+        rule = "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m)"
+        raise ValueError(f"{rule}, but got {keys.shape}, {inputs.shape}, {z.shape}")
     count, times, m = z.shape
     if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
         raise ValueError(

@@ -42,15 +42,12 @@ class Checks:
         """
         parts = returned if isinstance(returned, tuple) else (returned,)
         if not 1 <= len(parts) <= len(PARTS):
-            raise ValueError(
-                f"{self._label} must give a mean, or a tuple of mean, covariance, innovation and its covariance, "
-                f"but gave a tuple of {len(parts)} at {where}"
-            )
+            rule = f"{self._label} must give a mean, or a tuple of mean, covariance, innovation and its covariance"
+            raise ValueError(f"{rule}, but gave a tuple of {len(parts)} at {where}")
         output = Output(*parts)
         if self._has_covariance and output.cov is None:
-            raise ValueError(
-                f"{self._label} must give a covariance, or say has_covariance = False, but gave none at {where}"
-            )
+            rule = f"{self._label} must give a covariance, or say has_covariance = False"
+            raise ValueError(f"{rule}, but gave none at {where}")
         checked = {
             name: None if value is None and name != "mean" else self._part(name, value, where, leading)
             for name, value in output._asdict().items()
@@ -73,14 +70,12 @@ class Checks:
             array = array[..., None] * np.eye(*size)
         if array.shape != shape:
             got = f"shape {array.shape}" if array.size else short_repr(value)
-            raise ValueError(
-                f"{NAMES[name]} of {self._label} must be numbers of shape {shape}, but got {got} at {where}"
-            )
+            rule = f"{NAMES[name]} of {self._label} must be numbers of shape {shape}"
+            raise ValueError(f"{rule}, but got {got} at {where}")
         if not np.isfinite(array).all():
             location = _first(~np.isfinite(array), leading)
-            raise ValueError(
-                f"{NAMES[name]} of {self._label} must be finite, but it is not at {location or where}"
-            )
+            rule = f"{NAMES[name]} of {self._label} must be finite"
+            raise ValueError(f"{rule}, but it is not at {location or where}")
         return self._covariance(name, array, where, leading) if is_cov else array
 
     def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
@@ -89,10 +84,8 @@ class Checks:
         covs = 0.5 * (covs + covs.swapaxes(-1, -2))
         if wrong.any():
             location = _first(wrong, leading)
-            raise ValueError(
-                f"{NAMES[name]} of {self._label} must be symmetric and positive semidefinite, "
-                f"but it is not at {location or where}"
-            )
+            rule = f"{NAMES[name]} of {self._label} must be symmetric and positive semidefinite"
+            raise ValueError(f"{rule}, but it is not at {location or where}")
         return covs
 
 

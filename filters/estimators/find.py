@@ -70,10 +70,8 @@ def as_filter(estimator: Any, label: str, model: StateSpaceModel, numbers: dict)
     if not is_estimator(estimator):
         estimator = _made(estimator, label, model, numbers)
     elif numbers:
-        raise ValueError(
-            f"numbers must come with a function that makes an estimator, but {label!r} is one already, and got "
-            f"{', '.join(numbers)}"
-        )
+        rule = "numbers must come with a function that makes an estimator"
+        raise ValueError(f"{rule}, but {label!r} is one already, and got {', '.join(numbers)}")
     if isinstance(estimator, Filter):
         return estimator
     return ForeignFilter(model=model, estimator=estimator, label=label)
@@ -89,8 +87,6 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
         wanted = ", ".join(["a model", *numbers])
         raise ValueError(f"{what} must be made of {wanted}, but raised {error_line(error)}") from error
     if not isinstance(result, Filter) and not is_estimator(result):
-        raise ValueError(
-            f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, "
-            f"measurements), but made {short_repr(result)}"
-        )
+        rule = f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, measurements)"
+        raise ValueError(f"{rule}, but made {short_repr(result)}")
     return result

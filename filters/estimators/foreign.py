@@ -44,10 +44,8 @@ class ForeignFilter(Filter):
     def __post_init__(self):
         estimator = self.estimator
         if not is_estimator(estimator):
-            raise ValueError(
-                f"an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
-                f"but got {short_repr(estimator)}"
-            )
+            rule = "an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements)"
+            raise ValueError(f"{rule}, but got {short_repr(estimator)}")
         check = getattr(estimator, "check_model", None)
         if callable(check):
             check(self.model)
@@ -102,9 +100,8 @@ class ForeignFilter(Filter):
             with generators.used():
                 returned = _copied(self.estimator, seed).run(*arguments)
         except Exception as error:
-            raise ValueError(
-                f"the estimator {self.name!r} must not raise, but its run raised {error_line(error)}"
-            ) from error
+            rule = f"the estimator {self.name!r} must not raise"
+            raise ValueError(f"{rule}, but its run raised {error_line(error)}") from error
         checks = Checks(self.name, self.model.n, self.model.m, self.has_covariance)
         output = checks.output(returned, "run", z.shape[:2])
         innovation, s = without_missing(output, z)

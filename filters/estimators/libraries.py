@@ -61,10 +61,8 @@ class FilterPyEstimator(Estimator):
             elif kind == "z" and "residual" not in self._arguments:
                 lacks.append("residual")
         if lacks:
-            raise ValueError(
-                f"the estimator {self.name!r} must treat angles as such on a model with angles, "
-                f"but has no {', '.join(lacks)}"
-            )
+            rule = f"the estimator {self.name!r} must treat angles as such on a model with angles"
+            raise ValueError(f"{rule}, but has no {', '.join(lacks)}")
 
     def reset(self, key, z) -> Output:
         """The prior, updated with the first measurement; FilterPy's filters take no key."""

@@ -31,10 +31,8 @@ class EstimatorSession:
     def __init__(self, filter_):
         """Of a `filters.estimators.foreign.ForeignFilter`; `start` comes next."""
         if not steps_alone(filter_.estimator):
-            raise ValueError(
-                f"the estimator {filter_.name!r} must have reset(key, z) and step(u, z) to run beside an env, "
-                "but it lacks them"
-            )
+            rule = f"the estimator {filter_.name!r} must have reset(key, z) and step(u, z) to run beside an env"
+            raise ValueError(f"{rule}, but it lacks them")
         model, self._filter = filter_.model, filter_
         n, m = model.n, model.m
         self._original = copy.deepcopy(filter_.estimator)
@@ -92,10 +90,8 @@ class EstimatorSession:
             with self.generators.used():
                 returned = getattr(self._estimator, method)(first, copied)
         except Exception as error:
-            raise ValueError(
-                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {error_line(error)} "
-                f"at {where}"
-            ) from error
+            rule = f"the estimator {self._checks.name!r} must not raise"
+            raise ValueError(f"{rule}, but its {method} raised {error_line(error)} at {where}") from error
         output = self._checks.output(returned, where)
         innovation, s = without_missing(output, z)
         for attribute, value in (

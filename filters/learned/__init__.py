@@ -30,9 +30,8 @@ def check_installed() -> None:
     """Raise ValueError unless what learned estimators need is installed."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        raise ValueError(
-            f"a learned estimator needs {' and '.join(missing)}, but got none: {to_install('learned')}"
-        )
+        rule = f"a learned estimator needs {' and '.join(missing)}"
+        raise ValueError(f"{rule}, but got none: {to_install('learned')}")
 
 
 def check_file(path: str | Path) -> None:

@@ -60,9 +60,8 @@ class TrainedEstimator:
                     [tuple(map(str, quantity)) for quantity in entries] for entries in self._quantities
                 ]
         except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ValueError(
-                f"an estimator's file must be one of `thruster train-estimator`, but {self.path} is not: {error}"
-            ) from None
+            rule = "an estimator's file must be one of `thruster train-estimator`"
+            raise ValueError(f"{rule}, but {self.path} is not: {error}") from None
         self.name = one_of("a trained estimator", kind, tuple(LEARNED))
 
     def __call__(self, model: StateSpaceModel) -> LearnedEstimator:

@@ -53,9 +53,8 @@ class KalmanNet(LearnedEstimator):
         """Make the network of the gain."""
         n, m = self.model.n, self.model.m
         if max(n, m) > MOST:
-            raise ValueError(
-                f"{self.kind} must have a model of at most {MOST} states and measurements, but got {n} and {m}"
-            )
+            rule = f"{self.kind} must have a model of at most {MOST} states and measurements"
+            raise ValueError(f"{rule}, but got {n} and {m}")
         self.gain = GainNetwork(n, m, n * m)
 
     def begin(self, keys: np.ndarray, z: Tensor) -> Track:

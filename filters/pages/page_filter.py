@@ -15,8 +15,6 @@ from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
 
-__all__ = ["FilterWithPage", "Page", "PageFilter"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FilterWithPage(Filter):

@@ -232,10 +232,8 @@ class Called:
                 values = function(states, *inputs, self._constants(c))
             return stacked(values, parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise ValueError(
-                f"{self._name} must accept tensors, or consist of arithmetic without branches, but raised "
-                f"{type(error).__name__}: {str(error).splitlines()[0]}"
-            ) from error
+            rule = f"{self._name} must accept tensors, or consist of arithmetic without branches"
+            raise ValueError(f"{rule}, but raised {type(error).__name__}: {str(error).splitlines()[0]}") from error
 
     def _prove(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> None:
         """Raise TypeError if a function asks a state for a number: for one trajectory it would be answered."""

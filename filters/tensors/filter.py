@@ -212,10 +212,8 @@ class TensorFilter:
         self._changed: dict[str, Tensor] = {}
         self._make()
         if self._model is not filter_.model and any(self._user_functions):
-            raise ValueError(
-                f"functions of tensors need a filter on the model itself, but got {filter_.name!r}, "
-                "which uses an affine approximation"
-            )
+            rule = "functions of tensors need a filter on the model itself"
+            raise ValueError(f"{rule}, but got {filter_.name!r}, which uses an affine approximation")
         for name in DIMENSIONS:
             setattr(self, name, torch.as_tensor(getattr(self._model, name), dtype=dtype, device=device))
 
@@ -332,10 +330,8 @@ class TensorFilter:
             inputs = z.new_zeros(*z.shape[:-2], z.shape[-2] - 1, 0)
         u = self._finite("inputs", inputs, (self._model.inputs,))
         if z.ndim < 2 or u.ndim < 2 or u.shape[:-1] != (*z.shape[:-2], z.shape[-2] - 1):
-            raise ValueError(
-                "inputs and measurements must have shapes (..., K, p) and (..., K + 1, m), but got "
-                f"{tuple(u.shape)} and {tuple(z.shape)}"
-            )
+            rule = "inputs and measurements must have shapes (..., K, p) and (..., K + 1, m)"
+            raise ValueError(f"{rule}, but got {tuple(u.shape)} and {tuple(z.shape)}")
         batch = z.shape[:-2]
         if keys is None:
             keys = filter_keys(range(prod(batch))).reshape(*batch, 2) if self.filter.size else (0, 0)
@@ -374,10 +370,8 @@ class TensorFilter:
             or self._changed
             or not all(_is(tensor, getattr(self._model, name)) for name, tensor in changeable.items())
         ):
-            raise ValueError(
-                "the compiled log-likelihood needs the model's own functions, prior and constants, but got "
-                "others: use run"
-            )
+            rule = "the compiled log-likelihood needs the model's own functions, prior and constants"
+            raise ValueError(f"{rule}, but got others: use run")
         noise = self.process_noise_cov, self.measurement_noise_cov
         return compiled_likelihood(self.filter, inputs, measurements, *noise)
 

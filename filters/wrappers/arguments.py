@@ -56,9 +56,8 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError):
-        raise ValueError(
-            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
-        ) from None
+        rule = "model must be 'module:factory' that can be imported, or a StateSpaceModel"
+        raise ValueError(f"{rule}, but got {model!r}") from None
     return f"model {model!r}", factory
 
 

@@ -173,9 +173,8 @@ class EstimateStates(gym.vector.VectorWrapper):
             z = observations.reshape(self.num_envs, -1)
         z = as_floats(z)
         if z.shape != (self.num_envs, self._m):
-            raise ValueError(
-                f"measurements must have shape {(self.num_envs, self._m)}, but got {short_repr(np.shape(z))}"
-            )
+            rule = f"measurements must have shape {(self.num_envs, self._m)}"
+            raise ValueError(f"{rule}, but got {short_repr(np.shape(z))}")
         reported, valid = info.get("_measurement"), info.get("measurement_valid")
         if reported is not None and not np.all(reported):  # Gymnasium has zeros for copies that reported none
             observed = as_floats(observations).reshape(self.num_envs, -1)[:, : self._m]

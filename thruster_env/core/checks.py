@@ -183,9 +183,8 @@ def vector(name: str, value, size: int | None = None) -> np.ndarray:
         array = np.full(0, np.nan)
     if array.ndim != 1 or not array.size or array.size != (size or array.size) or not np.isfinite(array).all():
         count = size or array.size or "some"
-        raise ValueError(
-            f"{name} must be {count} finite number{'' if count == 1 else 's'}, but got {short_repr(value)}"
-        )
+        rule = f"{name} must be {count} finite number{'' if count == 1 else 's'}"
+        raise ValueError(f"{rule}, but got {short_repr(value)}")
     return array
 
 

@@ -77,9 +77,8 @@ def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
     except ValueError:  # rows of different lengths
         chosen = np.empty(0)
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise ValueError(
-            f"reset_mask must be {count} booleans, at least one of them true, but got {short_repr(mask)}"
-        )
+        rule = f"reset_mask must be {count} booleans, at least one of them true"
+        raise ValueError(f"{rule}, but got {short_repr(mask)}")
     if not keys.seeded and not chosen.all():
         raise ValueError(f"reset_mask must have all copies at the first reset, but got {short_repr(mask)}")
     return chosen.copy()

@@ -45,14 +45,12 @@ def object_named(name: str, what: str):
     except RuleBroken:
         raise
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"{what} must be 'module:object' that can be imported, but {name!r} is not: {error}"
-        ) from None
+        rule = f"{what} must be 'module:object' that can be imported"
+        raise ValueError(f"{rule}, but {name!r} is not: {error}") from None
     except Exception as error:
         article = "an" if what[0] in "aeiou" else "a"
-        raise ValueError(
-            f"{article} {what}'s module must import, but {name!r} raised {error_line(error)}"
-        ) from error
+        rule = f"{article} {what}'s module must import"
+        raise ValueError(f"{rule}, but {name!r} raised {error_line(error)}") from error
     return result
 
 

@@ -37,8 +37,6 @@ def count_steps(length: float, dt: float, resolution: float) -> int:
     """
     count = length / dt - max(ROUNDING, 2.0 * resolution / dt)
     if not count <= MOST_STEPS:
-        raise ValueError(
-            f"two successive stamps must be at most {MOST_STEPS} steps of {dt:g} s apart, but are {length:.9g} s: "
-            "after a gap or a clock that was set start anew"
-        )
+        rule = f"two successive stamps must be at most {MOST_STEPS} steps of {dt:g} s apart"
+        raise ValueError(f"{rule}, but are {length:.9g} s: after a gap or a clock that was set start anew")
     return max(1, math.ceil(count))

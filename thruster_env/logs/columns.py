@@ -131,10 +131,8 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
     try:
         import pint
     except ImportError:
-        raise ValueError(
-            f"units must be converted by pint, which is not installed ({to_install('units')}), but "
-            f"{where} is in {unit!r} in place of {wanted!r}"
-        ) from None
+        rule = f"units must be converted by pint, which is not installed ({to_install('units')})"
+        raise ValueError(f"{rule}, but {where} is in {unit!r} in place of {wanted!r}") from None
     registry = pint.application_registry.get()
     try:
         source, target = (WRITTEN.get(text, text) for text in (unit, wanted))
@@ -266,16 +264,14 @@ def find_columns(
         channel = None if name == TIME else find_wanted(name, wanted)
         if channel is None and name != TIME:
             known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
-            raise ValueError(
-                f"columns must be given for some of {known}, but got {short_repr(name)}={text} ({file})"
-            )
+            rule = f"columns must be given for some of {known}"
+            raise ValueError(f"{rule}, but got {short_repr(name)}={text} ({file})")
         if not isinstance(text, str):
             raise ValueError(f"the column for {name} must be a header, but got {short_repr(text)} ({file})")
         key = TIME if channel is None else channel.key
         if key in columns:
-            raise ValueError(
-                f"a column must be given once for {name}, but got {columns[key].header} and {text} ({file})"
-            )
+            rule = f"a column must be given once for {name}"
+            raise ValueError(f"{rule}, but got {columns[key].header} and {text} ({file})")
         columns[key] = column_of(text, headers, units, name, file)
     known_headers = set(headers)
     for header in units:
@@ -290,9 +286,8 @@ def _check_columns(
     columns: Mapping[str, Column], wanted: Sequence[Wanted], headers: Sequence[str], needs_time: bool, file: str
 ) -> None:
     """Raise ValueError, naming all that is missing, unless inputs, measurements and times are there."""
-    missing = [
-        channel for channel in wanted if channel.kind in (INPUT, MEASUREMENT) and channel.key not in columns
-    ]
+    needed = [channel for channel in wanted if channel.kind in (INPUT, MEASUREMENT)]
+    missing = [channel for channel in needed if channel.key not in columns]
     if not missing:
         return
     texts = [
@@ -303,9 +298,8 @@ def _check_columns(
     if needs_time and TIME not in columns:
         texts.append("times (use --column time=HEADER, or --dt)")
     python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
-    raise ValueError(
-        f"a log must have a column for {' and for '.join(texts)}, but {file} has {listed(headers)}; {python}"
-    )
+    rule = f"a log must have a column for {' and for '.join(texts)}"
+    raise ValueError(f"{rule}, but {file} has {listed(headers)}; {python}")
 
 
 def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
@@ -332,9 +326,7 @@ def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str],
         remaining = [channel for channel in wanted if channel.kind in kinds]
         for channel in remaining:
             name = plain(channel.quantity.name).lower()
-            take(
-                channel.key, [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name]
-            )
+            take(channel.key, [text for text in bases.get(name, []) if plain(parted(text)[0]).lower() == name])
         for channel in remaining:  # the whole header: what stands behind the line of "V_s" is no unit
             take(channel.key, by_header.get(plain(channel.quantity.symbol), []), without_unit=False)
         for channel in remaining:

@@ -157,9 +157,7 @@ def has_outliers(logs: Sequence[Log]) -> bool:
 def _of_rows(log: Log) -> list[Finding]:
     recording, last = log.recording, log.steps
     findings = [Finding(DAMAGED, "", 0, last, 1, text) for text in recording.damage]
-    findings += [
-        Finding(remark.kind, remark.channel, 0, last, last + 1, remark.sentence) for remark in recording.remarks
-    ]
+    findings += [Finding(kind, channel, 0, last, last + 1, text) for kind, channel, text in recording.remarks]
     for first, count in recording.gaps:
         text = f"a gap: {count} rows ({count * log.dt:.4g} s) are missing{_where(log, first, first + count - 1)}"
         findings.append(Finding(GAP, "", first, first + count - 1, count, text))
@@ -170,9 +168,8 @@ def _of_rows(log: Log) -> list[Finding]:
         findings.append(Finding(MISSING, "", 0, last, recording.missing, text))
     if recording.doubled:
         rows = "row has" if recording.doubled == 1 else "rows have"
-        text = (
-            f"{recording.doubled} {rows} the time of the row before; of two samples of a channel the last is used"
-        )
+        rule = "of two samples of a channel the last is used"
+        text = f"{recording.doubled} {rows} the time of the row before; {rule}"
         findings.append(Finding(DOUBLED, "", 0, last, recording.doubled, text))
     if recording.shifted:
         farthest = f"by up to {recording.farthest:.3g} s"

@@ -83,16 +83,13 @@ def grid_of(stamps: np.ndarray, dt: float | None = None, clock: np.ndarray | Non
         dt = _rounded(period, spread)
     longest = max(len(piece) for piece in pieces)
     times = since
-    if (
-        abs(dt - period) * longest <= SAME_RATE * dt + SURE * spread * longest
-    ):  # else a piece has no place of its own
+    if abs(dt - period) * longest <= SAME_RATE * dt + SURE * spread * longest:  # else no piece has its own place
         times = _shifted(since, pieces, dt)
     numbers = np.floor(times / dt + 0.5)
     regular = bool((abs(times - dt * numbers) <= TOLERANCE * dt).all() and (np.diff(numbers) > 0).all())
     shifts = abs(since - dt * numbers)[inverse]
-    if regular:
-        return Grid(dt, int(numbers[-1]) + 1, (dt * numbers)[inverse], False, shifts)
-    return Grid(dt, int(numbers[-1]) + 1, times[inverse], True, shifts)
+    times = dt * numbers if regular else times
+    return Grid(dt, int(numbers[-1]) + 1, times[inverse], not regular, shifts)
 
 
 def _usual(since: np.ndarray) -> float:
@@ -362,7 +359,7 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
 
 def in_seconds(stamps: np.ndarray, unit: str | None, header: str, where: str) -> tuple[np.ndarray, str]:
     """Stamps (rows,) of a column in a unit, None for what `unit_of` finds; and what that took, in words."""
-    unit, assumption = (
-        (unit, "") if unit is not None else unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
-    )
+    assumption = ""
+    if unit is None:
+        unit, assumption = unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
     return converted(stamps, unit, SECOND, where), assumption

@@ -168,10 +168,8 @@ class Log:
 
     def _known(self, channel: str) -> str:
         if channel not in self.channels:
-            raise ValueError(
-                f"a channel of log {self.name} must be one of {', '.join(self.channels)}, "
-                f"but got {short_repr(channel)}"
-            )
+            rule = f"a channel of log {self.name} must be one of {', '.join(self.channels)}"
+            raise ValueError(f"{rule}, but got {short_repr(channel)}")
         return channel
 
 

@@ -164,25 +164,18 @@ def read_log(
         columns = [parts[channel.key] for channel in wanted if channel.kind == kind]
         return np.column_stack(columns) if columns else np.empty((rows, 0))
 
-    driven = {
-        channel.key: samples[channel.key]._replace(
-            times=samples[channel.key].times - offsets.get(channel.key, 0.0)
-        )
-        for channel in wanted
-        if channel.kind == INPUT
-    }
+    driven = {}
+    for key in (channel.key for channel in wanted if channel.kind == INPUT):
+        driven[key] = samples[key]._replace(times=samples[key].times - offsets.get(key, 0.0))
     end = float(of_file.times[-1]) if marks is not None else of_file.dt * (of_file.rows - 1)
     remarks = (
         *([Remark(CLOCK, "", assumption)] if assumption else []),
         *table.remarks,
         *stale_inputs(driven, end, dt, start),
     )
-    referred = {
-        channel.key: channel.quantity
-        for channel in wanted
-        if channel.kind not in (INPUT, MEASUREMENT) and channel.key in parts
-    }
-    recording = _recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file)
+    referring = [channel for channel in wanted if channel.kind not in (INPUT, MEASUREMENT)]
+    referred = {channel.key: channel.quantity for channel in referring if channel.key in parts}
+    recording = _recording(of_file, rows, tuple(dropped)) if grid else Recording(doubled=_doubled(of_file))
     if last < FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {last + 1}")
     return Log(
@@ -203,9 +196,9 @@ def read_log(
     )
 
 
-def _as_recorded(of_file: Grid) -> Recording:
-    """The recording of a file's rows without a grid: of two rows with one stamp the last counts."""
-    return Recording(doubled=int((np.diff(of_file.times) == 0).sum()))
+def _doubled(grid: Grid) -> int:
+    """The number of rows with the stamp of the row before."""
+    return int((np.diff(grid.times) == 0).sum())
 
 
 def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...]) -> Recording:
@@ -218,8 +211,8 @@ def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...
     holes = np.maximum(np.round(apart[~is_gap] / usual).astype(int) - 1, 0)
     shifts = grid.shifts[grid.shifts > TOLERANCE * grid.dt]
     farthest = float(shifts.max()) if len(shifts) else 0.0
-    doubled = int((np.diff(grid.times) == 0).sum())
-    return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(shifts), farthest, doubled, dropped)
+    count = int((holes > 0).sum())
+    return Recording(gaps, int(holes.sum()), count, len(shifts), farthest, _doubled(grid), dropped)
 
 
 def _described(path: Path) -> Description:
@@ -230,16 +223,14 @@ def _described(path: Path) -> Description:
     content = read_toml(description, "what is said of a log")
     unknown = sorted(set(content) - set(Description._fields))
     if unknown:
-        raise ValueError(
-            f"keys beside a log must be among {', '.join(Description._fields)}, but {description} has {unknown}"
-        )
+        rule = f"keys beside a log must be among {', '.join(Description._fields)}"
+        raise ValueError(f"{rule}, but {description} has {unknown}")
     for key, kind in (("columns", str), ("units", str), ("clock_offset", float | int)):
         part = content.get(key, {})
         if not isinstance(part, dict) or not all(isinstance(value, kind) for value in part.values()):
             what = "texts" if kind is str else "seconds"
-            raise ValueError(
-                f"{key} beside a log must map names to {what}, but {description} has {short_repr(part)}"
-            )
+            rule = f"{key} beside a log must map names to {what}"
+            raise ValueError(f"{rule}, but {description} has {short_repr(part)}")
     return Description(**content)
 
 
@@ -251,9 +242,8 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     apart = np.flatnonzero(np.diff(table.lines) != 1)
     if column is None and len(apart):
         line = table.lines[int(apart[0])] + 1
-        raise ValueError(
-            f"rows of a log without times must follow one another, but line {line} of {file} is empty"
-        )
+        rule = "rows of a log without times must follow one another"
+        raise ValueError(f"{rule}, but line {line} of {file} is empty")
     if column is None:
         if dt is None:
             raise ValueError(
@@ -283,9 +273,8 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
         )
     count = (clocked[-1] - clocked[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
-        raise ValueError(
-            f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
-        )
+        rule = f"a log must be at most {MOST_STEPS} steps long"
+        raise ValueError(f"{rule}, but {file} has {count:.3g} from first to last time")
     fitted = grid_of(stamps, dt, table.clock)
     if not grid:
         fitted = Grid(fitted.dt, fitted.rows, stamps - stamps[0], True)
@@ -303,10 +292,8 @@ def _offsets(
             raise ValueError(f"clock offsets must be of channels {known}, but got {short_repr(name)} ({file})")
         offsets[channel.key] = finite(f"the clock offset of {name}", seconds)
         if abs(offsets[channel.key]) >= length:  # nothing of the channel would be left
-            raise ValueError(
-                f"the clock offset of {name} must be shorter than the log, {length:g} s, but got {seconds:g} "
-                f"({file})"
-            )
+            rule = f"the clock offset of {name} must be shorter than the log, {length:g} s"
+            raise ValueError(f"{rule}, but got {seconds:g} ({file})")
     return offsets
 
 
@@ -322,10 +309,8 @@ def _series(table: Table, column: Column, wanted: Wanted, grid: Grid) -> tuple[S
     if not present.any() and wanted.kind in (INPUT, MEASUREMENT):
         raise ValueError(f"a column must hold numbers, but {where} has none")
     if wanted.kind == INPUT and not present[0]:
-        raise ValueError(
-            f"an input must be known from the first row on, but it is missing in "
-            f"{table.location(0, column.header)}"
-        )
+        rule = "an input must be known from the first row on"
+        raise ValueError(f"{rule}, but it is missing in {table.location(0, column.header)}")
     if wanted.kind == MEASUREMENT and present.sum() > 1 and np.ptp(values[present]) == 0.0:
         raise ValueError(f"a measurement must vary, but {where} is {values[present][0]:.10g} in all rows")
     return Series(grid.times[present], values[present]), present

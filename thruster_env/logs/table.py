@@ -70,11 +70,9 @@ class Table:
     def numbers(self, column: str) -> np.ndarray:
         """A column as float64 (rows,), NaN where a number is missing; ValueError for text and infinite numbers."""
         cells = self.cells[column]
-        if isinstance(cells, np.ndarray):
-            if cells.dtype.kind not in "biufOU" or cells.ndim != 1:
-                raise ValueError(
-                    f"columns must hold numbers, but column {column!r} of {self.file} holds {cells.dtype}"
-                )
+        if isinstance(cells, np.ndarray) and (cells.dtype.kind not in "biufOU" or cells.ndim != 1):
+            rule = "columns must hold numbers"
+            raise ValueError(f"{rule}, but column {column!r} of {self.file} holds {cells.dtype}")
         if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU":
             numbers = cells.astype(np.float64)
         else:
@@ -85,7 +83,8 @@ class Table:
                     raise ValueError
             except ValueError:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
-                rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
+                has_comma = texts[row].count(",") == 1 and _is_number(texts[row].replace(",", "."))
+                rule = "columns must hold numbers" + ", with decimal points" * has_comma
                 raise ValueError(
                     f"{rule}, but got {short_repr(cells[row])} in {self.location(row, column)}"
                 ) from None
@@ -155,9 +154,8 @@ def _read_csv(path: Path) -> Table:
         text = path.read_text(encoding="utf-8-sig").lstrip("\ufeff")  # some programs write the mark twice
     except UnicodeDecodeError as error:
         line = 1 + error.object[: error.start].count(b"\n")
-        raise ValueError(
-            f"a CSV file must be text in UTF-8, but {path} is not: {error.reason} in line {line}"
-        ) from None
+        rule = "a CSV file must be text in UTF-8"
+        raise ValueError(f"{rule}, but {path} is not: {error.reason} in line {line}") from None
     if "\0" in text:  # as in UTF-16, or where a loss of power left a block empty
         line = 1 + text[: text.index("\0")].count("\n")
         raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: a zero byte in line {line}")
@@ -171,9 +169,7 @@ def _read_csv(path: Path) -> Table:
     else:
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
         try:
-            numbered = [
-                (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
-            ]
+            numbered = [(reader.line_num, [*map(str.strip, row)]) for row in reader if any(map(str.strip, row))]
         except csv.Error as error:
             raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
     (line, header), *rows = numbered
@@ -181,10 +177,8 @@ def _read_csv(path: Path) -> Table:
     _check_header(header, line, path)
     for line, row in rows:
         if len(row) != len(header):
-            raise ValueError(
-                f"rows must have as many cells as the header, {len(header)}, but got {len(row)} in line {line} of "
-                f"{path}"
-            )
+            rule = f"rows must have as many cells as the header, {len(header)}"
+            raise ValueError(f"{rule}, but got {len(row)} in line {line} of {path}")
     if not rows:
         raise ValueError(f"a log must have a header and rows, but {path} has only a header")
     columns = list(zip(*(row for _, row in rows), strict=True))
@@ -205,9 +199,8 @@ def _is_shortest(cells: Sequence[str]) -> bool:
 
 def _check_header(header: Sequence[str], line: int, path: Path) -> None:
     if all(map(_is_number, header)):
-        raise ValueError(
-            f"the first line must name the columns, but line {line} of {path} has numbers: {short_repr(header)}"
-        )
+        rule = "the first line must name the columns"
+        raise ValueError(f"{rule}, but line {line} of {path} has numbers: {short_repr(header)}")
     names = set()
     for name in header:
         if name and name in names:
@@ -218,10 +211,8 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
 
 def _read_parquet(path: Path) -> Table:
     if find_spec("pyarrow") is None:
-        raise ValueError(
-            f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')}), "
-            f"but got {path}"
-        )
+        rule = f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')})"
+        raise ValueError(f"{rule}, but got {path}")
     if not path.exists():
         raise FileNotFoundError(ENOENT, strerror(ENOENT))
     with _damaged("a Parquet file must be one, but {path} is not", path), opened("parquet", path) as file:
@@ -319,11 +310,6 @@ def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
             )
             raise ValueError(f"{rule}, but {path} has {sizes}: leave one out")
     return Table(str(path), cells, range(1, len(cells[first]) + 1), "row")
-
-
-def _has_comma(text: str) -> bool:
-    """Whether a text is a number with a decimal comma."""
-    return text.count(",") == 1 and _is_number(text.replace(",", "."))
 
 
 def _is_number(text: str) -> bool:

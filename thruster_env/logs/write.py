@@ -43,9 +43,8 @@ def check_not_among(path: str | Path) -> None:
     logs = [path.with_suffix(suffix) for suffix in (*SUFFIXES, *ENDINGS) if path.suffix == ".toml"]
     for log in logs:
         if log.is_file():
-            raise ValueError(
-                f"a file must not take the name of the description of a log, but got {path} beside {log.name}"
-            )
+            rule = "a file must not take the name of the description of a log"
+            raise ValueError(f"{rule}, but got {path} beside {log.name}")
 
 
 def write_columns(

@@ -111,11 +111,8 @@ class Contents:
             if len(names) < len(reader.connections):
                 raise ValueError("it has two connections of one number")
             decoders = dict(self._decoders(reader.connections))
-            chosen = [
-                connection
-                for connection in reader.connections
-                if connection.id in decoders and decoders[connection.id].leaves
-            ]
+            readable = {number for number, decoder in decoders.items() if decoder.leaves}
+            chosen = [connection for connection in reader.connections if connection.id in readable]
             rows = Counter({connection.id: 0 for connection in chosen})
             unpack = unpacker(KIND, self.path).decompress if is_packed else bytes
             for connection, received, data in reader.messages(chosen) if chosen else ():
@@ -241,9 +238,8 @@ class Samples:
                 rows = np.array(numbers).reshape(-1, width)
                 values |= {f"{leaf.path}[{entry}]": rows[:, entry] for entry in range(width)}
             elif width:
-                unread[leaf.path] = (
-                    "an array whose length changes" if width < 0 else f"an array of {width} entries"
-                )
+                what = "whose length changes" if width < 0 else f"of {width} entries"
+                unread[leaf.path] = f"an array {what}"
         return values, unread
 
 
@@ -259,9 +255,10 @@ def _are_set(stamps: np.ndarray) -> bool:
 
 def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str, str]) -> Topic:
     """A topic whose messages are of one type or several, in order of their times [s] since the beginning [ns]."""
-    stamps, received = (np.concatenate([np.empty(0, np.int64), *stamp_arrays]) for stamp_arrays in _ticks(parts))
+    stamps = np.concatenate([np.empty(0, np.int64), *(np.array(part.stamps, np.int64) for part in parts)])
+    received = np.concatenate([np.empty(0, np.int64), *(np.array(part.received, np.int64) for part in parts)])
     has_stamps = _are_set(stamps[np.argsort(received, kind="stable")])
-    ticks = (stamps if has_stamps else received).astype(np.int64)
+    ticks = stamps if has_stamps else received
     order = np.argsort(ticks, kind="stable")
     values: dict[str, np.ndarray] = {}
     unread, row = dict(unread), 0
@@ -275,12 +272,6 @@ def _topic(name: str, parts: Sequence[Samples], begin: int, unread: Mapping[str,
     values = {key: column[order] for key, column in values.items()}
     clock = (HEADER, received) if has_stamps else (RECEIPT, None)
     return Topic(name, times, values, unread=unread, clock=clock[0], received=clock[1])
-
-
-def _ticks(parts: Sequence[Samples]) -> Iterator[list[np.ndarray]]:
-    """The stamps of messages, and when they were received [ns]."""
-    yield [np.array(part.stamps, np.int64) for part in parts]
-    yield [np.array(part.received, np.int64) for part in parts]
 
 
 def _leaves(defined: dict, kind: str, before: str = "", depth: int = 0) -> Iterator[Leaf]:
@@ -312,9 +303,7 @@ def _check_types(defined: dict) -> None:
             all(isinstance(constant[2], (bool, int, float, str)) for constant in constants),
             all(map(NAME.fullmatch, names)) and len(names) <= MOST_FIELDS,
             max((what[1] for _, (node, what) in fields if node.name == "ARRAY"), default=0) <= MOST_FIELDS,
-            not any(
-                inner.name == "NAME" and _is_void(defined, element_kind) for (inner, element_kind), _ in arrays
-            ),
+            not any(inner.name == "NAME" and _is_void(defined, what) for (inner, what), _ in arrays),
         ]
         if not all(sound):
             raise ValueError(f"the type {kind[:80]!r} is none of a message")

@@ -53,9 +53,8 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             offsets = [np.array(kind_offsets, np.int64) for kind_offsets in index.offsets]
             content = np.memmap(path, np.uint8, "r")
             formats = _formats(reader, index, offsets, content, path)
-        if not any(
-            len(offsets[kind]) for kind, (definition, *_) in formats.items() if definition.form.name not in FORMATS
-        ):
+        kinds = {each[0].form.name for kind, each in formats.items() if len(offsets[kind])}
+        if kinds <= {*FORMATS}:
             raise ValueError("it holds no messages but those that describe others")
     damage = _damage(formats, offsets, content)
     names = None if wanted is None else {column.partition(".")[0].partition("#")[0] for column in wanted}
@@ -67,15 +66,9 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
             continue
         parts: dict[str, list[tuple[Topic, np.ndarray]]] = {}
         for _, kind, definition in group:
-            kind_offsets = offsets[kind]
-            kind_offsets = kind_offsets[
-                (kind_offsets >= definition.begin)
-                & (kind_offsets < definition.end)
-                & (kind_offsets + definition.form.len <= len(content))
-            ]
-            for topic, topic_offsets in (
-                _instances(definition.form, content, kind_offsets) if len(kind_offsets) else ()
-            ):
+            begins = definition.within(offsets[kind])
+            begins = begins[begins + definition.form.len <= len(content)]
+            for topic, topic_offsets in _instances(definition.form, content, begins) if len(begins) else ():
                 parts.setdefault(topic.name, []).append((topic._replace(damage=damage), topic_offsets))
         for each in parts.values():
             yield joined(*map(list, zip(*each, strict=True)))
@@ -87,6 +80,10 @@ class Definition(NamedTuple):
     form: Any  # pymavlink's
     begin: int  # [bytes]
     end: int
+
+    def within(self, offsets: np.ndarray) -> np.ndarray:
+        """Those of the offsets that lie in the part."""
+        return offsets[(offsets >= self.begin) & (offsets < self.end)]
 
 
 def _formats(
@@ -155,13 +152,14 @@ def _damage(
     formats: Mapping[int, Sequence[Definition]], offsets: Sequence[np.ndarray], content: np.ndarray
 ) -> str:
     """The parts of a log that are not read, in words; a few bytes of 0 or 255 at its end only fill a page."""
-    begins = [np.empty(0, np.int64)]
-    ends = [np.empty(0, np.int64)]
+    begins, ends, unlike, unnamed = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [], []
     for kind, each in formats.items():
-        for definition in each:
-            starts = offsets[kind][(offsets[kind] >= definition.begin) & (offsets[kind] < definition.end)]
+        for form, starts in ((definition.form, definition.within(offsets[kind])) for definition in each):
             begins.append(starts)
-            ends.append(starts + definition.form.len)
+            ends.append(starts + form.len)
+            if len(offsets[kind]):
+                unlike += [form.name] * (struct.calcsize(form.msg_struct) + HEADER != form.len)
+                unnamed += [form.name] * (sum(map(bool, form.columns)) != len(form.format))
     order = np.argsort(np.concatenate(begins))
     begin, end = np.concatenate(begins)[order], np.concatenate(ends)[order]
     if not len(begin):
@@ -171,21 +169,8 @@ def _damage(
     rest = set(content[len(content) - after :].tolist()) if 0 < after < LONGEST else set()
     is_rest = rest in (set(), {0}, {255})
     nameless = sum(len(kind_offsets) for kind, kind_offsets in enumerate(offsets) if kind not in formats)
-    texts = [f"{lost} bytes in {hole_count} place{'s' * (hole_count != 1)} of the log belong to no message"] * (
-        lost > 0
-    )
-    unlike = (
-        definition.form.name
-        for kind, each in formats.items()
-        for definition in each
-        if len(offsets[kind]) and struct.calcsize(definition.form.msg_struct) + HEADER != definition.form.len
-    )
-    unnamed = (
-        definition.form.name
-        for kind, each in formats.items()
-        for definition in each
-        if len(offsets[kind]) and sum(map(bool, definition.form.columns)) != len(definition.form.format)
-    )
+    places = f"{hole_count} place{'s' * (hole_count != 1)}"
+    texts = [f"{lost} bytes in {places} of the log belong to no message"] * (lost > 0)
     texts += [f"the format of {name!r} is not as long as its messages" for name in unlike]
     texts += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
     texts += [f"{nameless} messages of the log have no format"] * (nameless > 0)

@@ -84,9 +84,8 @@ def topics_of(
         except Exception as error:  # of this one alone
             why = " ".join(str(error).split())[:160] or type(error).__name__
             if wanted is not None:
-                raise Refused(
-                    f"a field must be one that can be read, but {name!r} is not: {why} ({path})"
-                ) from None
+                rule = "a field must be one that can be read"
+                raise Refused(f"{rule}, but {name!r} is not: {why} ({path})") from None
             yield Topic("", None, {}, unread={name: f"damaged: {why}"})
             continue
         values = values if values.shape[0] == along else values.T

@@ -33,10 +33,9 @@ class Recorded:
         """
         check_stamps(stamps, form, path)
         self.path, self.form, self.stamps = Path(path), form, stamps
-        names = {name for text in asked for name in (text, text.rpartition("[")[0].strip()) if name}
+        self._asked = {name for text in asked for name in (text, text.rpartition("[")[0].strip()) if name}
         self.is_whole, self.is_timed = not form.has_stamps, False
-        self._asked = names
-        self.samples = read(path, None if self.is_whole else names)
+        self.samples = read(path, None if self.is_whole else self._asked)
 
     def columns(
         self, wanted: list[Wanted], named: Mapping[str, str], units: Mapping[str, str], needs_time: bool
@@ -47,11 +46,9 @@ class Recorded:
             raise ValueError(f"{rule}, but got time={named[TIME]} ({self.path})")
         self.is_timed = TIME in named  # by a vector for all fields, in place of those beside them
         while True:
-            unit_of = {
-                name: unit for name, samples in self.samples.items() if (unit := _unit(name, samples)) is not None
-            }
+            read_units = {name: _unit(name, samples) for name, samples in self.samples.items()}
+            unit_of = {name: unit for name, unit in read_units.items() if unit is not None} | units
             file_units = {name: samples.unit for name, samples in self.samples.items() if samples.unit}
-            unit_of |= units
             try:
                 columns = find_columns(wanted, [*self.samples], named, unit_of, str(self.path), needs_time)
                 return columns if self.form.has_units else _without_units(columns, wanted, file_units)
@@ -78,11 +75,8 @@ class Recorded:
         Raises:
             ValueError: if a field has no times, or they run backwards, or inputs and measurements do not overlap.
         """
-        columns = {
-            key: column
-            for key, column in columns.items()
-            if key != TIME or self.is_timed or not self.has_times(columns)
-        }
+        if not self.is_timed and self.has_times(columns):
+            columns = {key: column for key, column in columns.items() if key != TIME}
         fields = {column.header: self.samples[column.header] for column in columns.values()}
         choice = chosen_clock({name: samples.clocked for name, samples in fields.items()}, self.stamps, self.path)
         fields = {name: samples.by(choice.clock) for name, samples in fields.items()}
@@ -96,27 +90,25 @@ class Recorded:
                     f"all fields of a log must have times, but there are none beside {name!r} in {self.path} "
                     f"(use --column time=NAME)"
                 )
-        of = {
-            kind: [fields[columns[key].header] for key in columns if key.startswith(f"{kind}:")] for kind in KINDS
-        }
-        clock = _clock(of[INPUT], of[MEASUREMENT], self.path)
+        inputs, measured = (
+            [columns[key].header for key in columns if key.startswith(f"{kind}:")] for kind in (INPUT, MEASUREMENT)
+        )
+        clock = _clock([fields[name] for name in inputs], [fields[name] for name in measured], self.path)
         apart = np.unique(np.concatenate([_times(samples) for samples in fields.values()]))
         apart = apart[(apart > clock[0]) & (apart < clock[-1])]
         stamps = np.sort(np.concatenate([clock, np.setdiff1d(apart, clock)]), kind="stable")
         cells = {name: _rows(samples, stamps) for name, samples in fields.items()}
-        for name in (columns[key].header for key in columns if key.startswith(f"{INPUT}:")):
+        for name in inputs:
             cells[name][0] = fields[name].values[_times(fields[name]) <= stamps[0]][-1]
         rows = range(1, len(stamps) + 1)
-        clock_remarks = [
-            Remark(CLOCK, "", text) for text in dict.fromkeys(part.assumption for part in fields.values()) if text
-        ]
+        assumptions = dict.fromkeys(part.assumption for part in fields.values() if part.assumption)
+        clock_remarks = [Remark(CLOCK, "", text) for text in assumptions]
         is_clock = np.isin(stamps, clock)
         remarks = [*clock_remarks, *_of_choice(choice), *_not_used(columns, fields, clock, self.path)]
         table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(fields), remarks)
         return table, {**columns, TIME: Column(STAMP, SECOND)}
 
 
-KINDS = (INPUT, MEASUREMENT)
 MANY = 0.1  # of the samples of a channel outside the log: worth a word
 
 
@@ -207,10 +199,8 @@ def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.nda
     clock = max(within, key=len, default=np.empty(0))
     if len(clock) < 2:
         end = max((_times(samples)[-1] for samples in measured if len(samples.values)), default=np.nan)
-        raise ValueError(
-            f"measurements must continue after all inputs have begun, at {begin:.15g} s, but {path} has "
-            f"{len(clock)} from there on, and they end at {end:.15g} s"
-        )
+        rule = f"measurements must continue after all inputs have begun, at {begin:.15g} s"
+        raise ValueError(f"{rule}, but {path} has {len(clock)} from there on, and they end at {end:.15g} s")
     return clock
 
 

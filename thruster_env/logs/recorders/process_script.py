@@ -114,9 +114,7 @@ class Walk:
         self.datasets[name if brackets == "{}" else group] = MANY[brackets]
         if dataset.size > MOST_OBJECTS or depth >= DEEPEST:
             return
-        for index, reference in enumerate(
-            np.asarray(dataset[()]).reshape(-1), 1
-        ):  # MATLAB counts along columns, from 1
+        for index, reference in enumerate(np.ravel(dataset[()]), 1):  # MATLAB counts along columns, from 1
             full_name = f"{name}{{{index}}}" if brackets == "{}" else f"{group}({index}).{field}"
             if reference:
                 self._add(self._file[reference], full_name, depth + 1)
@@ -161,22 +159,17 @@ def _line(error: object) -> str:
 
 def _described(dataset: Any, field: str | None) -> dict[str, Any]:
     """Shape, type and attributes of a dataset."""
-    kind = dataset.dtype if field is None else dataset.dtype[field]
-    attributes = (
-        {}
-        if field is not None
-        else {
-            key: _plain(value) for key, value in dataset.attrs.items() if key.lower() in TOLD and _is_some(value)
-        }
-    )
-    plain = kind.str if kind.kind in NUMERIC else str(kind)
-    return {"shape": list(dataset.shape), "kind": kind.kind, "dtype": plain, "attributes": attributes}
-
-
-def _is_some(value: Any) -> bool:
     import h5py
 
-    return not isinstance(value, h5py.Empty)
+    kind = dataset.dtype if field is None else dataset.dtype[field]
+    attributes = dict(dataset.attrs) if field is None else {}
+    attributes = {
+        key: _plain(value)
+        for key, value in attributes.items()
+        if key.lower() in TOLD and not isinstance(value, h5py.Empty)
+    }
+    plain = kind.str if kind.kind in NUMERIC else str(kind)
+    return {"shape": list(dataset.shape), "kind": kind.kind, "dtype": plain, "attributes": attributes}
 
 
 def _plain(value: Any) -> Any:
@@ -240,10 +233,8 @@ def parquet(request: dict) -> tuple[dict[str, Any], Reader]:
         size += sum(part.total_uncompressed_size for part in parts)
     names = pyarrow.parquet.read_schema(request["files"][0]).names
     if request["files"] != [request["path"]] and max(8 * numbers, size) <= request["bytes"]:
-        tables.append(
-            pyarrow.parquet.read_table(request["path"], **CHECKED)
-        )  # names of its folders are columns, too
-        names = tables[0].column_names
+        tables.append(pyarrow.parquet.read_table(request["path"], **CHECKED))
+        names = tables[0].column_names  # those of its folders, too
 
     def read(number: int) -> np.ndarray:
         if not tables:
@@ -274,13 +265,9 @@ def main() -> None:
     for line in sys.stdin:
         try:
             values = np.ascontiguousarray(read(int(line)))
+            description, data = {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]}, b""
             if values.dtype.kind in SENT:
                 description, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
-            else:
-                description, data = (
-                    {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]},
-                    memoryview(b""),
-                )
         except Exception as error:
             answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         else:

@@ -156,13 +156,12 @@ def _of_table(table: Table) -> Contents:
     clock, times = find_columns([], table.names, {}, {}, table.file).get(TIME), None
     if clock is not None:
         try:
-            dates = table.dates(clock.header)
-            where = f"column {clock.header!r} of {table.file}"
-            times = dates
-            if dates is None:
+            times = table.dates(clock.header)
+            if times is None:
+                where = f"column {clock.header!r} of {table.file}"
                 times = in_seconds(table.numbers(clock.header), clock.unit, clock.header, where)[0]
         except ValueError:  # the column is listed, or why it is not
-            times = None
+            pass
     listed, unread = list[Field](), dict[str, str]()
     for name in table.names:
         try:
@@ -232,8 +231,7 @@ def _field(name: str, topic: str, samples: Samples) -> Field:
     if times is not None and count:
         begin, end = float(times.min()), float(times.max())
     if times is not None and count > 1:
-        length = float(times.max() - times.min())
-        rate = (count - 1) / length if length > 0.0 else nothing
+        rate = (count - 1) / (end - begin) if end > begin else nothing
         gap = float(np.diff(np.sort(times)).max())
     known = np.isfinite(values)
     finite = values[known]

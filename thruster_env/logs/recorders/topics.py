@@ -215,9 +215,8 @@ class Pairs:
             if self._pairs.setdefault(name, (topic, parent, child)) != (topic, parent, child):
                 raise self._doubled(name)
             if len(self._pairs) > MOST_FIELDS:
-                raise Refused(
-                    f"a bag must have at most {MOST_FIELDS} pairs of frames, but got more ({self._path})"
-                )
+                rule = f"a bag must have at most {MOST_FIELDS} pairs of frames"
+                raise Refused(f"{rule}, but got more ({self._path})")
             yield name, transform
 
     def check(self, topics: Container[str]) -> None:

@@ -82,14 +82,12 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
         damage = f"{damage}, and " * bool(lost) + f"{strays} {are} damaged, or of a kind that is not known"
     elif not lost:
         damage = "some messages of the log are not as long as their formats say" if log.file_corruption else ""
-    while data_list:
+    while data_list:  # what is read already need not stay in memory
         same_topic = [data_list.pop(0)]
-        while data_list and (data_list[0].name, data_list[0].multi_id) == (
-            same_topic[0].name,
-            same_topic[0].multi_id,
-        ):
+        topic, instance = same_topic[0].name, same_topic[0].multi_id
+        while data_list and (data_list[0].name, data_list[0].multi_id) == (topic, instance):
             same_topic.append(data_list.pop(0))
-        name = f"{same_topic[0].name}#{same_topic[0].multi_id}" if same_topic[0].multi_id else same_topic[0].name
+        name = f"{topic}#{instance}" if instance else topic
         if wants(wanted, name):
             yield joined([_topic(name, data, damage) for data in same_topic])
 
@@ -181,10 +179,8 @@ def _checked_definitions(content: bytes, parts: Sequence[tuple[int, int]], path:
 
 def _numbers(data: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
     """All fields but the stamp, text and padding."""
-    names = [
-        name for name in data if name != STAMP and kinds.get(name, "char") != "char" and "_padding" not in name
-    ]
-    return {name: data[name].astype(np.float64) for name in names}
+    names = [name for name in data if name != STAMP and "_padding" not in name]
+    return {name: data[name].astype(np.float64) for name in names if kinds.get(name, "char") != "char"}
 
 
 def _check_formats(formats: Mapping) -> None:
