@@ -18,34 +18,38 @@ OF_EACH_KIND = ("kf-steady", "ekf-robust", "ukf", "vb", "enkf", "ensrf", "pf", "
 DT = 0.05  # of the pendulum
 
 
+def gaussians(q, r, mean, cov):
+    """The arguments of a model that give Q, R, and mean and covariance of the initial state."""
+    return {"process_noise_cov": q, "measurement_noise_cov": r, "prior_mean": mean, "prior_cov": cov}
+
+
+def state_space(f, h, /, q, r, mean, cov, **more):
+    """A model by f, h, Q, R, and mean and covariance of the initial state, which further arguments may replace."""
+    return StateSpaceModel(**{"transition": f, "observe": h, **gaussians(q, r, mean, cov), **more})
+
+
+def affine(a, b, c, /, q, r, mean, cov, **more):
+    """An affine model by A, B, C, Q, R, and mean and covariance of the initial state, as `state_space`."""
+    return affine_model(**{"a": a, "b": b, "c": c, **gaussians(q, r, mean, cov), **more})
+
+
 def scalar_model(**changes):
     """Affine, n = m = p = 1, without offsets."""
-    arguments = {
-        "a": [[0.9]],
-        "b": [[1.0]],
-        "c": [[2.0]],
-        "process_noise_cov": [0.1],
-        "measurement_noise_cov": [0.2],
-        "prior_mean": [3.0],
-        "prior_cov": [0.5],
-    }
-    return affine_model(**{**arguments, **changes})
+    return affine([[0.9]], [[1.0]], [[2.0]], q=[0.1], r=[0.2], mean=[3.0], cov=[0.5], **changes)
 
 
 def plane_model(**changes):
     """Affine, n = m = 2, p = 1, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.3], [-0.2, 0.8]],
-        "b": [[1.0], [0.5]],
-        "c": [[1.0, 0.4], [-0.3, 1.5]],
-        "state_offset": [0.3, -0.2],
-        "measurement_offset": [0.7, -0.1],
-        "process_noise_cov": [[0.3, 0.12], [0.12, 0.2]],
-        "measurement_noise_cov": [[0.5, -0.25], [-0.25, 0.4]],
-        "prior_mean": [1.0, -1.0],
-        "prior_cov": [[1.0, 0.4], [0.4, 0.5]],
-    }
-    return affine_model(**{**arguments, **changes})
+    return affine(
+        [[0.9, 0.3], [-0.2, 0.8]],
+        [[1.0], [0.5]],
+        [[1.0, 0.4], [-0.3, 1.5]],
+        q=[[0.3, 0.12], [0.12, 0.2]],
+        r=[[0.5, -0.25], [-0.25, 0.4]],
+        mean=[1.0, -1.0],
+        cov=[[1.0, 0.4], [0.4, 0.5]],
+        **{"state_offset": [0.3, -0.2], "measurement_offset": [0.7, -0.1], **changes},
+    )
 
 
 def line_model(**changes):
@@ -56,18 +60,16 @@ def line_model(**changes):
 
 def wide_model(**changes):
     """Affine, n = 3, p = 2, m = 2, stable, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
-        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
-        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
-        "state_offset": [0.3, -0.2, 0.1],
-        "measurement_offset": [0.7, -1.5],
-        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -1.0, 0.5],
-        "prior_cov": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
-    }
-    return affine_model(**{**arguments, **changes})
+    return affine(
+        [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
+        [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
+        [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
+        q=[[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
+        r=[[0.5, 0.2], [0.2, 0.3]],
+        mean=[1.0, -1.0, 0.5],
+        cov=[[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
+        **{"state_offset": [0.3, -0.2, 0.1], "measurement_offset": [0.7, -1.5], **changes},
+    )
 
 
 def lonely_model():
@@ -127,16 +129,9 @@ def look(x, c):
 
 def pendulum(**changes):
     """n = m = 2, p = 1, nonlinear in both functions, without Jacobians."""
-    arguments = {
-        "transition": swing,
-        "observe": look,
-        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
-        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
-        "prior_mean": [0.5, 0.2],
-        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
-        "constants": (9.81, 0.3),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    noise = {"q": [[2e-4, 1e-4], [1e-4, 1e-3]], "r": [[0.01, 0.003], [0.003, 0.04]]}
+    prior = {"mean": [0.5, 0.2], "cov": [[0.2, 0.05], [0.05, 0.1]]}
+    return state_space(swing, look, **noise, **prior, **{"constants": (9.81, 0.3), **changes})
 
 
 MODELS = {"thruster": thruster_model, "wide affine": wide_model, "no input": lonely_model}  # for every filter

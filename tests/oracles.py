@@ -1,4 +1,4 @@
-"""Naive computations that tests of several filters compare with."""
+"""Naive computations that tests of several filters compare with, and comparisons of several arrays."""
 
 import math
 
@@ -7,6 +7,18 @@ import numpy as np
 from filters import run
 from tests.models import KEY
 from thruster_env.core.streams import normal_block
+
+
+def each_close(found, expected, **tolerances):
+    """Assert that arrays are close to others, pair by pair."""
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, **tolerances)
+
+
+def each_equal(found, expected):
+    """Assert that arrays are equal to others, pair by pair."""
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def normals(stream, step, rows, size):

@@ -16,7 +16,7 @@ from filters import (
 from filters.adaptive import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
-from tests.oracles import kalman_update
+from tests.oracles import each_close, kalman_update
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -148,8 +148,7 @@ def test_with_nothing_to_learn_it_is_the_extended_filter(kind, numbers, make):
     with interpreted():
         expected = run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), inputs, z)
         found = run(kind(model=model, **numbers), np.zeros((1, 2)), inputs, z)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
+    each_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
 def many_long(model):

@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from tests.filters.test_localised import ring
-from tests.models import KEY, plane_model, random_affine, simulated
+from tests.models import KEY, plane_model, random_affine, simulated, state_space
 from thruster_env.core.compiled import interpreted
 
 DEVIATION = 0.3
@@ -122,15 +122,7 @@ def place(x, c):
 
 def drifting(noise):
     """A body whose speed changes with a variance a step."""
-    return StateSpaceModel(
-        transition=walk,
-        observe=place,
-        process_noise_cov=[1e-4, noise],
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[0.04, 0.1],
-        inputs=0,
-    )
+    return state_space(walk, place, q=[1e-4, noise], r=[0.04], mean=[0.0, 0.0], cov=[0.04, 0.1], inputs=0)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -169,15 +161,8 @@ def test_the_factor_grows_of_the_state_whose_q_is_too_small():
         return (x[0], x[2])
 
     def pair(noise):
-        return StateSpaceModel(
-            transition=both,
-            observe=places,
-            process_noise_cov=[1e-4, 0.001, 1e-4, noise],
-            measurement_noise_cov=[0.04, 0.04],
-            prior_mean=np.zeros(4),
-            prior_cov=[0.04, 0.1, 0.04, 0.1],
-            inputs=0,
-        )
+        prior = {"mean": np.zeros(4), "cov": [0.04, 0.1, 0.04, 0.1]}
+        return state_space(both, places, q=[1e-4, 0.001, 1e-4, noise], r=[0.04, 0.04], **prior, inputs=0)
 
     _, z = simulated(pair(0.1), 150, count=4)
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import filters
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.differentiated.runs import ModelSlopes
 from filters.likelihood import likelihood
 from filters.sensitivity import sensitivity
-from tests.models import simulated
+from tests.models import simulated, state_space
 
 DT = 0.1
 LINEARISING = ("ekf", "iekf", "ekf-robust", "vb", "sage-husa", "fading", "h-infinity", "schmidt", "mhe", "gsf")
@@ -40,17 +40,9 @@ def place(x, c):
 
 
 def at_rest(**changes):
-    arguments = {
-        "transition": drag,
-        "observe": place,
-        "process_noise_cov": [1e-4, 1e-4, 1e-3, 1e-3],
-        "measurement_noise_cov": [0.01, 0.01],
-        "prior_mean": [0.0] * 4,
-        "prior_cov": [0.01] * 4,
-        "inputs": 2,
-        "constants": (0.3,),
-    }
-    return StateSpaceModel(**arguments | changes)
+    noise = {"q": [1e-4, 1e-4, 1e-3, 1e-3], "r": [0.01, 0.01]}
+    prior = {"mean": [0.0] * 4, "cov": [0.01] * 4}
+    return state_space(drag, place, **noise, **prior, **{"inputs": 2, "constants": (0.3,), **changes})
 
 
 @pytest.mark.usefixtures("as_python")
@@ -76,16 +68,9 @@ def tank(x, u, c):
 
 
 def one_state(transition, constants, start=0.0):
-    return StateSpaceModel(
-        transition=transition,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1e-4],
-        measurement_noise_cov=[0.01],
-        prior_mean=[start],
-        prior_cov=[0.04],
-        inputs=1,
-        constants=constants,
-    )
+    noise = {"q": [1e-4], "r": [0.01]}
+    prior = {"mean": [start], "cov": [0.04]}
+    return state_space(transition, lambda x, c: (x[0],), **noise, **prior, inputs=1, constants=constants)
 
 
 @pytest.mark.usefixtures("as_python")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model
+from filters import Inversion, LowPass, OpenLoop, run, thruster_model
 from filters.baselines import component_solver
+from tests.models import state_space
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 
@@ -27,15 +28,7 @@ def bump(x, c):
 
 
 def bumpy_model(**changes):
-    arguments = {
-        "transition": drift,
-        "observe": bump,
-        "process_noise_cov": [0.1, 0.1],
-        "measurement_noise_cov": [0.2],
-        "prior_mean": [1.0, 0.2],
-        "prior_cov": [0.3, 0.15],
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    return state_space(drift, bump, q=[0.1, 0.1], r=[0.2], mean=[1.0, 0.2], cov=[0.3, 0.15], **changes)
 
 
 def open_loop(model, inputs):

@@ -15,20 +15,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import truncated_normal
 
 INF = np.inf
-PAGES = (
-    "kf",
-    "kf-steady",
-    "ekf",
-    "iekf",
-    "ukf",
-    "ckf",
-    "fading",
-    "h-infinity",
-    "schmidt",
-    "ekf-robust",
-    "sage-husa",
-    "vb",
-)
+PAGES = "kf kf-steady ekf iekf ukf ckf fading h-infinity schmidt ekf-robust sage-husa vb".split()
 BY_NAME = {"x_1": (0.0, None), "x_3": (-0.2, 0.4)}
 
 

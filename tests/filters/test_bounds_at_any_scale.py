@@ -6,10 +6,11 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, affine_model, make_filter, run
+from filters import affine_model, make_filter, run
 from filters.bounds import path_bound
 from filters.posterior import posterior_bound
 from filters.wrapped import wrapped_variances
+from tests.models import affine, state_space
 from thruster_env.core.checks import covariance_root
 from tuning.problems import model_problem
 from tuning.problems.model_problem import ModelProblem
@@ -48,15 +49,7 @@ def exact_covariances(f, h, r, prior, q, steps=STEPS):
 def linear(case, q):
     f, h, r, prior = CASES[case]
     n = len(f)
-    model = affine_model(
-        a=f,
-        b=np.zeros((n, 0)),
-        c=[h],
-        process_noise_cov=q,
-        measurement_noise_cov=[r],
-        prior_mean=np.zeros(n),
-        prior_cov=prior,
-    )
+    model = affine(f, np.zeros((n, 0)), [h], q=q, r=[r], mean=np.zeros(n), cov=prior)
     return model, exact_covariances(f, h, r, prior, q)
 
 
@@ -118,16 +111,8 @@ def test_rounding_of_slopes_by_differences_is_no_information():
         return x[0] + x[1], x[1]
 
     def model(**known):
-        return StateSpaceModel(
-            transition=move,
-            observe=lambda x, c: (x[0],),
-            process_noise_cov=[1e-16, 1e-4],
-            measurement_noise_cov=[1.0],
-            prior_mean=[1e6, 0.1],
-            prior_cov=[1.0, 0.01],
-            inputs=0,
-            **known,
-        )
+        prior = {"mean": [1e6, 0.1], "cov": [1.0, 0.01]}
+        return state_space(move, lambda x, c: (x[0],), q=[1e-16, 1e-4], r=[1.0], **prior, inputs=0, **known)
 
     inputs = np.zeros((1, STEPS, 0))
     told = model(transition_jacobian=lambda x, u, c: ((1.0, 1.0), (0.0, 1.0)))
@@ -136,15 +121,7 @@ def test_rounding_of_slopes_by_differences_is_no_information():
 
 
 def test_a_state_too_uncertain_for_float64_has_no_bound_rather_than_a_wrong_one():
-    model = affine_model(
-        a=[[1e30]],
-        b=np.zeros((1, 0)),
-        c=[[0.0]],
-        process_noise_cov=[1.0],
-        measurement_noise_cov=[1.0],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-    )
+    model = affine([[1e30]], np.zeros((1, 0)), [[0.0]], q=[1.0], r=[1.0], mean=[0.0], cov=[1.0])
     found = posterior_bound(model, np.zeros((1, 8, 0)), truths=2)[0, :, 0, 0]
     assert found[1] == pytest.approx(1e60) and not np.isfinite(found[-1])
 

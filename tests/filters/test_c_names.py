@@ -5,10 +5,10 @@ import subprocess
 
 import pytest
 
-from filters import StateSpaceModel, make_filter
+from filters import make_filter
 from filters.c.project import c_filter, write_project
 from filters.monitoring.monitor import monitor_of
-from tests.models import scalar_model
+from tests.models import scalar_model, state_space
 
 TAKEN = """exp R advance NAN new class double_t correct settle filter x u z t0 i P prior_mean line math
 board is_lost update reset Real told states INFINITY isnan expf y0 gamma M_PI INT8_MAX NULL printf remove index
@@ -35,16 +35,10 @@ ODD = ["exp", "a*/b", "a/*b", "what??/", 'q"uote', "R", "%d", "back\\slash", "na
 def of_odd_names():
     """A model whose states and channels have odd names."""
     names = [(name, f"s{k}", "") for k, name in enumerate(ODD)]
-    return StateSpaceModel(
-        transition=lambda x, u, c: x,
-        observe=lambda x, c: x,
-        process_noise_cov=[1.0] * len(ODD),
-        measurement_noise_cov=[1.0] * len(ODD),
-        prior_mean=[0.0] * len(ODD),
-        prior_cov=[1.0] * len(ODD),
-        inputs=0,
-        states=names,
-        measurements=names,
+    noise = {"q": [1.0] * len(ODD), "r": [1.0] * len(ODD)}
+    prior = {"mean": [0.0] * len(ODD), "cov": [1.0] * len(ODD)}
+    return state_space(
+        lambda x, u, c: x, lambda x, c: x, **noise, **prior, inputs=0, states=names, measurements=names
     )
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from filters import EnsembleTransformFilter, StateSpaceModel, make_filter
-from tests.models import KEY, wide_model
+from filters import EnsembleTransformFilter, make_filter
+from tests.models import KEY, state_space, wide_model
 from thruster_env.core.compiled import interpreted
 
 
@@ -26,14 +26,7 @@ DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_analyses.json"
 
 @pytest.mark.parametrize("case", DAPPER, ids=lambda case: case["name"])
 def test_the_same_ensemble_gives_the_same_ensemble_as_in_dapper(case):
-    model = StateSpaceModel(
-        transition=stay,
-        observe=curved,
-        process_noise_cov=np.zeros((3, 3)),
-        measurement_noise_cov=case["r"],
-        prior_mean=np.zeros(3),
-        prior_cov=np.ones(3),
-    )
+    model = state_space(stay, curved, q=np.zeros((3, 3)), r=case["r"], mean=np.zeros(3), cov=np.ones(3))
     for name, posterior in case["posterior"].items():
         kind, _, number = name.partition(" ")
         numbers = {NUMBERS[kind]: int(number)} if number else {}

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
+from tests.models import state_space
 from thruster_env.core.streams import filter_keys
 
 MOST_RESCALINGS = json.loads((Path(__file__).parents[1] / "data" / "dapper_twins.json").read_text())
@@ -39,15 +40,8 @@ def whole(x, c):
 @pytest.fixture(scope="module")
 def model():
     mean, prior_cov = MOST_RESCALINGS["prior"]
-    return StateSpaceModel(
-        transition=step,
-        observe=whole,
-        process_noise_cov=MOST_RESCALINGS["q"],
-        measurement_noise_cov=MOST_RESCALINGS["r"],
-        prior_mean=mean,
-        prior_cov=prior_cov,
-        substeps=2,
-        inputs=0,
+    return state_space(
+        step, whole, q=MOST_RESCALINGS["q"], r=MOST_RESCALINGS["r"], mean=mean, cov=prior_cov, substeps=2, inputs=0
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
 from tests import models
 from tests.models import DT, held_voltages, line_model, look, simulated, swing
-from tests.oracles import kalman_update
+from tests.oracles import each_close, kalman_update
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -60,8 +60,7 @@ def test_on_an_affine_model_it_is_the_kalman_filter():
     by_kalman = estimates_of(model, inputs, measurements, KalmanFilter)
     for derivatives in ({}, {"transition_jacobian": None, "observe_jacobian": None}):
         extended = estimates_of(model.replace(**derivatives), inputs, measurements)
-        for one, other in zip(extended[:5], by_kalman[:5], strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+        each_close(extended[:5], by_kalman[:5], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("x", [(0.0, 0.0), (0.5, -2.0), (-3.0, 100.0), (30.0, 0.02)])

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 import filters
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.c.project import c_filter
 from filters.differentiated.runs import ModelSlopes
 from filters.sensitivity import sensitivity
-from tests.models import simulated
+from tests.models import simulated, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian, step_growth, step_of
 from thruster_env.model.affine import linearize
@@ -52,17 +52,15 @@ def ranged_called(x, c):
 
 
 def body(offset=0.0, unit=1.0, called=False, **changes):
-    arguments = {
-        "transition": moved_called if called else moved,
-        "observe": ranged_called if called else ranged,
-        "process_noise_cov": [1e-3 * unit**2, 1e-3 * unit**2],
-        "measurement_noise_cov": [0.01 * unit**2],
-        "prior_mean": [offset + 1.0 * unit, 0.5 * unit],
-        "prior_cov": [unit**2, 0.1 * unit**2],
-        "inputs": 1,
-        "constants": (offset, unit),
-    }
-    return StateSpaceModel(**arguments | changes)
+    return state_space(
+        moved_called if called else moved,
+        ranged_called if called else ranged,
+        q=[1e-3 * unit**2, 1e-3 * unit**2],
+        r=[0.01 * unit**2],
+        mean=[offset + 1.0 * unit, 0.5 * unit],
+        cov=[unit**2, 0.1 * unit**2],
+        **{"inputs": 1, "constants": (offset, unit), **changes},
+    )
 
 
 def data():
@@ -147,16 +145,9 @@ def flow(x, u, c):
 def test_many_states_far_from_zero():
     found, (inputs, z) = [], (np.zeros((1, 6, 0)), np.sin(np.arange(7.0 * 40)).reshape(1, 7, 40))
     for offset, unit in ((0.0, 1.0), (5e6, 1.0), (1e9, 1e3)):
-        model = StateSpaceModel(
-            transition=flow,
-            observe=lambda x, c: x,
-            process_noise_cov=[0.01 * unit**2] * 40,
-            measurement_noise_cov=[0.1 * unit**2] * 40,
-            prior_mean=offset + unit * np.cos(np.arange(40.0)),
-            prior_cov=[unit**2] * 40,
-            inputs=0,
-            constants=(offset, unit),
-        )
+        noise = {"q": [0.01 * unit**2] * 40, "r": [0.1 * unit**2] * 40}
+        prior = {"mean": offset + unit * np.cos(np.arange(40.0)), "cov": [unit**2] * 40}
+        model = state_space(flow, lambda x, c: x, **noise, **prior, inputs=0, constants=(offset, unit))
         found.append((run(make_filter("ekf", model), None, inputs, offset + unit * z).means - offset) / unit)
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=1e-5)
@@ -178,15 +169,8 @@ def test_scales_of_states_without_variance():
     def step(x, u, c):
         return x[0] + x[1], x[1], x[2] + 0.25, x[3], x[4]
 
-    model = StateSpaceModel(
-        transition=step,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.0] * 5,
-        measurement_noise_cov=[1.0],
-        prior_mean=[7.0, 0.0, 3.0, -40.0, 0.0],
-        prior_cov=[0.0, 0.01, 0.0, 0.0, 0.0],
-        inputs=0,
-    )
+    prior = {"mean": [7.0, 0.0, 3.0, -40.0, 0.0], "cov": [0.0, 0.01, 0.0, 0.0, 0.0]}
+    model = state_space(step, lambda x, c: (x[0],), q=[0.0] * 5, r=[1.0], **prior, inputs=0)
     np.testing.assert_allclose(model.scales, [0.1 * (0.75 + 0.25 * math.cos(1.0)), 0.1, 0.25, 40.0, 1.0])
 
 

@@ -7,7 +7,7 @@ from filters import FILTERS, make_filter, run, thruster_model
 from filters.engine.session import Session
 from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrapped
 from tests.models import KEY, MODELS, OF_EACH_KIND, scalar_model, simulated, small, varying_noise
-from tests.oracles import equal
+from tests.oracles import each_close, equal
 from tests.slow import SLOW
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys, filter_keys
@@ -100,8 +100,7 @@ def assert_compiled_as_python(filter_, *data, **noise):
     compiled = run(filter_, *data, **noise)
     with interpreted():
         as_python = run(filter_, *data, **noise)
-    for one, other in zip(compiled, as_python, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    each_close(compiled, as_python, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FILTERS, StateSpaceModel, run
+from filters import FILTERS, run
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.particles.weighted import WeightedFilter
-from tests.models import KEY, MODELS, simulated, small, varying_noise, wide_model
+from tests.models import KEY, MODELS, simulated, small, state_space, varying_noise, wide_model
 from tests.oracles import equal
 from thruster_env.core.streams import filter_keys
 
@@ -202,14 +202,7 @@ def see(x, c):
 @pytest.mark.usefixtures("as_python")
 def test_only_real_members_are_put_through_the_model(name):
     """What pads members to full vector registers must not fail where no member does."""
-    model = StateSpaceModel(
-        transition=needs_positive,
-        observe=see,
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.01],
-        prior_mean=[5.0],
-        prior_cov=[0.01],
-    )
+    model = state_space(needs_positive, see, q=[0.01], r=[0.01], mean=[5.0], cov=[0.01])
     filter_ = small(name, model, size=5)
     belief = filter_.predict(filter_.init(KEY), [0.0])
     assert belief.mean[0] == pytest.approx(math.log(5.0) + 3.0, abs=0.3)

@@ -16,12 +16,11 @@ from filters import (
     IteratedExtendedKalmanFilter,
     KalmanFilter,
     UnscentedKalmanFilter,
-    affine_model,
     run,
     smooth,
 )
 from filters.smoothers.online import WithSmoother
-from tests.models import KEY, pendulum, scalar_model, simulated, wide_model
+from tests.models import KEY, affine, pendulum, scalar_model, simulated, wide_model
 from thruster_env.core.compiled import interpreted
 
 KINDS = {
@@ -99,15 +98,9 @@ def test_step_by_step_it_is_the_smoother_of_the_batch(kind):
 
 def moving_target():
     """Position and speed of a target; the position is measured."""
-    return affine_model(
-        a=[[1.0, 1.0], [0.0, 1.0]],
-        b=np.zeros((2, 0)),
-        c=[[1.0, 0.0]],
-        process_noise_cov=0.01 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]),
-        measurement_noise_cov=[1.0],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 0.1],
-    )
+    noise = {"q": 0.01 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), "r": [1.0]}
+    prior = {"mean": [0.0, 0.0], "cov": [1.0, 0.1]}
+    return affine([[1.0, 1.0], [0.0, 1.0]], np.zeros((2, 0)), [[1.0, 0.0]], **noise, **prior)
 
 
 def covariances_in_theory(model, lags):

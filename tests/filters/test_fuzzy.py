@@ -10,7 +10,7 @@ from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thrus
 from filters.gaussian.mixtures import BLENDINGS
 from filters.gaussian.sigma_points import memberships
 from tests.models import pendulum, random_affine, simulated
-from tests.oracles import kalman_update
+from tests.oracles import each_close, kalman_update
 from thruster_env.core.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
@@ -52,8 +52,7 @@ def test_with_equal_rules_it_is_the_kalman_filter(n, blending):
     z[0, 5], z[0, 11, 0] = np.nan, np.nan
     exact = run(KalmanFilter(model=model), KEYS, inputs, z)
     found = run(FuzzyKalmanFilter(model=model, low=[-3.0] * n, high=[2.0] * n, blending=blending), KEYS, inputs, z)
-    for one, other in zip(found, exact, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
+    each_close(found, exact, rtol=1e-11, atol=1e-12)
 
 
 def test_an_affine_model_needs_no_range():

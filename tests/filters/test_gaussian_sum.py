@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import ExtendedKalmanFilter, GaussianSumFilter, KalmanFilter, StateSpaceModel, run
-from tests.models import line_model, simulated
+from filters import ExtendedKalmanFilter, GaussianSumFilter, KalmanFilter, run
+from tests.models import line_model, simulated, state_space
 from thruster_env.core.compiled import interpreted
 
 KEYS = np.zeros((1, 2))
@@ -22,13 +22,8 @@ def square(x, c):
 
 
 def square_model(mean=0.2):
-    return StateSpaceModel(
-        transition=stay,
-        observe=square,
-        process_noise_cov=[0.1, 0.2],
-        measurement_noise_cov=[[0.05, 0.01], [0.01, 0.5]],
-        prior_mean=[0.5, mean],
-        prior_cov=[[0.5, 0.2], [0.2, 1.0]],
+    return state_space(
+        stay, square, q=[0.1, 0.2], r=[[0.05, 0.01], [0.01, 0.5]], mean=[0.5, mean], cov=[[0.5, 0.2], [0.2, 1.0]]
     )
 
 

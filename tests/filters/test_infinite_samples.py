@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import filters
-from filters import EstimateState, EstimateStates, StateSpaceModel, make_filter, run, smooth
+from filters import EstimateState, EstimateStates, make_filter, run, smooth
 from filters.engine.batch import Beliefs
+from tests.models import state_space
 from thruster_env.core.streams import filter_keys
 
 FINITE, KEY = "must be .*finite", (0, 0)
@@ -18,15 +19,8 @@ def follows(x, u, c):
 
 
 def line(**changes):
-    model = StateSpaceModel(
-        transition=follows,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.1],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-        inputs=1,
-        constants=(0.1,),
+    model = state_space(
+        follows, lambda x, c: (x[0],), q=[0.1], r=[0.1], mean=[0.0], cov=[1.0], inputs=1, constants=(0.1,)
     )
     return model.replace(**changes)
 

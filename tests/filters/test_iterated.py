@@ -10,11 +10,11 @@ from filters import (
     ExtendedKalmanFilter,
     IteratedExtendedKalmanFilter,
     KalmanFilter,
-    StateSpaceModel,
     run,
     thruster_model,
 )
-from tests.models import plane_model, simulated
+from tests.models import plane_model, simulated, state_space
+from tests.oracles import each_close, each_equal
 
 KEYS = np.zeros((1, 2))
 
@@ -37,16 +37,9 @@ def look_jacobian(x, c):
 
 def landmark(**changes):
     """A place in the plane, seen by distance and bearing."""
-    arguments = {
-        "transition": stay,
-        "observe": look,
-        "observe_jacobian": look_jacobian,
-        "process_noise_cov": [0.01, 0.01],
-        "measurement_noise_cov": [[0.05, 0.01], [0.01, 0.02]],
-        "prior_mean": [3.0, 2.0],
-        "prior_cov": [[2.0, 0.4], [0.4, 1.0]],
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    noise = {"q": [0.01, 0.01], "r": [[0.05, 0.01], [0.01, 0.02]]}
+    prior = {"mean": [3.0, 2.0], "cov": [[2.0, 0.4], [0.4, 1.0]]}
+    return state_space(stay, look, **noise, **prior, **{"observe_jacobian": look_jacobian, **changes})
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])
@@ -91,8 +84,7 @@ def test_one_iteration_is_the_extended_filter(model):
     measurements[0, 7] = np.nan
     once = run(IteratedExtendedKalmanFilter(model=model, iterations=1), KEYS, inputs, measurements)
     extended = run(ExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
-    for one, other in zip(once, extended, strict=True):
-        np.testing.assert_array_equal(one, other)
+    each_equal(once, extended)
 
 
 def test_on_an_affine_model_it_is_the_kalman_filter():
@@ -101,8 +93,7 @@ def test_on_an_affine_model_it_is_the_kalman_filter():
     measurements[0, 10, 0] = measurements[0, 20] = np.nan
     by_kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
     found = run(IteratedExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
-    for one, other in zip(found[:5], by_kalman[:5], strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(found[:5], by_kalman[:5], rtol=1e-10, atol=1e-10)
 
 
 def test_a_missing_channel_of_a_nonlinear_measurement_has_no_effect():

@@ -5,8 +5,8 @@ import pytest
 from scipy.linalg import inv, sqrtm
 from scipy.optimize import minimize_scalar
 
-from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter, StateSpaceModel
-from tests.models import KEY, plane_model
+from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter
+from tests.models import KEY, plane_model, state_space
 from thruster_env.core.compiled import interpreted
 
 SIZE = 9
@@ -21,16 +21,8 @@ def curved(x, c):
 
 
 def curved_model(**changes):
-    arguments = {
-        "transition": stay,
-        "observe": curved,
-        "process_noise_cov": [0.1, 0.1],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -0.5],
-        "prior_cov": [[0.8, 0.2], [0.2, 0.5]],
-        "inputs": 0,
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    prior = {"mean": [1.0, -0.5], "cov": [[0.8, 0.2], [0.2, 0.5]]}
+    return state_space(stay, curved, q=[0.1, 0.1], r=[[0.5, 0.2], [0.2, 0.3]], **prior, **{"inputs": 0, **changes})
 
 
 def updated(kind, model, z, **numbers):

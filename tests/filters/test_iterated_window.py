@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.linalg import inv, sqrtm
 
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.c.project import c_filter
 from filters.ensembles.rank_histogram import record_members
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.tensors import torch
 from tests.filters.test_ensemble_twins import step, whole
 from tests.filters.test_filter_paths import assert_compiled_as_python, assert_paths_agree
-from tests.models import KEY, plane_model, random_affine, simulated, varying_noise
+from tests.models import KEY, plane_model, random_affine, simulated, state_space, varying_noise
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.simulate import simulate
 
@@ -38,17 +38,9 @@ def pushed(x, u, c):
 
 
 def curved_model(**changes):
-    arguments = {
-        "transition": pushed,
-        "observe": curved,
-        "process_noise_cov": [[0.1, 0.05, 0.0], [0.05, 0.2, 0.0], [0.0, 0.0, 0.1]],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -0.5, 2.0],
-        "prior_cov": [0.6, 0.2, 1.5],
-        "inputs": 1,
-        "substeps": 2,
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    noise = {"q": [[0.1, 0.05, 0.0], [0.05, 0.2, 0.0], [0.0, 0.0, 0.1]], "r": [[0.5, 0.2], [0.2, 0.3]]}
+    prior = {"mean": [1.0, -0.5, 2.0], "cov": [0.6, 0.2, 1.5]}
+    return state_space(pushed, curved, **noise, **prior, **{"inputs": 1, "substeps": 2, **changes})
 
 
 class Textbook:
@@ -173,15 +165,8 @@ def test_of_a_linear_model_every_step_is_that_without_a_lag(lag):
 @pytest.mark.usefixtures("as_python")
 def test_a_window_of_one_step_nearly_halves_the_error_on_lorenz_s_system():
     """Of 1963, measured every 0.25 time units: the motion of the members is not linear within their spread."""
-    model = StateSpaceModel(
-        transition=step,
-        observe=whole,
-        process_noise_cov=[1e-6] * 3,
-        measurement_noise_cov=[2.0] * 3,
-        prior_mean=[1.5, -1.5, 25.0],
-        prior_cov=[2.0] * 3,
-        inputs=0,
-        substeps=5,
+    model = state_space(
+        step, whole, q=[1e-6] * 3, r=[2.0] * 3, mean=[1.5, -1.5, 25.0], cov=[2.0] * 3, inputs=0, substeps=5
     )
     nothing = np.zeros((2, 200, 0))
     drawn = simulate(model, filter_keys(range(2)), nothing)

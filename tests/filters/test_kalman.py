@@ -8,7 +8,7 @@ from scipy.linalg import solve_discrete_are
 
 from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
 from tests.models import held_voltages, random_affine, simulated
-from tests.oracles import kalman_update
+from tests.oracles import each_equal, kalman_update
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 
@@ -130,8 +130,7 @@ def test_on_the_thruster_it_is_the_affine_filter_about_the_operating_point(volta
     inputs, measurements = simulated(model, 50, level=6.0)
     of_nonlinear = run(KalmanFilter(model=model), KEYS, inputs, measurements)
     of_affine = run(KalmanFilter(model=linearize(model, x, u)), KEYS, inputs, measurements)
-    for one, other in zip(of_nonlinear, of_affine, strict=True):
-        np.testing.assert_array_equal(one, other)
+    each_equal(of_nonlinear, of_affine)
 
 
 def test_linearize_keeps_the_offsets_and_has_the_slopes_of_the_whole_step():

@@ -6,9 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from filters import KalmanFilter, affine_model, run, thruster_model
+from filters import KalmanFilter, run, thruster_model
 from filters.engine.session import Session
-from tests.models import rescaled, simulated, wide_model
+from tests.models import affine, rescaled, simulated, wide_model
+from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
 
 KEYS = np.zeros((1, 2))
@@ -28,8 +29,7 @@ def test_every_form_gives_the_same_estimates(form, kind):
     with interpreted():
         estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
         expected = run(KalmanFilter(model=model), KEYS, inputs, z)
-    for one, other in zip(estimates, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(estimates, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_compiled_batch_loop_session_and_python_agree(form):
@@ -40,8 +40,7 @@ def test_compiled_batch_loop_session_and_python_agree(form):
     close = {"rtol": 1e-12, "atol": 1e-12}
     estimates = run(filter_, KEYS, inputs, z)
     with interpreted():
-        for one, other in zip(run(filter_, KEYS, inputs, z), estimates, strict=True):
-            np.testing.assert_allclose(one, other, **close)
+        each_close(run(filter_, KEYS, inputs, z), estimates, **close)
     session = Session(filter_)
     session.start(KEYS[0], z[0, 0])
     belief, _ = filter_.update(filter_.init(), z[0, 0])
@@ -76,8 +75,7 @@ def test_noise_may_vary_from_step_to_step(form):
     with interpreted():
         estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z, **noise)
         expected = run(KalmanFilter(model=model), KEYS, inputs, z, **noise)
-    for one, other in zip(estimates, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(estimates, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_a_change_of_units_changes_no_estimate(form):
@@ -97,8 +95,7 @@ def test_the_square_root_form_starts_from_an_exact_state_and_the_information_for
     with interpreted():
         estimates = run(KalmanFilter(model=model, form="square-root"), KEYS, inputs, z)
         expected = run(KalmanFilter(model=model), KEYS, inputs, z)
-    for one, other in zip(estimates, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(estimates, expected, rtol=1e-10, atol=1e-10)
     with pytest.raises(ValueError, match="prior_cov must be positive definite"):
         KalmanFilter(model=model, form="information")
 
@@ -107,14 +104,9 @@ def test_the_square_root_form_keeps_its_digits_where_covariances_lose_theirs():
     """Two nearly equal channels, almost without noise: P (2, 2) then has a condition of 1e18."""
     small = 1e-9
     slope = 1.0 + small
-    model = affine_model(
-        a=np.eye(2),
-        b=np.zeros((2, 1)),
-        c=[[1.0, 1.0], [1.0, slope]],
-        process_noise_cov=[0.0, 0.0],
-        measurement_noise_cov=[small**2, small**2],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
+    prior = {"mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    model = affine(
+        np.eye(2), np.zeros((2, 1)), [[1.0, 1.0], [1.0, slope]], q=[0.0, 0.0], r=[small**2, small**2], **prior
     )
     filter_ = KalmanFilter(model=model, form="square-root")
     with interpreted():

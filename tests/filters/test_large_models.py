@@ -11,7 +11,16 @@ from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior,
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
 from filters.smoothers.smooth import smooth
-from tests.models import OF_EACH_KIND, lonely_model, pendulum, random_affine, simulated, varying_noise, wide_model
+from tests.models import (
+    OF_EACH_KIND,
+    lonely_model,
+    pendulum,
+    random_affine,
+    simulated,
+    state_space,
+    varying_noise,
+    wide_model,
+)
 from tests.slow import slow_but
 from tests.thruster_env.core.test_angles import turned, turning, turntable
 from thruster_env.core import equal_functions, matrices, sources
@@ -237,17 +246,9 @@ def test_slopes_of_many_angles_are_those_of_an_angle_at_the_cut():
     """By central differences, of states and of a joint parameter, in half the components: others jump there."""
     half = [Quantity(f"heading {i}", f"psi_{i}", "rad", i % 2 == 0) for i in range(40)]
     eye = np.eye(40)
-    model = StateSpaceModel(
-        transition=headings,
-        observe=compasses,
-        process_noise_cov=np.ones(40),
-        measurement_noise_cov=np.ones(40),
-        prior_mean=np.full(40, np.pi - 0.5),
-        prior_cov=np.ones(40),
-        states=half,
-        measurements=half,
-        constants=(0.5,),
-    )
+    noise = {"q": np.ones(40), "r": np.ones(40)}
+    prior = {"mean": np.full(40, np.pi - 0.5), "cov": np.ones(40)}
+    model = state_space(headings, compasses, **noise, **prior, states=half, measurements=half, constants=(0.5,))
     angles, x, scales = np.arange(40) % 2 == 0, model.prior_mean, model.scales
     with interpreted():
         by_state = shape.transition_slopes(model.functions, model.shape)(x, scales, (0.0,), model.constants)
@@ -269,15 +270,9 @@ def test_slopes_of_a_large_analytic_model_are_exact():
     def grow(x, u, c):
         return x * x
 
-    model = StateSpaceModel(
-        transition=grow,
-        observe=lambda x, c: (x[0] * x[39], x[1]),
-        process_noise_cov=np.ones(40),
-        measurement_noise_cov=[1.0, 1.0],
-        prior_mean=np.arange(40.0),
-        prior_cov=np.ones(40),
-        analytic=True,
-    )
+    noise = {"q": np.ones(40), "r": [1.0, 1.0]}
+    prior = {"mean": np.arange(40.0), "cov": np.ones(40)}
+    model = state_space(grow, lambda x, c: (x[0] * x[39], x[1]), **noise, **prior, analytic=True)
     x, expected = model.prior_mean, np.zeros((2, 40))
     expected[0, [0, 39]], expected[1, 1] = (x[39], x[0]), 1.0
     np.testing.assert_allclose(model.transition_jacobian(x, (0.0,), ()), np.diag(2 * x), rtol=1e-15)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
-from filters import StateSpaceModel, make_filter, run, smooth
+from filters import make_filter, run, smooth
 from filters.c.project import c_filter
 from filters.ensembles.stochastic import gaspari_cohn
 from filters.tensors import torch
 from tests.filters.test_c import assert_same, built, estimated
-from tests.models import KEY, simulated, wide_model
+from tests.models import KEY, simulated, state_space, wide_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.model.quantities import Positions
 
@@ -32,17 +32,15 @@ def curved(x, c):
 
 def ring(**changes):
     """Eight states on a ring, of which every other one is measured."""
-    arguments = {
-        "transition": decay,
-        "observe": curved,
-        "process_noise_cov": np.full(8, 0.1),
-        "measurement_noise_cov": DAPPER["r"],
-        "prior_mean": np.zeros(8),
-        "prior_cov": np.ones(8),
-        "inputs": 0,
-        "positions": Positions(range(8), (0, 2, 4, 6), 8),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    return state_space(
+        decay,
+        curved,
+        q=np.full(8, 0.1),
+        r=DAPPER["r"],
+        mean=np.zeros(8),
+        cov=np.ones(8),
+        **{"inputs": 0, "positions": Positions(range(8), (0, 2, 4, 6), 8), **changes},
+    )
 
 
 def updated(name, members, z, model=None, **numbers):

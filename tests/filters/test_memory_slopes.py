@@ -16,7 +16,7 @@ from tests.filters.test_pages import MADE, assert_slopes, wide_pendulum, with_no
 from tests.filters.test_pages_called import turn_if
 from tests.filters.test_sensitivity import slopes_of
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
-from tests.models import simulated
+from tests.models import simulated, state_space
 from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.graphs import Graph
@@ -244,14 +244,8 @@ def folded(x, c):
 
 
 def test_slopes_along_numbers_that_are_made_of_others_are_found():
-    shape = StateSpaceModel(
-        transition=lambda x, u, c: x,
-        observe=folded,
-        process_noise_cov=[1.0, 1.0],
-        measurement_noise_cov=[1.0] * 6,
-        prior_mean=[0.7, 0.2],
-        prior_cov=[1.0, 1.0],
-        constants=(3.0,),
+    shape = state_space(
+        lambda x, u, c: x, folded, q=[1.0, 1.0], r=[1.0] * 6, mean=[0.7, 0.2], cov=[1.0, 1.0], constants=(3.0,)
     ).shape
     graph = Graph()
     a, b, c = (graph.given(Place("numbers", k)) for k in range(3))

@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model
+from filters import ExtendedKalmanFilter, affine_model, make_filter, run, thruster_model
+from tests.models import affine, state_space
+from tests.oracles import each_close, each_equal
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import as_value
 from thruster_env.core.streams import episode_keys
@@ -37,16 +39,9 @@ def position(x, c):
 
 
 def spring(**changes):
-    arguments = {
-        "transition": spring_step,
-        "observe": position,
-        "process_noise_cov": [[0.01, 0.004], [0.004, 0.02]],
-        "measurement_noise_cov": 0.1,
-        "prior_mean": [1.0, 0.0],
-        "prior_cov": [0.5, 0.5],
-        "constants": (2.0, 0.3),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    noise = {"q": [[0.01, 0.004], [0.004, 0.02]], "r": 0.1}
+    prior = {"mean": [1.0, 0.0], "cov": [0.5, 0.5]}
+    return state_space(spring_step, position, **noise, **prior, **{"constants": (2.0, 0.3), **changes})
 
 
 class TestChecks:
@@ -135,24 +130,14 @@ def test_replace_changes_what_it_is_told_and_checks_it():
 def test_an_affine_model_does_what_its_matrices_say():
     rng = np.random.default_rng(0)
     a, b, c, offset, shift = (rng.normal(size=s) for s in ((3, 3), (3, 2), (2, 3), 3, 2))
-    model = affine_model(
-        a=a,
-        b=b,
-        c=c,
-        state_offset=offset,
-        measurement_offset=shift,
-        process_noise_cov=[1.0] * 3,
-        measurement_noise_cov=[1.0] * 2,
-        prior_mean=[0.0] * 3,
-        prior_cov=[1.0] * 3,
-    )
+    prior = {"mean": [0.0] * 3, "cov": [1.0] * 3}
+    model = affine(a, b, c, q=[1.0] * 3, r=[1.0] * 2, **prior, state_offset=offset, measurement_offset=shift)
     x, u = rng.normal(size=3), rng.normal(size=2)
     np.testing.assert_allclose(model.transition(x, u, model.constants), a @ x + b @ u + offset, rtol=1e-14)
     np.testing.assert_allclose(model.observe(x, model.constants), c @ x + shift, rtol=1e-14)
     np.testing.assert_array_equal(model.transition_jacobian(x, u, model.constants), a)
     np.testing.assert_array_equal(model.observe_jacobian(x, model.constants), c)
-    for found, given in zip(model.matrices(), (a, b, offset, c, shift), strict=True):
-        np.testing.assert_array_equal(found, given)
+    each_equal(model.matrices(), (a, b, offset, c, shift))
 
 
 class TestTruth:
@@ -267,8 +252,7 @@ class TestModelsThatNumbaRefuses:
             expected = run(make_filter("open-loop", spring()), keys, inputs, z)
             truth = simulate.simulate(spring(), keys, inputs)
         found = run(make_filter("open-loop", spring(transition=transition)), keys, inputs, z)
-        for part, rescaled in zip(found, expected, strict=True):
-            np.testing.assert_allclose(part, rescaled, rtol=1e-12, atol=1e-12)
+        each_close(found, expected, rtol=1e-12, atol=1e-12)
         drawn = simulate.simulate(spring(transition=transition), keys, inputs)
         np.testing.assert_allclose(drawn.states, truth.states, rtol=1e-12, atol=1e-12)
 
@@ -349,15 +333,8 @@ def seen(x, c):
 
 
 def swinging(**changes):
-    arguments = {
-        "transition": swing,
-        "observe": seen,
-        "process_noise_cov": [1e-4, 1e-2],
-        "measurement_noise_cov": [0.01, 0.01, 1.0],
-        "prior_mean": [0.3, -0.2],
-        "prior_cov": [0.1, 0.1],
-    }
-    return StateSpaceModel(**arguments | changes)
+    prior = {"mean": [0.3, -0.2], "cov": [0.1, 0.1]}
+    return state_space(swing, seen, q=[1e-4, 1e-2], r=[0.01, 0.01, 1.0], **prior, **changes)
 
 
 @pytest.mark.parametrize("plainly", [pytest.param(False, marks=pytest.mark.slow), True])
@@ -384,16 +361,8 @@ def test_a_root_at_zero_has_no_steep_slope_by_a_complex_step(size):
         outflow = [0.1 * np.sqrt(one) for one in np.linalg.solve(np.eye(size), np.array([*x]))]
         return np.array([one - flow for one, flow in zip(x, outflow, strict=True)])
 
-    model = StateSpaceModel(
-        transition=emptied,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.01] * size,
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0, 4.0] * (size // 2),
-        prior_cov=[0.1] * size,
-        inputs=0,
-        analytic=True,
-    )
+    prior = {"mean": [0.0, 4.0] * (size // 2), "cov": [0.1] * size}
+    model = state_space(emptied, lambda x, c: (x[0],), q=[0.01] * size, r=[0.1], **prior, inputs=0, analytic=True)
     slopes = np.array(model.transition_jacobian(as_value(model.prior_mean), (), ()))
     np.testing.assert_allclose(slopes, np.diag([0.0, 0.975] * (size // 2)), atol=1e-15)
 

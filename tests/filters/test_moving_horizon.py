@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from filters import MovingHorizonFilter, StateSpaceModel, make_filter, run, smooth
-from tests.models import KEY, line_model, plane_model, simulated
+from filters import MovingHorizonFilter, make_filter, run, smooth
+from tests.models import KEY, line_model, plane_model, simulated, state_space
+from tests.oracles import each_close
 
 KEYS, CLOSE = np.array([KEY]), {"rtol": 1e-9, "atol": 1e-9}
 Q, R = np.array([[0.01, 0.002], [0.002, 0.02]]), np.array([[0.04, 0.01], [0.01, 0.09]])
@@ -86,16 +87,7 @@ def observe(x, c):
 
 def curved_model(**changes):
     """The pendulum."""
-    return StateSpaceModel(
-        transition=transition,
-        observe=observe,
-        process_noise_cov=Q,
-        measurement_noise_cov=R,
-        prior_mean=PRIOR,
-        prior_cov=PRIOR_COV,
-        inputs=1,
-        **changes,
-    )
+    return state_space(transition, observe, q=Q, r=R, mean=PRIOR, cov=PRIOR_COV, inputs=1, **changes)
 
 
 def curved_data():
@@ -238,8 +230,7 @@ def test_of_functions_that_cannot_be_traced_it_is_the_same(loss):
     data = KEYS, inputs[None], measurements[None]
     models = curved_model().replace(transition=decides), curved_model()
     found, expected = (run(MovingHorizonFilter(model=one, horizon=3, loss=loss), *data) for one in models)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+    each_close(found, expected, rtol=1e-6, atol=1e-8)
 
 
 def test_with_a_horizon_of_one_it_is_the_iterated_filter():
@@ -247,8 +238,7 @@ def test_with_a_horizon_of_one_it_is_the_iterated_filter():
     data = KEYS, inputs[None], measurements[None]
     expected = run(make_filter("iekf", curved_model(), iterations=20), *data)
     filter_ = MovingHorizonFilter(model=curved_model(), horizon=1, iterations=20, loss="quadratic")
-    for one, other in zip(run(filter_, *data), expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
+    each_close(run(filter_, *data), expected, rtol=1e-7, atol=1e-9)
 
 
 def reactor(**changes):
@@ -258,16 +248,8 @@ def reactor(**changes):
         a = x[0] / (1.0 + 0.032 * x[0])
         return a, x[1] + 0.5 * (x[0] - a)
 
-    return StateSpaceModel(
-        transition=react,
-        observe=lambda x, c: (x[0] + x[1],),
-        process_noise_cov=[1e-6, 1e-6],
-        measurement_noise_cov=[0.01],
-        prior_mean=[0.1, 4.5],
-        prior_cov=[36.0, 36.0],
-        inputs=0,
-        **changes,
-    )
+    prior = {"mean": [0.1, 4.5], "cov": [36.0, 36.0]}
+    return state_space(react, lambda x, c: (x[0] + x[1],), q=[1e-6, 1e-6], r=[0.01], **prior, inputs=0, **changes)
 
 
 def test_in_a_batch_reactor_it_keeps_a_pressure_positive_that_the_ekf_takes_below_zero():

@@ -17,8 +17,8 @@ from tests.filters.test_particle import (
     root,
     weighted_covariance,
 )
-from tests.models import KEY, line_model, plane_model, scalar_model, simulated, varying_noise
-from tests.oracles import assert_normal, normals
+from tests.models import KEY, line_model, plane_model, scalar_model, simulated, state_space, varying_noise
+from tests.oracles import assert_normal, each_close, normals
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
 
@@ -84,15 +84,7 @@ def bent_by_branches(x, c):
 
 
 def bent_model(observe):
-    return StateSpaceModel(
-        transition=lambda x, u, c: (0.9 * x[0],),
-        observe=observe,
-        process_noise_cov=[0.5],
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.4],
-        prior_cov=[0.0],
-        inputs=0,
-    )
+    return state_space(lambda x, u, c: (0.9 * x[0],), observe, q=[0.5], r=[0.04], mean=[0.4], cov=[0.0], inputs=0)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -163,15 +155,10 @@ def test_a_smoothed_constant_goes_on_being_learnt():
 
 def slope_model():
     """z = x + theta + v of a slow x: affine also where theta is a state."""
-    return StateSpaceModel(
-        transition=lambda x, u, c: (0.5 * x[0],),
-        observe=lambda x, c: (x[0] + c[0],),
-        process_noise_cov=[0.1],
-        measurement_noise_cov=[0.5],
-        prior_mean=[0.0],
-        prior_cov=[0.1],
-        inputs=0,
-        constants=(0.0,),
+    noise = {"q": [0.1], "r": [0.5]}
+    prior = {"mean": [0.0], "cov": [0.1]}
+    return state_space(
+        lambda x, u, c: (0.5 * x[0],), lambda x, c: (x[0] + c[0],), **noise, **prior, inputs=0, constants=(0.0,)
     )
 
 
@@ -193,8 +180,7 @@ def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_th
     found = run(filter_, [KEY], inputs, z)
     with interpreted():
         same, plain = run(filter_, [KEY], inputs, z), run(make_filter("pf", model, **numbers), [KEY], inputs, z)
-    for one, other in zip(found, same, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    each_close(found, same, rtol=1e-9, atol=1e-12)
     there = ~np.isnan(z)
     optimal, prior = (np.abs((one.means - exact.means)[there]).mean() for one in (found, plain))
     assert optimal < 0.2 * prior

@@ -5,10 +5,10 @@ from collections import namedtuple
 import numpy as np
 import pytest
 
-from filters import affine_model
 from filters import posterior as bounds
 from filters.bounds import riccati_covariances
 from filters.posterior import posterior_bound, posterior_variances
+from tests.models import affine
 from thruster_env.thruster.model import thruster_model
 
 INPUTS = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(5, 4, 1)), 3, axis=1)
@@ -43,15 +43,9 @@ def test_of_a_large_model_the_work_limits_the_sequences_and_equal_ones_are_one(m
 def test_a_nearly_singular_q_loses_no_digits_and_a_singular_one_has_no_bound():
     def tracker(jitter):
         g = np.array([0.5, 1.0])
-        return affine_model(
-            a=[[1.0, 1.0], [0.0, 1.0]],
-            b=[[0.0], [0.0]],
-            c=[[1.0, 0.0]],
-            process_noise_cov=0.04 * np.outer(g, g) + jitter * np.eye(2),
-            measurement_noise_cov=[2.0],
-            prior_mean=[0.0, 0.0],
-            prior_cov=[100.0, 4.0],
-        )
+        noise = {"q": 0.04 * np.outer(g, g) + jitter * np.eye(2), "r": [2.0]}
+        prior = {"mean": [0.0, 0.0], "cov": [100.0, 4.0]}
+        return affine([[1.0, 1.0], [0.0, 1.0]], [[0.0], [0.0]], [[1.0, 0.0]], **noise, **prior)
 
     inputs = np.zeros((1, 100, 1))
     for jitter in (1e-2, 1e-7, 1e-11):

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
+from tests.models import state_space
 from thruster_env.core.angles import difference, wrapped
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.quantities import Quantity
@@ -39,16 +40,8 @@ def jacobian_of(x):
 
 
 def target():
-    return StateSpaceModel(
-        transition=move,
-        observe=see,
-        process_noise_cov=Q,
-        measurement_noise_cov=R,
-        prior_mean=TRUTH_0 + [3.0, 0.5, -4.0, -0.5],
-        prior_cov=P_0,
-        inputs=0,
-        measurements=[BEARING, ("range", "r", "m")],
-    )
+    prior = {"mean": TRUTH_0 + [3.0, 0.5, -4.0, -0.5], "cov": P_0}
+    return state_space(move, see, q=Q, r=R, **prior, inputs=0, measurements=[BEARING, ("range", "r", "m")])
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from filters import KalmanFilter, StateSpaceModel, make_filter, run, smooth
+from filters import KalmanFilter, make_filter, run, smooth
 from filters.c.project import c_filter
 from filters.tensors import torch
-from tests.models import KEY, plane_model, simulated, wide_model
+from tests.models import KEY, plane_model, simulated, state_space, wide_model
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 
@@ -24,15 +24,7 @@ def product(x, c):
 
 def curved_model(noise=0.3):
     """Two states, of which the product is measured."""
-    return StateSpaceModel(
-        transition=stay,
-        observe=product,
-        process_noise_cov=[0.0, 0.0],
-        measurement_noise_cov=[noise],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        inputs=0,
-    )
+    return state_space(stay, product, q=[0.0, 0.0], r=[noise], mean=[0.0, 0.0], cov=[1.0, 1.0], inputs=0)
 
 
 def prior_members(model, size):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import RaoBlackwellisedParticleFilter, StateSpaceModel, affine_model, make_filter, run
-from tests.models import KEY, line_model, plane_model, simulated
-from tests.oracles import assert_normal, normals
+from filters import RaoBlackwellisedParticleFilter, affine_model, make_filter, run
+from tests.models import KEY, line_model, plane_model, simulated, state_space
+from tests.oracles import assert_normal, each_close, normals
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, uniform_block
 from tuning.experiments import mixed_linear
@@ -34,15 +34,8 @@ def see_by_branches(x, c):
 
 
 def mixed_model(observe=see):
-    return StateSpaceModel(
-        transition=move,
-        observe=observe,
-        process_noise_cov=Q,
-        measurement_noise_cov=R,
-        prior_mean=[0.3, 0.1, -0.2],
-        prior_cov=[[0.5, 0.1, 0.0], [0.1, 0.2, 0.05], [0.0, 0.05, 0.1]],
-        inputs=1,
-    )
+    prior = {"mean": [0.3, 0.1, -0.2], "cov": [[0.5, 0.1, 0.0], [0.1, 0.2, 0.05], [0.0, 0.05, 0.1]]}
+    return state_space(move, observe, q=Q, r=R, **prior, inputs=1)
 
 
 def parts(s):
@@ -130,8 +123,7 @@ def test_cycles_are_those_of_the_textbook_with_the_same_draws(observe):
         np.testing.assert_allclose(innovation.cov[np.ix_(there, there)], s[np.ix_(there, there)], **close)
         assert innovation.log_likelihood == pytest.approx(level, rel=1e-9)
         resampled += 1.0 / (naive.w**2).sum() < 0.5 * size
-        for found, expected in zip((belief.mean, belief.cov), naive.belief(), strict=True):
-            np.testing.assert_allclose(found, expected, **close)
+        each_close((belief.mean, belief.cov), naive.belief(), **close)
         naive.predict(0.2, step + 1)
         belief = filter_.predict(belief, [0.2])
         np.testing.assert_allclose(belief.members[0], naive.s, **close)
@@ -182,8 +174,7 @@ def test_it_is_the_bootstrap_filter_where_all_states_are_sampled():
     numbers = {"ensemble_size": 20, "resampling_threshold": 0.6}
     found = run(make_filter("rbpf", model, sampled=(0, 1), **numbers), [KEY], inputs, z)
     plain = run(make_filter("pf", model, **numbers), [KEY], inputs, z)
-    for one, other in zip(found, plain, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+    each_close(found, plain, rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -229,8 +220,7 @@ def test_a_tenth_of_the_particles_is_as_good_and_compiled_code_gives_what_python
     compiled = run(filter_, *first)
     with interpreted():
         as_python = run(filter_, *first)
-    for one, other in zip(compiled, as_python, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    each_close(compiled, as_python, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("sampled", [(), "0", 1, (3,), (0.5,)])

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import filters
-from filters import EstimateState, RestartWarning, StateSpaceModel, make_filter, restarts_of
+from filters import EstimateState, RestartWarning, make_filter, restarts_of
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.wrappers.vector import EstimateStates
+from tests.models import affine, state_space
 from thruster_env.env.model_env import ModelEnv, Split
 from thruster_env.logs.log import Log
 from tuning.evaluation.evaluate import evaluate, restart_sentences
@@ -36,17 +37,15 @@ class Clock(NamedTuple):
 
 def model(**changes):
     """Two states, the second one driven by the input; each change makes it fail where x_2 is beyond 5."""
-    arguments = {
-        "transition": lambda x, u, c: (0.9 * x[0], x[1] + u[0]),
-        "observe": lambda x, c: (x[0] + x[1],),
-        "process_noise_cov": [0.1, 0.1],
-        "measurement_noise_cov": [100.0],
-        "prior_mean": [0.0, 0.0],
-        "prior_cov": [1.0, 0.01],
-        "inputs": 1,
-        "states": [("first", "a", "m"), ("second", "b", "m")],
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    return state_space(
+        lambda x, u, c: (0.9 * x[0], x[1] + u[0]),
+        lambda x, c: (x[0] + x[1],),
+        q=[0.1, 0.1],
+        r=[100.0],
+        mean=[0.0, 0.0],
+        cov=[1.0, 0.01],
+        **{"inputs": 1, "states": [("first", "a", "m"), ("second", "b", "m")], **changes},
+    )
 
 
 def lost_f(x, u, c):
@@ -109,18 +108,7 @@ def test_without_restarts_nothing_is_told():
 
 @pytest.mark.usefixtures("as_python")
 def test_a_covariance_that_overflows_is_told_and_so_are_noises_of_each_step():
-    filter_ = make_filter(
-        "kf",
-        filters.affine_model(
-            a=[[1.0]],
-            b=[[1.0]],
-            c=[[1.0]],
-            process_noise_cov=[0.1],
-            measurement_noise_cov=[1.0],
-            prior_mean=[0.0],
-            prior_cov=[1.0],
-        ),
-    )
+    filter_ = make_filter("kf", affine([[1.0]], [[1.0]], [[1.0]], q=[0.1], r=[1.0], mean=[0.0], cov=[1.0]))
     inputs, z = np.zeros((1, 4, 1)), np.full((1, 5, 1), np.nan)
     q = np.full((4, 1, 1), 0.1)
     q[2] = 1e305

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model
-from tests.models import held_voltages
+from filters import KalmanFilter, linearize, run, thruster_model
+from tests.models import held_voltages, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -97,15 +97,8 @@ def see(x, c):
     ],
 )
 def test_a_schedule_needs_points_to_lie_between(numbers, rule):
-    model = StateSpaceModel(
-        transition=grow,
-        observe=see,
-        process_noise_cov=[0.1],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.5],
-        prior_cov=[0.1],
-        operating_state=[0.5],
-        operating_input=[0.25],
+    model = state_space(
+        grow, see, q=[0.1], r=[0.1], mean=[0.5], cov=[0.1], operating_state=[0.5], operating_input=[0.25]
     )
     with pytest.raises(ValueError, match=rule) as error:
         KalmanFilter(model=model, **numbers)

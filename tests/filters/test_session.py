@@ -7,20 +7,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, affine_model, make_filter, thruster_model
+from filters import affine_model, make_filter, thruster_model
 from filters.engine.session import Session
+from tests.models import affine, state_space
 from thruster_env.core.compiled import interpreted
 
 
 def of_three_states():
-    return affine_model(
-        a=0.9 * np.eye(3),
-        b=np.ones((3, 1)),
-        c=[[1.0, 0.0, 0.0]],
-        process_noise_cov=[0.1] * 3,
-        measurement_noise_cov=[0.2],
-        prior_mean=[0.0] * 3,
-        prior_cov=[1.0] * 3,
+    return affine(
+        0.9 * np.eye(3), np.ones((3, 1)), [[1.0, 0.0, 0.0]], q=[0.1] * 3, r=[0.2], mean=[0.0] * 3, cov=[1.0] * 3
     )
 
 
@@ -78,15 +73,8 @@ def look(x, c):
 
 
 def cart(dt=0.1, q=0.01):
-    return StateSpaceModel(
-        transition=roll,
-        observe=look,
-        process_noise_cov=[q, q],
-        measurement_noise_cov=[0.04, 0.09],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        inputs=1,
-        constants=Timed(dt, 0.3),
+    return state_space(
+        roll, look, q=[q, q], r=[0.04, 0.09], mean=[0.0, 0.0], cov=[1.0, 1.0], inputs=1, constants=Timed(dt, 0.3)
     )
 
 

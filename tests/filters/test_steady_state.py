@@ -7,6 +7,7 @@ from scipy.linalg import solve_discrete_are
 from filters import KalmanFilter, SteadyStateKalmanFilter, linearize, run, thruster_model
 from filters.bounds import riccati_covariances
 from tests.models import simulated, wide_model
+from tests.oracles import each_close, each_equal
 
 KEYS = np.zeros((1, 2))
 
@@ -18,8 +19,7 @@ def test_from_riccati_s_covariance_on_it_is_the_kalman_filter():
     model = model.replace(prior_cov=riccati_covariances(model)[0])
     inputs, measurements = simulated(model)
     steady = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, measurements)
-    for one, other in zip(steady, run(KalmanFilter(model=model), KEYS, inputs, measurements), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(steady, run(KalmanFilter(model=model), KEYS, inputs, measurements), rtol=1e-10, atol=1e-10)
 
 
 def test_its_gain_is_the_limit_of_the_kalman_filter_s():
@@ -72,8 +72,7 @@ def test_on_the_thruster_it_is_the_filter_of_the_affine_approximation():
     np.testing.assert_allclose(filter_.gain, p @ c.T / (c @ p @ c.T + model.measurement_noise_cov), rtol=1e-9)
     inputs, measurements = simulated(model, 50)
     of_affine = run(SteadyStateKalmanFilter(model=affine), KEYS, inputs, measurements)
-    for one, other in zip(run(filter_, KEYS, inputs, measurements), of_affine, strict=True):
-        np.testing.assert_array_equal(one, other)
+    each_equal(run(filter_, KEYS, inputs, measurements), of_affine)
 
 
 def test_a_state_known_exactly_at_first_is_allowed():

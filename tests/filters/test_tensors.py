@@ -11,13 +11,13 @@ import pytest
 import torch
 
 import filters
-from filters import StateSpaceModel, make_filter, run, thruster_model
+from filters import make_filter, run, thruster_model
 from filters.likelihood import likelihood
 from tests.filters.test_c import KEPT, OWN, made
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
-from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, wide_model
+from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, state_space, wide_model
 from tests.slow import slow_but
 from thruster_env.auv.model import auv_model
 from thruster_env.core.compiled import interpreted
@@ -346,15 +346,7 @@ def truncated(x, u, c):
 
 
 def deciding():
-    model = StateSpaceModel(
-        transition=truncated,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.1],
-        measurement_noise_cov=[0.1],
-        prior_mean=[1.0],
-        prior_cov=[1.0],
-        inputs=1,
-    )
+    model = state_space(truncated, lambda x, c: (x[0],), q=[0.1], r=[0.1], mean=[1.0], cov=[1.0], inputs=1)
     return filters.torch(made("ekf", model))
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import filters
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
+from tests.models import state_space
 from thruster_env.core.streams import filter_keys
 
 torch = pytest.importorskip("torch")
@@ -15,14 +16,8 @@ TABLE = [0.5, 0.9]
 
 
 def model(transition):
-    return StateSpaceModel(
-        transition=transition,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.1, 0.1],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.3, 0.2],
-        prior_cov=[1.0, 1.0],
-        inputs=0,
+    return state_space(
+        transition, lambda x, c: (x[0],), q=[0.1, 0.1], r=[0.1], mean=[0.3, 0.2], cov=[1.0, 1.0], inputs=0
     )
 
 

@@ -9,8 +9,8 @@ from filters import affine_model, make_filter, run
 from filters.bounds import steady_state
 from filters.consistency.time_constants import forgetting_noise, slopes_along, time_constants
 from tests.linear_problem import LinearProblem
+from tests.models import affine, state_space
 from thruster_env.core.compiled import interpreted
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import runs_of
 
 DT = 0.1
@@ -26,15 +26,7 @@ def as_python():
 def walk(q):
     """A random walk that is measured with a variance of 1."""
     one = [[1.0]]
-    return affine_model(
-        a=one,
-        b=[[0.0]],
-        c=one,
-        process_noise_cov=[q],
-        measurement_noise_cov=1.0,
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-    )
+    return affine(one, [[0.0]], one, q=[q], r=1.0, mean=[0.0], cov=[1.0])
 
 
 def cart(q=(1e-12, 1e-12), blind=False):
@@ -43,15 +35,7 @@ def cart(q=(1e-12, 1e-12), blind=False):
     a = np.eye(n)
     a[0, 1] = a[-1, 1] = DT
     a[1, 1] = 1.0
-    return affine_model(
-        a=a,
-        b=np.zeros((n, 1)),
-        c=np.eye(1, n),
-        process_noise_cov=[*q, 1e-3][:n],
-        measurement_noise_cov=0.01,
-        prior_mean=[0.0] * n,
-        prior_cov=[1.0] * n,
-    )
+    return affine(a, np.zeros((n, 1)), np.eye(1, n), q=[*q, 1e-3][:n], r=0.01, mean=[0.0] * n, cov=[1.0] * n)
 
 
 def runs(steps, missing=0.0):
@@ -142,14 +126,10 @@ def test_a_q_that_is_large_enough_stays_and_nothing_to_forget_is_refused():
 
 
 def test_along_slopes_that_change_it_is_the_mean_growth_of_errors():
-    model = StateSpaceModel(
-        transition=lambda x, u, c: (0.9 * x[0] + u[0] * x[1], x[1]),
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1e-3, 1e-4],
-        measurement_noise_cov=0.1,
-        prior_mean=[0.0, 1.0],
-        prior_cov=[1.0, 1.0],
-        inputs=1,
+    noise = {"q": [1e-3, 1e-4], "r": 0.1}
+    prior = {"mean": [0.0, 1.0], "cov": [1.0, 1.0]}
+    model = state_space(
+        lambda x, u, c: (0.9 * x[0] + u[0] * x[1], x[1]), lambda x, c: (x[0],), **noise, **prior, inputs=1
     )
     keys, z = np.array([[1.0, 2.0]]), np.zeros((1, 301, 1))
     filter_, square = make_filter("ekf", model), np.sign(np.sin(np.arange(300) / 1.0))[None, :, None]

@@ -8,7 +8,7 @@ import pytest
 
 from filters import StateSpaceModel, make_filter, run, transformed_model
 from filters.augmented import Unknown, augmented_model
-from tests.models import KEY, simulated, wide_model
+from tests.models import KEY, simulated, state_space, wide_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -59,15 +59,9 @@ def sample_by_hand(s, c):
 def test_it_is_what_one_writes_by_hand(name):
     model = transformed_model(tank())
     slopes = np.diag([1 / 0.5, 1 / 0.4 + 1 / 0.6])
-    by_hand = StateSpaceModel(
-        transition=decay_by_hand,
-        observe=sample_by_hand,
-        process_noise_cov=slopes @ tank().process_noise_cov @ slopes,
-        measurement_noise_cov=[0.09, 0.04],
-        prior_mean=[math.log(0.5), math.log(0.4 / 0.6)],
-        prior_cov=slopes @ tank().prior_cov @ slopes,
-        inputs=1,
-    )
+    noise = {"q": slopes @ tank().process_noise_cov @ slopes, "r": [0.09, 0.04]}
+    prior = {"mean": [math.log(0.5), math.log(0.4 / 0.6)], "cov": slopes @ tank().prior_cov @ slopes}
+    by_hand = state_space(decay_by_hand, sample_by_hand, **noise, **prior, inputs=1)
     numbers = {"ensemble_size": 30} if name in ("enkf", "pf") else {}
     inputs, z = np.full((1, 20, 1), 0.7), 0.4 + np.random.default_rng(1).normal(size=(1, 21, 2)) * 0.2
     one, other = (run(make_filter(name, it, **numbers), np.array([KEY]), inputs, z) for it in (model, by_hand))

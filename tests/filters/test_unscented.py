@@ -7,6 +7,7 @@ import pytest
 
 from filters import CubatureKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, thruster_model
 from tests.models import held_voltages, pendulum, random_affine, simulated
+from tests.oracles import each_close
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 
@@ -127,8 +128,7 @@ def test_on_an_affine_model_it_is_the_kalman_filter(kind, prior_cov):
     measurements[0, 10, 0] = measurements[0, 20] = np.nan
     by_kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
     found = run(kind(model=model), KEYS, inputs, measurements)
-    for one, other in zip(found[:5], by_kalman[:5], strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(found[:5], by_kalman[:5], rtol=1e-10, atol=1e-10)
 
 
 def test_states_that_are_known_exactly_move_no_measurement():
@@ -147,8 +147,7 @@ def test_a_cubature_filter_is_an_unscented_one_whose_centre_weighs_nothing():
     inputs, measurements = simulated(pendulum())
     cubature = run(CubatureKalmanFilter(model=pendulum()), KEYS, inputs, measurements)
     filter_ = UnscentedKalmanFilter(model=pendulum(), alpha=1.0, beta=0.0, kappa=0.0)
-    for one, other in zip(run(filter_, KEYS, inputs, measurements), cubature, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    each_close(run(filter_, KEYS, inputs, measurements), cubature, rtol=1e-10, atol=1e-10)
 
 
 def bend(x, u, c):

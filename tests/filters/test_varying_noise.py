@@ -14,10 +14,9 @@ from filters.smoothers.online import WithSmoother
 from tests.filters.test_session import cart
 from tests.fuzz import unequal_steps
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
-from tests.models import plane_model, simulated, small
+from tests.models import affine, plane_model, simulated, small
 from tests.slow import slow_but
 from thruster_env.logs.steps import in_any_steps
-from thruster_env.model.affine import affine_model
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
@@ -265,14 +264,10 @@ def test_a_smoother_does_not_mind_the_order_of_states_of_which_some_are_known_ex
     )
     z, found = np.random.default_rng(8).normal(size=(1, 8, 1)), []
     for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1], [2, 1, 0]):
-        model = affine_model(
-            a=a[np.ix_(order, order)],
-            b=np.zeros((3, 0)),
-            c=[np.array(c, dtype=float)[order]],
-            process_noise_cov=np.array(q)[order],
-            measurement_noise_cov=[0.5],
-            prior_mean=np.array([1.0, 0.0, 0.5])[order],
-            prior_cov=np.array(p)[order],
+        noise = {"q": np.array(q)[order], "r": [0.5]}
+        prior = {"mean": np.array([1.0, 0.0, 0.5])[order], "cov": np.array(p)[order]}
+        model = affine(
+            a[np.ix_(order, order)], np.zeros((3, 0)), [np.array(c, dtype=float)[order]], **noise, **prior
         )
         smoothed = smooth(make_filter(name, model), measurements=z)
         found.append(smoothed.means[..., np.argsort(order)])
@@ -344,20 +339,7 @@ OTHERS = {
     "prior_mean": np.array([0.3, -0.2]),
     "prior_cov": np.array([[2.0, 0.3], [0.3, 0.5]]),
 }
-WITHOUT_TENSORS = {
-    "mhe",
-    "rhf",
-    "pf",
-    "apf",
-    "rbpf",
-    "gsf",
-    "imm",
-    "mmae",
-    "fuzzy",
-    "open-loop",
-    "low-pass",
-    "inversion",
-}
+WITHOUT_TENSORS = "mhe rhf pf apf rbpf gsf imm mmae fuzzy open-loop low-pass inversion".split()
 ON_TENSORS = [name for name in FILTERS if name not in WITHOUT_TENSORS]
 
 

@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from filters import FILTERS, EstimateState, EstimateStates
 from filters.wrappers.ids import ALIASES, filtered_id
+from tests.models import affine
 from thruster_env.model.state_space import StateSpaceModel
 
 COPIES, STEPS = 3, 30
@@ -152,17 +153,8 @@ def test_a_third_party_vector_env_takes_a_filter_too():
 
 
 def still():
-    from filters import affine_model
 
-    return affine_model(
-        a=np.eye(3),
-        b=np.zeros((3, 1)),
-        c=np.eye(3),
-        process_noise_cov=[0.1] * 3,
-        measurement_noise_cov=[0.1] * 3,
-        prior_mean=[0.0] * 3,
-        prior_cov=[1.0] * 3,
-    )
+    return affine(np.eye(3), np.zeros((3, 1)), np.eye(3), q=[0.1] * 3, r=[0.1] * 3, mean=[0.0] * 3, cov=[1.0] * 3)
 
 
 # The checker would like a bare env with actions in [-1, 1] and bounded observations; volts and a filter are meant.

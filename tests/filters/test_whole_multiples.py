@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import filters
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.c.programs import single_error
+from tests.models import state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
 
@@ -32,16 +33,9 @@ def still(x, u, c):  # as differences across a jump would be no derivative
 
 
 def model(transition):
-    return StateSpaceModel(
-        transition=transition,
-        transition_jacobian=still,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1e-30] * 4,
-        measurement_noise_cov=[1e6],
-        prior_mean=[48.0, 0.0, 49.0, 0.0],
-        prior_cov=[1e-30] * 4,
-        inputs=0,
-    )
+    noise = {"q": [1e-30] * 4, "r": [1e6]}
+    prior = {"mean": [48.0, 0.0, 49.0, 0.0], "cov": [1e-30] * 4}
+    return state_space(transition, lambda x, c: (x[0],), **noise, **prior, transition_jacobian=still, inputs=0)
 
 
 def expected():

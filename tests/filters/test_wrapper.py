@@ -10,9 +10,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
-from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
+from filters import FILTERS, EstimateState, StateSpaceModel, make_filter, run, thruster_model
 from filters.tuned_file import sealed
-from tests.models import TUNED
+from tests.models import TUNED, affine, state_space
 from thruster_env.thruster.parameters import TUNNEL, derive_constants
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
@@ -85,14 +85,10 @@ class Scripted(gym.Env):
 
 def two_channels():
     """A model with two states, two inputs and two measurements."""
-    return affine_model(
-        a=[[0.9, 0.3], [-0.2, 0.8]],
-        b=[[1.0, 0.2], [0.5, -1.0]],
-        c=[[1.0, 0.4], [-0.3, 1.5]],
-        process_noise_cov=[0.3, 0.2],
-        measurement_noise_cov=[[0.5, -0.25], [-0.25, 0.4]],
-        prior_mean=[1.0, -1.0],
-        prior_cov=[1.0, 0.5],
+    noise = {"q": [0.3, 0.2], "r": [[0.5, -0.25], [-0.25, 0.4]]}
+    prior = {"mean": [1.0, -1.0], "cov": [1.0, 0.5]}
+    return affine(
+        [[0.9, 0.3], [-0.2, 0.8]], [[1.0, 0.2], [0.5, -1.0]], [[1.0, 0.4], [-0.3, 1.5]], **noise, **prior
     )
 
 
@@ -463,15 +459,8 @@ class TestOtherEnvs:
         """The thruster reports one measurement; the model expects two."""
         model = two_channels()
         a, b, offset, c, shift = model.matrices()
-        one_input = affine_model(
-            a=a,
-            b=b[:, :1],
-            c=c,
-            process_noise_cov=model.process_noise_cov,
-            measurement_noise_cov=model.measurement_noise_cov,
-            prior_mean=model.prior_mean,
-            prior_cov=model.prior_cov,
-        )
+        prior = {"mean": model.prior_mean, "cov": model.prior_cov}
+        one_input = affine(a, b[:, :1], c, q=model.process_noise_cov, r=model.measurement_noise_cov, **prior)
         with pytest.raises(ValueError, match="measurement|observation"):
             EstimateState(bow_thruster(), model=one_input).reset(seed=0)
 
@@ -496,14 +485,7 @@ def see(x, c):
 
 class TestPendulum:
     def wrapped(self, filter):
-        model = StateSpaceModel(
-            transition=swing,
-            observe=see,
-            process_noise_cov=[1e-6, 1e-6],
-            measurement_noise_cov=[1e-4, 1e-4, 1e-4],
-            prior_mean=[0.0, 0.0],
-            prior_cov=[1.0, 1.0],
-        )
+        model = state_space(swing, see, q=[1e-6, 1e-6], r=[1e-4, 1e-4, 1e-4], mean=[0.0, 0.0], cov=[1.0, 1.0])
         numbers = {"ensemble_size": 50} if filter == "enkf" else {}
         return EstimateState(gym.make("Pendulum-v1"), filter=filter, model=model, **numbers)
 

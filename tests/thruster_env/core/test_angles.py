@@ -7,13 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
+from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_filter, run, smooth
 from filters.baselines import component_solver
 from filters.consistency.report import consistency_report
 from filters.ensembles.rank_histogram import record_members
 from filters.gaussian.mixtures import Parts, part_aligner
 from filters.likelihood import likelihood
-from tests.models import simulated, small
+from tests.models import affine, simulated, small
 from thruster_env.core.angles import difference, row_aligner, wrapped, wrapped_where
 from thruster_env.core.compiled import compiled, interpreted
 from thruster_env.core.streams import filter_keys
@@ -71,16 +71,9 @@ def turning(heading=0.0, angles=True, wraps=False, **changes):
 def turntable(heading=0.0, angles=True):
     """The same, affine: n = 2, p = m = 1."""
     names = {"states": (RATE, HEADING), "measurements": (COMPASS,)} if angles else {}
-    return affine_model(
-        a=[[0.95, 0.0], [DT, 1.0]],
-        b=[[DT], [0.0]],
-        c=[[0.0, 1.0]],
-        process_noise_cov=[[2e-3, 1e-4], [1e-4, 1e-3]],
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.2, heading],
-        prior_cov=[[0.05, 0.01], [0.01, 0.1]],
-        **names,
-    )
+    noise = {"q": [[2e-3, 1e-4], [1e-4, 1e-3]], "r": [0.04]}
+    prior = {"mean": [0.2, heading], "cov": [[0.05, 0.01], [0.01, 0.1]]}
+    return affine([[0.95, 0.0], [DT, 1.0]], [[DT], [0.0]], [[0.0, 1.0]], **noise, **prior, **names)
 
 
 def data_of(model, seed=3):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
+from tests.models import state_space
 from thruster_env.core import equal_functions
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.integration import runge_kutta
@@ -324,14 +325,9 @@ def test_a_function_that_reads_other_values_than_before_is_another(make, monkeyp
 
 def final_mean(function, name="ekf"):
     """The last estimate of a model that moves by a function, from a prior without measurements."""
-    model = StateSpaceModel(
-        transition=lambda x, u, c: (function(x[0]),),
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.04],
-        prior_mean=[1.0],
-        prior_cov=[0.0],
-        inputs=0,
+    noise = {"q": [0.01], "r": [0.04]}
+    model = state_space(
+        lambda x, u, c: (function(x[0]),), lambda x, c: (x[0],), **noise, mean=[1.0], cov=[0.0], inputs=0
     )
     return run(make_filter(name, model), None, np.zeros((1, 2, 0)), np.full((1, 3, 1), np.nan)).means[0, -1, 0]
 

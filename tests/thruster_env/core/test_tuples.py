@@ -141,13 +141,4 @@ def test_a_fingerprint_tells_functions_apart_and_is_stable():
 
     fingerprint = partial(function_fingerprint, within=__name__)
     assert fingerprint(one) == fingerprint(one, None)
-    assert (
-        len(
-            {
-                function_fingerprint(within=__name__),
-                function_fingerprint(one, within=__name__),
-                function_fingerprint(other, within=__name__),
-            }
-        )
-        == 3
-    )
+    assert len({function_fingerprint(*each, within=__name__) for each in ((), (one,), (other,))}) == 3

@@ -5,19 +5,14 @@ import pickle
 import numpy as np
 import pytest
 
+from tests.models import affine
 from thruster_env.logs.grid import Series, grid_of, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.read import read_log
-from thruster_env.model.affine import affine_model
 
-MODEL = affine_model(
-    a=[[0.9]],
-    b=[[1.0]],
-    c=[[1.0]],
-    process_noise_cov=[0.1],
-    measurement_noise_cov=[0.1],
-    prior_mean=[0.0],
-    prior_cov=[1.0],
+MODEL = affine(
+    *([[0.9]], [[1.0]], [[1.0]]),
+    **{"q": [0.1], "r": [0.1], "mean": [0.0], "cov": [1.0]},
     states=[("speed", "n", "rad/s")],
     input_quantities=[("voltage", "V_s", "V")],
     measurements=[("tachometer", "tach", "rad/s")],
