@@ -84,21 +84,12 @@ class VehicleContext(Context):
 VEHICLE_SENSOR_EFFECTS = Registry("sensors", SENSOR_EFFECTS.effects)
 
 
-@inlined
-def near_surface(memory, b, target, rows, number, numbers, at, begin):
-    """Lose a measurement at depths beyond a limit."""
-    limit, valid, depth = numbers[at], target + int(numbers[at + 1]), int(numbers[at + 2])
-    for j in range(memory.shape[2]):
-        hold_missing(memory, b, j, target, rows, valid, not memory[b, depth, j] < limit, begin)
-
-
 @VEHICLE_SENSOR_EFFECTS.register("near-surface")
 @dataclass(frozen=True)
 class NearSurface(Effect):
     """A sensor that works near the surface only, as satellites do: missing at a `depth` [m] or more."""
 
     depth: float = 1.0
-    act = staticmethod(near_surface)
     checks = {"depth": finite}
     row_count = 1  # the last measurement that was not missing
     loses = True
@@ -106,3 +97,11 @@ class NearSurface(Effect):
     def parameters(self, context: VehicleContext) -> list[float]:
         """The depth [m], where validity stands, the row of the true depth."""
         return [self.depth, context.valid_offset, context.depth_row]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Lose a measurement at depths beyond a limit."""
+        limit, valid, depth = numbers[at], target + int(numbers[at + 1]), int(numbers[at + 2])
+        for j in range(memory.shape[2]):
+            hold_missing(memory, b, j, target, rows, valid, not memory[b, depth, j] < limit, begin)

@@ -32,71 +32,6 @@ LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's
 
 
 @inlined
-def student_t(memory, b, target, rows, number, numbers, at, begin):
-    """Add scale times a Student-t variate: Bailey's (1994) form of the transform of Box and Muller."""
-    degrees, scale = numbers[at], numbers[at + 1]
-    for j in range(memory.shape[2]):
-        u0, u1, _, _ = uniforms(memory, b, j, number)
-        radius = (degrees * (u0 ** (-2.0 / degrees) - 1.0)) ** 0.5
-        memory[b, target, j] += scale * radius * math.cos(2.0 * math.pi * u1)
-
-
-@inlined
-def outliers(memory, b, target, rows, number, numbers, at, begin):
-    """With a probability add a normal variate of a standard deviation."""
-    probability, std = numbers[at], numbers[at + 1]
-    for j in range(memory.shape[2]):
-        u, _, _, _ = uniforms(memory, b, j, number)
-        v, _, _, _ = normals(memory, b, j, number)
-        if u < probability:
-            memory[b, target, j] += std * v
-
-
-@inlined
-def bias(memory, b, target, rows, number, numbers, at, begin):
-    """Add a bias that starts at value + std n and drifts by a random walk."""
-    for j in range(memory.shape[2]):
-        v, _, _, _ = normals(memory, b, j, number)
-        if begin:
-            memory[b, rows, j] = numbers[at] + numbers[at + 1] * v
-        else:
-            memory[b, rows, j] += numbers[at + 2] * v
-        memory[b, target, j] += memory[b, rows, j]
-
-
-@inlined
-def quantisation(memory, b, target, rows, number, numbers, at, begin):
-    """Round to the nearest multiple of a step."""
-    step = numbers[at]
-    for j in range(memory.shape[2]):  # math.floor would make an integer, which ends at 2^63
-        memory[b, target, j] = np.floor(memory[b, target, j] / step + 0.5) * step
-
-
-@inlined
-def saturation(memory, b, target, rows, number, numbers, at, begin):
-    """Clip to an interval."""
-    for j in range(memory.shape[2]):
-        memory[b, target, j] = min(max(memory[b, target, j], numbers[at]), numbers[at + 1])
-
-
-@inlined
-def delay(memory, b, target, rows, number, numbers, at, begin):
-    """Report the measurement of `steps` steps ago, from a ring of rows; at first the first measurement."""
-    steps, valid = int(numbers[at]), target + int(numbers[at + 1])
-    for j in range(memory.shape[2]):
-        if begin:
-            for i in range(steps):
-                memory[b, rows + i, j] = memory[b, target, j]
-                memory[b, rows + steps + i, j] = memory[b, valid, j]
-        slot = rows + int(memory[b, STEP, j]) % steps
-        now, now_valid = memory[b, target, j], memory[b, valid, j]
-        memory[b, target, j] = memory[b, slot, j]
-        memory[b, valid, j] = memory[b, slot + steps, j]
-        memory[b, slot, j] = now
-        memory[b, slot + steps, j] = now_valid
-
-
-@inlined
 def hold_missing(memory, b, j, target, last, valid, missing, begin):
     """If copy j's measurement is missing, repeat the last one, stored in row `last`, and mark it as not valid."""
     if begin:
@@ -105,31 +40,6 @@ def hold_missing(memory, b, j, target, last, valid, missing, begin):
         memory[b, target, j] = memory[b, last, j]
         memory[b, valid, j] = 0.0
     memory[b, last, j] = memory[b, target, j]
-
-
-@inlined
-def dropout(memory, b, target, rows, number, numbers, at, begin):
-    """Lose measurements in runs (a two-state Markov chain); a lost one repeats the last and is not valid."""
-    begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
-    last, lost = rows, rows + 1
-    for j in range(memory.shape[2]):
-        u, _, _, _ = uniforms(memory, b, j, number)
-        if begin:
-            memory[b, lost, j] = 0.0
-        if memory[b, lost, j] > 0.0:
-            memory[b, lost, j] = 0.0 if u < ends else 1.0
-        else:
-            memory[b, lost, j] = 1.0 if u < begins else 0.0
-        hold_missing(memory, b, j, target, last, valid, memory[b, lost, j] > 0.0, begin)
-
-
-@inlined
-def sample_every(memory, b, target, rows, number, numbers, at, begin):
-    """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
-    steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
-    for j in range(memory.shape[2]):
-        between = (int(memory[b, STEP, j]) - first) % steps != 0
-        hold_missing(memory, b, j, target, rows, valid, between, begin)
 
 
 def _degrees(name: str, value) -> float:
@@ -151,12 +61,21 @@ class StudentT(Effect):
 
     scale: float
     degrees: float = 3.0
-    act = staticmethod(student_t)
     checks = {"scale": not_negative, "degrees": _degrees}
 
     def parameters(self, context: Context) -> list[float]:
         """Degrees of freedom and scale."""
         return [self.degrees, self.scale]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add scale times a Student-t variate: Bailey's (1994) form of the transform of Box and Muller."""
+        degrees, scale = numbers[at], numbers[at + 1]
+        for j in range(memory.shape[2]):
+            u0, u1, _, _ = uniforms(memory, b, j, number)
+            radius = (degrees * (u0 ** (-2.0 / degrees) - 1.0)) ** 0.5
+            memory[b, target, j] += scale * radius * math.cos(2.0 * math.pi * u1)
 
 
 @SENSOR_EFFECTS.register("outliers")
@@ -166,12 +85,22 @@ class Outliers(Effect):
 
     std: float
     probability: float = 0.05
-    act = staticmethod(outliers)
     checks = {"std": not_negative, "probability": checked_probability}
 
     def parameters(self, context: Context) -> list[float]:
         """Probability and standard deviation."""
         return [self.probability, self.std]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """With a probability add a normal variate of a standard deviation."""
+        probability, std = numbers[at], numbers[at + 1]
+        for j in range(memory.shape[2]):
+            u, _, _, _ = uniforms(memory, b, j, number)
+            v, _, _, _ = normals(memory, b, j, number)
+            if u < probability:
+                memory[b, target, j] += std * v
 
 
 @SENSOR_EFFECTS.register("bias")
@@ -182,9 +111,20 @@ class Bias(Effect):
     value: float = 0.0
     std: float = 0.0
     drift: float = 0.0
-    act = staticmethod(bias)
     checks = {"value": finite, "std": not_negative, "drift": not_negative}
     row_count = 1  # the bias
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a bias that starts at value + std n and drifts by a random walk."""
+        for j in range(memory.shape[2]):
+            v, _, _, _ = normals(memory, b, j, number)
+            if begin:
+                memory[b, rows, j] = numbers[at] + numbers[at + 1] * v
+            else:
+                memory[b, rows, j] += numbers[at + 2] * v
+            memory[b, target, j] += memory[b, rows, j]
 
 
 @SENSOR_EFFECTS.register("quantisation")
@@ -193,8 +133,15 @@ class Quantisation(Effect):
     """Rounding to the nearest multiple of `step`."""
 
     step: float
-    act = staticmethod(quantisation)
     checks = {"step": positive}
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Round to the nearest multiple of a step."""
+        step = numbers[at]
+        for j in range(memory.shape[2]):  # math.floor would make an integer, which ends at 2^63
+            memory[b, target, j] = np.floor(memory[b, target, j] / step + 0.5) * step
 
 
 @SENSOR_EFFECTS.register("saturation")
@@ -204,7 +151,6 @@ class SensorSaturation(Effect):
 
     low: float
     high: float
-    act = staticmethod(saturation)
 
     def __post_init__(self):
         """Check the arguments."""
@@ -213,6 +159,13 @@ class SensorSaturation(Effect):
             raise ValueError(f"low must be less than high, but got {self.low!r} and {self.high!r}")
         set_field(self, "low", low)
         set_field(self, "high", high)
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Clip to an interval."""
+        for j in range(memory.shape[2]):
+            memory[b, target, j] = min(max(memory[b, target, j], numbers[at]), numbers[at + 1])
 
 
 @SENSOR_EFFECTS.register("dropout")
@@ -230,7 +183,6 @@ class Dropout(Effect):
 
     probability: float = 0.1
     mean_length: float | None = None
-    act = staticmethod(dropout)
     row_count = 2  # the last valid measurement, and whether one is missing
     loses = True
 
@@ -252,6 +204,22 @@ class Dropout(Effect):
         begins = self.probability / (1.0 - self.probability) / self.mean_length
         return [begins, 1.0 / self.mean_length, context.valid_offset]
 
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Lose measurements in runs (a two-state Markov chain); a lost one repeats the last and is not valid."""
+        begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
+        last, lost = rows, rows + 1
+        for j in range(memory.shape[2]):
+            u, _, _, _ = uniforms(memory, b, j, number)
+            if begin:
+                memory[b, lost, j] = 0.0
+            if memory[b, lost, j] > 0.0:
+                memory[b, lost, j] = 0.0 if u < ends else 1.0
+            else:
+                memory[b, lost, j] = 1.0 if u < begins else 0.0
+            hold_missing(memory, b, j, target, last, valid, memory[b, lost, j] > 0.0, begin)
+
 
 def _delay_steps(name: str, value) -> int:
     steps = at_least(name, value, 1)
@@ -266,7 +234,6 @@ class Delay(Effect):
     """A measurement that comes `steps` sample times late; at first, the first one is repeated."""
 
     steps: int = 1
-    act = staticmethod(delay)
     checks = {"steps": _delay_steps}
 
     def parameters(self, context: Context) -> list[float]:
@@ -276,6 +243,23 @@ class Delay(Effect):
     def rows(self, context: Context) -> int:
         """Measurements on their way, and whether they are valid."""
         return 2 * self.steps
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Report the measurement of `steps` steps ago, from a ring of rows; at first the first measurement."""
+        steps, valid = int(numbers[at]), target + int(numbers[at + 1])
+        for j in range(memory.shape[2]):
+            if begin:
+                for i in range(steps):
+                    memory[b, rows + i, j] = memory[b, target, j]
+                    memory[b, rows + steps + i, j] = memory[b, valid, j]
+            slot = rows + int(memory[b, STEP, j]) % steps
+            now, now_valid = memory[b, target, j], memory[b, valid, j]
+            memory[b, target, j] = memory[b, slot, j]
+            memory[b, valid, j] = memory[b, slot + steps, j]
+            memory[b, slot, j] = now
+            memory[b, slot + steps, j] = now_valid
 
 
 @SENSOR_EFFECTS.register("sample-every")
@@ -289,7 +273,6 @@ class SampleEvery(Effect):
 
     steps: int
     first: int = 0
-    act = staticmethod(sample_every)
     row_count = 1  # the last sample
     loses = True
 
@@ -302,3 +285,12 @@ class SampleEvery(Effect):
     def parameters(self, context: Context) -> list[float]:
         """Steps between two samples, number of the first one, and offset of the validity flag."""
         return [self.steps, self.first, context.valid_offset]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
+        steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
+        for j in range(memory.shape[2]):
+            between = (int(memory[b, STEP, j]) - first) % steps != 0
+            hold_missing(memory, b, j, target, rows, valid, between, begin)

@@ -20,52 +20,6 @@ from thruster_env.effects.effects import Context, Effect, normals, not_negative,
 
 
 @inlined
-def constant(memory, b, target, rows, number, numbers, at, begin):
-    """Add a constant."""
-    for j in range(memory.shape[2]):
-        memory[b, target, j] += numbers[at]
-
-
-@inlined
-def sinusoid(memory, b, target, rows, number, numbers, at, begin):
-    """Add amplitude sin(2 pi t/period + phase)."""
-    amplitude, period, phase, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
-    for j in range(memory.shape[2]):
-        time = (memory[b, STEP, j] - 0.5) * dt
-        memory[b, target, j] += amplitude * math.sin(2.0 * math.pi * time / period + phase)
-
-
-@inlined
-def gauss_markov(memory, b, target, rows, number, numbers, at, begin):
-    """Add a first-order Gauss-Markov process, x' = a x + s sqrt(1 - a^2) n, stationary from the start."""
-    std, decay = numbers[at], numbers[at + 1]
-    spread = (1.0 - decay * decay) ** 0.5
-    for j in range(memory.shape[2]):
-        n, _, _, _ = normals(memory, b, j, number)
-        memory[b, rows, j] = std * n if begin else decay * memory[b, rows, j] + std * spread * n
-        memory[b, target, j] += memory[b, rows, j]
-
-
-@inlined
-def gusts(memory, b, target, rows, number, numbers, at, begin):
-    """Add gusts that begin at random; each is height/2 (1 - cos(2 pi t/duration)), with a normal height."""
-    chance, std, duration, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
-    since, height = rows, rows + 1
-    for j in range(memory.shape[2]):
-        u, _, _, _ = uniforms(memory, b, j, number)
-        n, _, _, _ = normals(memory, b, j, number)
-        if begin:
-            memory[b, since, j] = duration
-        memory[b, since, j] += dt
-        if memory[b, since, j] >= duration and u < chance:
-            memory[b, since, j] = 0.5 * dt
-            memory[b, height, j] = std * n
-        if memory[b, since, j] < duration:
-            turn = 2.0 * math.pi * memory[b, since, j] / duration
-            memory[b, target, j] += 0.5 * memory[b, height, j] * (1.0 - math.cos(turn))
-
-
-@inlined
 def recorded_value(time, numbers, at):
     """Value of a series at a time [s], linear between samples; numbers: sample time, repeat, count, values."""
     sample_time, repeat, count = numbers[at], numbers[at + 1], int(numbers[at + 2])
@@ -82,25 +36,23 @@ def recorded_value(time, numbers, at):
     return (1.0 - share) * numbers[at + 3 + before] + share * numbers[at + 3 + after]
 
 
-@inlined
-def recorded(memory, b, target, rows, number, numbers, at, begin):
-    """Add a recorded series."""
-    for j in range(memory.shape[2]):
-        time = (memory[b, STEP, j] - 0.5) * numbers[at]
-        memory[b, target, j] += recorded_value(time, numbers, at + 1)
-
-
 @dataclass(frozen=True)
 class ConstantSignal(Effect):
     """A constant `value`."""
 
     value: float
-    act = staticmethod(constant)
     checks = {"value": finite}
 
     def largest(self) -> float:
         """Its magnitude."""
         return abs(self.value)
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a constant."""
+        for j in range(memory.shape[2]):
+            memory[b, target, j] += numbers[at]
 
 
 @dataclass(frozen=True)
@@ -110,7 +62,6 @@ class Sinusoid(Effect):
     amplitude: float
     period: float = 4.0
     phase: float = 0.0
-    act = staticmethod(sinusoid)
     checks = {"amplitude": finite, "period": positive, "phase": finite}
 
     def largest(self) -> float:
@@ -121,6 +72,15 @@ class Sinusoid(Effect):
         """Amplitude, period [s], phase [rad], sample time [s]."""
         return [self.amplitude, self.period, self.phase, context.dt]
 
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add amplitude sin(2 pi t/period + phase)."""
+        amplitude, period, phase, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
+        for j in range(memory.shape[2]):
+            time = (memory[b, STEP, j] - 0.5) * dt
+            memory[b, target, j] += amplitude * math.sin(2.0 * math.pi * time / period + phase)
+
 
 @dataclass(frozen=True)
 class GaussMarkov(Effect):
@@ -128,7 +88,6 @@ class GaussMarkov(Effect):
 
     std: float
     time_constant: float = 1.0
-    act = staticmethod(gauss_markov)
     checks = {"std": not_negative, "time_constant": positive}
     row_count = 1  # the process
 
@@ -139,6 +98,17 @@ class GaussMarkov(Effect):
     def parameters(self, context: Context) -> list[float]:
         """Standard deviation and the correlation of neighbouring steps."""
         return [self.std, math.exp(-context.dt / self.time_constant)]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a first-order Gauss-Markov process, x' = a x + s sqrt(1 - a^2) n, stationary from the start."""
+        std, decay = numbers[at], numbers[at + 1]
+        spread = (1.0 - decay * decay) ** 0.5
+        for j in range(memory.shape[2]):
+            n, _, _, _ = normals(memory, b, j, number)
+            memory[b, rows, j] = std * n if begin else decay * memory[b, rows, j] + std * spread * n
+            memory[b, target, j] += memory[b, rows, j]
 
 
 @dataclass(frozen=True)
@@ -154,7 +124,6 @@ class Gusts(Effect):
     std: float
     rate: float = 0.5
     duration: float = 0.5
-    act = staticmethod(gusts)
     checks = {"std": not_negative, "rate": not_negative, "duration": positive}
     row_count = 2  # time since the gust began, and its height
 
@@ -165,6 +134,25 @@ class Gusts(Effect):
     def parameters(self, context: Context) -> list[float]:
         """Probability that one begins in a calm step, standard deviation, duration [s], sample time [s]."""
         return [1.0 - math.exp(-self.rate * context.dt), self.std, self.duration, context.dt]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add gusts that begin at random; each is height/2 (1 - cos(2 pi t/duration)), with a normal height."""
+        chance, std, duration, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
+        since, height = rows, rows + 1
+        for j in range(memory.shape[2]):
+            u, _, _, _ = uniforms(memory, b, j, number)
+            n, _, _, _ = normals(memory, b, j, number)
+            if begin:
+                memory[b, since, j] = duration
+            memory[b, since, j] += dt
+            if memory[b, since, j] >= duration and u < chance:
+                memory[b, since, j] = 0.5 * dt
+                memory[b, height, j] = std * n
+            if memory[b, since, j] < duration:
+                turn = 2.0 * math.pi * memory[b, since, j] / duration
+                memory[b, target, j] += 0.5 * memory[b, height, j] * (1.0 - math.cos(turn))
 
 
 @dataclass(frozen=True)
@@ -235,4 +223,10 @@ def _column(file: str, column: str | None) -> np.ndarray:
 class RecordedSignal(RecordedSeries):
     """A recorded signal."""
 
-    act = staticmethod(recorded)
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a recorded series."""
+        for j in range(memory.shape[2]):
+            time = (memory[b, STEP, j] - 0.5) * numbers[at]
+            memory[b, target, j] += recorded_value(time, numbers, at + 1)

@@ -19,12 +19,12 @@ from thruster_env.core.memory import KEY_0, KEY_1, STEP
 from thruster_env.core.streams import PARAMETERS, REFERENCE_SIGNAL, normal_block, uniform_block
 from thruster_env.effects.effects import LONGEST, Context, Effect, Registry, not_negative, set_field
 from thruster_env.effects.signals import (
+    ConstantSignal,
     GaussMarkov,
     Gusts,
     RecordedSeries,
     RecordedSignal,
     Sinusoid,
-    constant,
     recorded_value,
 )
 from thruster_env.thruster.parameters import ThrusterParameters, checked
@@ -61,42 +61,6 @@ def outside(voltage, low, high):
     return voltage - min(max(voltage, low), high)
 
 
-@inlined
-def dead_band(memory, b, target, rows, number, numbers, at, begin):
-    """Apply the dead band to the voltage."""
-    low, high = numbers[at], numbers[at + 1]
-    for j in range(memory.shape[2]):
-        memory[b, target, j] = outside(memory[b, target, j], low, high)
-
-
-@inlined
-def slew_limit(memory, b, target, rows, number, numbers, at, begin):
-    """Limit the change of the voltage per step; it starts from zero."""
-    change = numbers[at]
-    for j in range(memory.shape[2]):
-        before = 0.0 if begin else memory[b, rows, j]
-        after = min(max(memory[b, target, j], before - change), before + change)
-        memory[b, target, j] = after
-        memory[b, rows, j] = after
-
-
-@inlined
-def saturation(memory, b, target, rows, number, numbers, at, begin):
-    """Clip to plus and minus a limit."""
-    limit = numbers[at]
-    for j in range(memory.shape[2]):
-        memory[b, target, j] = min(max(memory[b, target, j], -limit), limit)
-
-
-@inlined
-def sag(memory, b, target, rows, number, numbers, at, begin):
-    """Lose a fraction of the voltage that drives current, V_s - k_e omega_m."""
-    fraction, back_emf, speed = numbers[at], numbers[at + 1], int(numbers[at + 2])
-    for j in range(memory.shape[2]):
-        driving = memory[b, target, j] - back_emf * memory[b, speed, j]
-        memory[b, target, j] -= 0.0 if begin else fraction * driving
-
-
 def _width_or_none(name: str, value) -> float | None:
     return None if value is None else not_negative(name, value)
 
@@ -111,7 +75,6 @@ class DeadBand(Effect):
 
     width: float
     astern: float | None = None
-    act = staticmethod(dead_band)
     checks = {"width": not_negative, "astern": _width_or_none}
 
     def parameters(self, context: Context) -> list[float]:
@@ -122,6 +85,14 @@ class DeadBand(Effect):
         """As plain data; without `astern` where the band is symmetric."""
         mapping = super().as_mapping()
         return {name: value for name, value in mapping.items() if value is not None}
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Apply the dead band to the voltage."""
+        low, high = numbers[at], numbers[at + 1]
+        for j in range(memory.shape[2]):
+            memory[b, target, j] = outside(memory[b, target, j], low, high)
 
 
 def dead_band_of(low: float, high: float) -> tuple[DeadBand, ...]:
@@ -135,13 +106,23 @@ class SlewLimit(Effect):
     """A voltage that changes by at most `rate` [V/s], from zero at the start of an episode."""
 
     rate: float
-    act = staticmethod(slew_limit)
     checks = {"rate": positive}
     row_count = 1  # the voltage of the last step
 
     def parameters(self, context: Context) -> list[float]:
         """The largest change in a step [V]."""
         return [self.rate * context.dt]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Limit the change of the voltage per step; it starts from zero."""
+        change = numbers[at]
+        for j in range(memory.shape[2]):
+            before = 0.0 if begin else memory[b, rows, j]
+            after = min(max(memory[b, target, j], before - change), before + change)
+            memory[b, target, j] = after
+            memory[b, rows, j] = after
 
 
 @AMPLIFIER_EFFECTS.register("saturation")
@@ -150,8 +131,15 @@ class AmplifierSaturation(Effect):
     """A voltage within plus and minus `limit` [V], less than the action space's bound to matter."""
 
     limit: float
-    act = staticmethod(saturation)
     checks = {"limit": positive}
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Clip to plus and minus a limit."""
+        limit = numbers[at]
+        for j in range(memory.shape[2]):
+            memory[b, target, j] = min(max(memory[b, target, j], -limit), limit)
 
 
 def _fraction(name: str, value) -> float:
@@ -171,12 +159,20 @@ class Sag(Effect):
     """
 
     fraction: float
-    act = staticmethod(sag)
     checks = {"fraction": _fraction}
 
     def parameters(self, context: ThrusterContext) -> list[float]:
         """Fraction, back-EMF constant [V s/rad], row of the motor speed."""
         return [self.fraction, context.back_emf, context.speed_row]
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Lose a fraction of the voltage that drives current, V_s - k_e omega_m."""
+        fraction, back_emf, speed = numbers[at], numbers[at + 1], int(numbers[at + 2])
+        for j in range(memory.shape[2]):
+            driving = memory[b, target, j] - back_emf * memory[b, speed, j]
+            memory[b, target, j] -= 0.0 if begin else fraction * driving
 
 
 # Reference thrust: signals that the thruster has to follow; those of a list are added.
@@ -194,78 +190,6 @@ def _uniform(memory, b, j, number, index):
     return u
 
 
-@inlined
-def steps(memory, b, target, rows, number, numbers, at, begin):
-    """Add levels that are drawn from an interval and held."""
-    low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-    for j in range(memory.shape[2]):
-        part = math.floor((memory[b, STEP, j] + 1.0) / hold)
-        u = _uniform(memory, b, j, number, part)
-        memory[b, target, j] += low + (high - low) * u
-
-
-@inlined
-def ramps(memory, b, target, rows, number, numbers, at, begin):
-    """Add straight lines between levels that are drawn from an interval."""
-    low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-    for j in range(memory.shape[2]):
-        position = (memory[b, STEP, j] + 1.0) / hold
-        part = math.floor(position)
-        before, after = _uniform(memory, b, j, number, part), _uniform(memory, b, j, number, part + 1.0)
-        memory[b, target, j] += low + (high - low) * (before + (position - part) * (after - before))
-
-
-@inlined
-def binary_sequence(memory, b, target, rows, number, numbers, at, begin):
-    """Add a pseudo-random binary sequence: one of two levels, drawn and held."""
-    low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-    for j in range(memory.shape[2]):
-        part = math.floor((memory[b, STEP, j] + 1.0) / hold)
-        u = _uniform(memory, b, j, number, part)
-        memory[b, target, j] += high if u < 0.5 else low
-
-
-@inlined
-def multi_sine(memory, b, target, rows, number, numbers, at, begin):
-    """Add sines of equal amplitude with phases that are drawn."""
-    offset, amplitude, dt, count = numbers[at], numbers[at + 1], numbers[at + 2], int(numbers[at + 3])
-    for j in range(memory.shape[2]):
-        memory[b, target, j] += offset
-        for i in range(count):
-            if begin:
-                u = _uniform(memory, b, j, number, i)
-                memory[b, rows + i, j] = 2.0 * math.pi * u
-            time = (memory[b, STEP, j] + 1.0) * dt
-            phase = 2.0 * math.pi * time / numbers[at + 4 + i] + memory[b, rows + i, j]
-            memory[b, target, j] += amplitude * math.sin(phase)
-
-
-@inlined
-def band_limited_noise(memory, b, target, rows, number, numbers, at, begin):
-    """Add white noise through a low-pass, x' = A x + b n, r = c x, stationary from the start."""
-    offset = numbers[at]
-    for j in range(memory.shape[2]):
-        step = memory[b, STEP, j] + 1.0
-        n, m, _, _ = normal_block(number, step, REFERENCE_SIGNAL, memory[b, KEY_0, j], memory[b, KEY_1, j])
-        x, y = memory[b, rows, j], memory[b, rows + 1, j]
-        if begin:
-            memory[b, rows, j] = numbers[at + 9] * n
-            memory[b, rows + 1, j] = numbers[at + 10] * n + numbers[at + 11] * m
-        else:
-            memory[b, rows, j] = numbers[at + 1] * x + numbers[at + 2] * y + numbers[at + 5] * n
-            memory[b, rows + 1, j] = numbers[at + 3] * x + numbers[at + 4] * y + numbers[at + 6] * n
-        memory[b, target, j] += offset
-        memory[b, target, j] += numbers[at + 7] * memory[b, rows, j] + numbers[at + 8] * memory[b, rows + 1, j]
-
-
-@inlined
-def recorded_reference(memory, b, target, rows, number, numbers, at, begin):
-    """Add a recorded series."""
-    for j in range(memory.shape[2]):
-        time = (memory[b, STEP, j] + 1.0) * numbers[at]
-        memory[b, target, j] += recorded_value(time, numbers, at + 1)
-
-
 @REFERENCE_SIGNALS.register("constant")
 @dataclass(frozen=True)
 class Constant(Effect):
@@ -273,7 +197,7 @@ class Constant(Effect):
 
     level: float | None = None
     thrust: float | None = None
-    act = staticmethod(constant)
+    act = staticmethod(ConstantSignal.act)
 
     def __post_init__(self):
         """Check the arguments."""
@@ -326,7 +250,15 @@ class _Levels(Effect):
 class Steps(_Levels):
     """Levels drawn between `low` and `high` [T_max], each held for `hold_time` [s]."""
 
-    act = staticmethod(steps)
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add levels that are drawn from an interval and held."""
+        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
+        for j in range(memory.shape[2]):
+            part = math.floor((memory[b, STEP, j] + 1.0) / hold)
+            u = _uniform(memory, b, j, number, part)
+            memory[b, target, j] += low + (high - low) * u
 
 
 @REFERENCE_SIGNALS.register("ramps")
@@ -334,7 +266,16 @@ class Steps(_Levels):
 class Ramps(_Levels):
     """Straight lines between levels drawn from `low` to `high` [T_max], each line taking `hold_time` [s]."""
 
-    act = staticmethod(ramps)
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add straight lines between levels that are drawn from an interval."""
+        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
+        for j in range(memory.shape[2]):
+            position = (memory[b, STEP, j] + 1.0) / hold
+            part = math.floor(position)
+            before, after = _uniform(memory, b, j, number, part), _uniform(memory, b, j, number, part + 1.0)
+            memory[b, target, j] += low + (high - low) * (before + (position - part) * (after - before))
 
 
 @REFERENCE_SIGNALS.register("prbs")
@@ -342,7 +283,15 @@ class Ramps(_Levels):
 class BinarySequence(_Levels):
     """Pseudo-random binary sequence: `low` or `high` [T_max] with equal chance, drawn every `hold_time` [s]."""
 
-    act = staticmethod(binary_sequence)
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a pseudo-random binary sequence: one of two levels, drawn and held."""
+        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
+        for j in range(memory.shape[2]):
+            part = math.floor((memory[b, STEP, j] + 1.0) / hold)
+            u = _uniform(memory, b, j, number, part)
+            memory[b, target, j] += high if u < 0.5 else low
 
 
 def _periods(name: str, values) -> tuple[float, ...]:
@@ -357,7 +306,6 @@ class MultiSine(Effect):
     amplitude: float = 0.1
     offset: float = 0.4
     periods: tuple[float, ...] = (4.0, 1.7, 0.7)
-    act = staticmethod(multi_sine)
     checks = {"amplitude": finite, "offset": finite, "periods": _periods}
 
     def parameters(self, context: ThrusterContext) -> list[float]:
@@ -368,6 +316,21 @@ class MultiSine(Effect):
     def rows(self, context: ThrusterContext) -> int:
         """The phases."""
         return len(self.periods)
+
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add sines of equal amplitude with phases that are drawn."""
+        offset, amplitude, dt, count = numbers[at], numbers[at + 1], numbers[at + 2], int(numbers[at + 3])
+        for j in range(memory.shape[2]):
+            memory[b, target, j] += offset
+            for i in range(count):
+                if begin:
+                    u = _uniform(memory, b, j, number, i)
+                    memory[b, rows + i, j] = 2.0 * math.pi * u
+                time = (memory[b, STEP, j] + 1.0) * dt
+                phase = 2.0 * math.pi * time / numbers[at + 4 + i] + memory[b, rows + i, j]
+                memory[b, target, j] += amplitude * math.sin(phase)
 
 
 LEAST_BANDWIDTH = 1e-5  # of the sample rate; a narrower low-pass is lost in rounding
@@ -384,7 +347,6 @@ class BandLimitedNoise(Effect):
     std: float = 0.15
     offset: float = 0.4
     bandwidth: float = 0.5
-    act = staticmethod(band_limited_noise)
     checks = {"std": not_negative, "offset": finite, "bandwidth": positive}
     row_count = 2  # the states of the low-pass
 
@@ -404,13 +366,37 @@ class BandLimitedNoise(Effect):
         numbers = [*a.ravel(), *b.ravel(), *c.ravel(), root[0, 0], root[1, 0], root[1, 1]]
         return [self.offset * context.thrust_scale, *map(float, numbers)]
 
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add white noise through a low-pass, x' = A x + b n, r = c x, stationary from the start."""
+        offset = numbers[at]
+        for j in range(memory.shape[2]):
+            step = memory[b, STEP, j] + 1.0
+            n, m, _, _ = normal_block(number, step, REFERENCE_SIGNAL, memory[b, KEY_0, j], memory[b, KEY_1, j])
+            x, y = memory[b, rows, j], memory[b, rows + 1, j]
+            if begin:
+                memory[b, rows, j] = numbers[at + 9] * n
+                memory[b, rows + 1, j] = numbers[at + 10] * n + numbers[at + 11] * m
+            else:
+                memory[b, rows, j] = numbers[at + 1] * x + numbers[at + 2] * y + numbers[at + 5] * n
+                memory[b, rows + 1, j] = numbers[at + 3] * x + numbers[at + 4] * y + numbers[at + 6] * n
+            memory[b, target, j] += offset
+            memory[b, target, j] += numbers[at + 7] * memory[b, rows, j] + numbers[at + 8] * memory[b, rows + 1, j]
+
 
 @REFERENCE_SIGNALS.register("recorded")
 @dataclass(frozen=True)
 class RecordedReference(RecordedSeries):
     """A recorded reference thrust; its values are in newtons."""
 
-    act = staticmethod(recorded_reference)
+    @staticmethod
+    @inlined
+    def act(memory, b, target, rows, number, numbers, at, begin):
+        """Add a recorded series."""
+        for j in range(memory.shape[2]):
+            time = (memory[b, STEP, j] + 1.0) * numbers[at]
+            memory[b, target, j] += recorded_value(time, numbers, at + 1)
 
 
 # Uncertain parameters: factors on a preset's values, drawn once per episode from its key.
