@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,6 +11,7 @@ import numpy as np
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from docs.scripts import by_name, digits
+from docs.scripts.ranking import leaderboard
 from filters import EstimateState
 from filters.augmented import Unknown
 from filters.consistency.intervals import Interval
@@ -20,8 +21,7 @@ from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.commands import ObserveStateVector
 from tuning.auv.scenario import Scenario, find_scenario
-from tuning.evaluation.compare import Contender, Row, compare, contender
-from tuning.problems.data import held_out_seeds
+from tuning.evaluation.compare import Contender, Row, contender
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice
 
@@ -111,71 +111,27 @@ def restless(filter_: Contender, variance: float) -> Contender:
 
 MEMBERS = [small("enkf", size) for size in (50, 100, 200, 300)]
 CURES = [
-    small("enkf"),
-    small("enkf", centred_perturbations=1),
-    small("enkf", inflation=1.02),
-    small("enkf", inflation=1.05),
-    small("enkf", relaxation=0.3),
-    small("enkf", relaxation=0.5),
+    *(small("enkf", **numbers) for numbers in ({}, {"centred_perturbations": 1})),
+    *(small("enkf", inflation=inflation) for inflation in (1.02, 1.05)),
+    *(small("enkf", relaxation=relaxation) for relaxation in (0.3, 0.5)),
     small("enkf", inflation=1.05, relaxation=0.3),
-    restless(small("enkf"), 1e-7),
-    restless(small("enkf"), 1e-6),
-    small("etkf"),
-    small("etkf", rotations=1),
-    small("etkf", relaxation=0.3),
-    small("etkf", relaxation=0.45),
+    *(restless(small("enkf"), variance) for variance in (1e-7, 1e-6)),
+    *(small("etkf", **numbers) for numbers in ({}, {"rotations": 1})),
+    *(small("etkf", relaxation=relaxation) for relaxation in (0.3, 0.45)),
     small("etkf", relaxation=0.45, rotations=1),
     small("etkf", inflation=1.02, relaxation=0.3),
     restless(small("etkf", relaxation=0.3), 1e-7),
 ]
 FAST_CURES = [
-    *MEMBERS,
-    small("enkf", 1000),
-    small("enkf", inflation=1.02),
-    small("enkf", inflation=1.05),
+    *(*MEMBERS, small("enkf", 1000)),
+    *(small("enkf", inflation=inflation) for inflation in (1.02, 1.05)),
     small("enkf", relaxation=0.5),
-    restless(small("enkf"), 1e-8),
-    restless(small("enkf"), 1e-6),
-    small("etkf"),
-    small("etkf", rotations=1),
-    small("etkf", inflation=1.01),
-    small("etkf", inflation=1.02),
+    *(restless(small("enkf"), variance) for variance in (1e-8, 1e-6)),
+    *(small("etkf", **numbers) for numbers in ({}, {"rotations": 1})),
+    *(small("etkf", inflation=inflation) for inflation in (1.01, 1.02)),
     small("etkf", relaxation=0.4),
-    small("etkf", 300),
-    small("etkf", 300, relaxation=0.4),
+    *(small("etkf", 300, **numbers) for numbers in ({}, {"relaxation": 0.4})),
 ]
-
-
-def filters_motion() -> str:
-    """Filters of eight states, a row per scenario and filter."""
-    return by_scenario(MOTION, FILTERS)
-
-
-def filters_navigation() -> str:
-    """Filters of twelve states."""
-    return by_scenario(NAVIGATION, (EKF, ROBUST, UKF))
-
-
-def filters_members() -> str:
-    """How many members the papers' sensors ask for at 20 Hz, untuned."""
-    return of_rows(rows_of("auv:papers_20hz", [EKF, UKF, *MEMBERS], RUNS))
-
-
-def filters_cures() -> str:
-    """Settings with which 50 members suffice there."""
-    return of_rows(rows_of("auv:papers_20hz", [EKF, *CURES], RUNS))
-
-
-def filters_fast() -> str:
-    """The same at the papers' 1 kHz, where the spread collapses."""
-    return of_rows(rows_of("auv:papers", [EKF, *FAST_CURES], FEW))
-
-
-def filters_drag() -> str:
-    """Wrong drag: an EKF with more process noise, and EKFs with coefficients as further states."""
-    scaled = contender("ekf", knows="scaled")._replace(label="ekf, scaled default")
-    joint = [contender("ekf", unknown=unknown) for unknown in (AXIAL_DRAG, DRAG)]
-    return of_rows(rows_of("auv:wrong_drag", [EKF, scaled, *joint], RUNS))
 
 
 def filters_current() -> str:
@@ -183,7 +139,7 @@ def filters_current() -> str:
     symbols = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
     lines, units = [], {}
     for name in ("auv:current", "auv:estimated_current"):
-        (row,) = rows_of(name, [EKF], RUNS)
+        (row,) = rows_of(name, [EKF])
         evaluation = row.evaluation
         errors = {state.symbol: error for state, error in zip(evaluation.states, evaluation.rmse, strict=True)}
         units |= {state.symbol: state.unit for state in evaluation.states}
@@ -192,24 +148,25 @@ def filters_current() -> str:
     return markdown_table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in symbols), "NEES"], lines)
 
 
-def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -> list[Row]:
+def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int = RUNS) -> list[Row]:
     """Filters on a scenario's held-out seeds."""
     problem = find_scenario(scenario) if isinstance(scenario, str) else scenario
-    (board,), interrupted = compare(filters, [problem], held_out_seeds(0, runs))
-    if interrupted:
-        raise KeyboardInterrupt
-    return board.rows
+    return leaderboard(problem, filters, runs).rows
 
 
-def by_scenario(scenarios: Sequence[str], filters: Sequence[Contender], runs: int = RUNS) -> str:
+def by_scenario(scenarios: Sequence[str], filters: Sequence[Contender]) -> Callable[[], str]:
     """A table with the scenario in the first column."""
-    rows = [[f"`{name}`", *cells(row)] for name in scenarios for row in rows_of(name, filters, runs)]
-    return markdown_table(["scenario", *HEADER], rows)
+
+    def table() -> str:
+        rows = [[f"`{name}`", *cells(row)] for name in scenarios for row in rows_of(name, filters)]
+        return markdown_table(["scenario", *HEADER], rows)
+
+    return table
 
 
-def of_rows(rows: Sequence[Row]) -> str:
+def compared(scenario: str, filters: Sequence[Contender], runs: int = RUNS) -> Callable[[], str]:
     """A table of one scenario."""
-    return markdown_table(HEADER, [cells(row) for row in rows])
+    return lambda: markdown_table(HEADER, [cells(row) for row in rows_of(scenario, filters, runs)])
 
 
 def cells(row: Row) -> list[str]:
@@ -238,7 +195,14 @@ def plain(value: float) -> str:
 
 
 FIGURES = {"auv_frame.png": frame}
-TABLES = by_name(
-    *(returns, filters_motion, filters_navigation, filters_current),
-    *(filters_members, filters_cures, filters_fast, filters_drag),
-)
+SCALED = contender("ekf", knows="scaled")._replace(label="ekf, scaled default")
+JOINT = [contender("ekf", unknown=unknown) for unknown in (AXIAL_DRAG, DRAG)]  # coefficients as further states
+TABLES = {
+    **by_name(returns, filters_current),
+    "filters_motion": by_scenario(MOTION, FILTERS),
+    "filters_navigation": by_scenario(NAVIGATION, (EKF, ROBUST, UKF)),
+    "filters_members": compared("auv:papers_20hz", [EKF, UKF, *MEMBERS]),
+    "filters_cures": compared("auv:papers_20hz", [EKF, *CURES]),  # settings with which 50 members suffice
+    "filters_fast": compared("auv:papers", [EKF, *FAST_CURES], FEW),  # at 1 kHz, where the spread collapses
+    "filters_drag": compared("auv:wrong_drag", [EKF, SCALED, *JOINT]),
+}

@@ -333,9 +333,8 @@ def amplifier_effects(path: Path) -> Path:
     }
     voltages = np.where(time < 1.0, 12.0 * np.sin(2 * math.pi * time), np.where(time < 1.5, 12.0, -12.0))
     plain = make_plant("t200", max_voltage=FULL_VOLTAGE["t200"], **QUIET)
-    plants = {
-        title: plain._replace(amplifier=AMPLIFIER_EFFECTS.make(effect)) for title, effect in examples.items()
-    }
+    make = AMPLIFIER_EFFECTS.make
+    plants = {title: plain._replace(amplifier=make(effect)) for title, effect in examples.items()}
     return _signals(path, plants, plain, voltages, (VOLTAGE, "voltage [V]"))
 
 
@@ -410,12 +409,8 @@ def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, first
 
 
 FIGURES = {
-    "plant_responses.png": responses,
-    "plant_steady.png": steady_states,
-    "plant_sensors.png": sensor_effects,
-    "plant_flow.png": flow_signals,
-    "plant_amplifier.png": amplifier_effects,
-    "plant_references.png": references,
-    "plant_frame.png": frame,
+    **{"plant_responses.png": responses, "plant_steady.png": steady_states, "plant_sensors.png": sensor_effects},
+    **{"plant_flow.png": flow_signals, "plant_amplifier.png": amplifier_effects},
+    **{"plant_references.png": references, "plant_frame.png": frame},
 }
 TABLES = by_name(parameters, presets, accuracy, returns)

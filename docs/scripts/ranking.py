@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,50 +52,38 @@ VEHICLE, VEHICLE_SEEDS = ("auv:motion", "auv:dvl_outliers", "auv:wrong_drag"), 5
 COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS", "log L")
 
 
-def speed() -> str:
-    """|speed| at slow crossings and dwells."""
-    by_speed = contender("gsf", component=0)  # the sum is split along omega_m
-    marginal = [contender("rbpf", sampled=(component,)) for component in (0, 1)]
-    filters = [EKF, UKF, by_speed, ENKF, RANKED, PF, MANY, *marginal]
-    return table_of(leaderboard(find_scenario("speed_magnitude"), filters))
+def compared(scenario: str, filters: Sequence[Contender], seeds: int = SEEDS, **changes) -> Callable[[], str]:
+    """The table of filters on a scenario, or on one with changes."""
+    return lambda: table_of(leaderboard(find_scenario(scenario).replace(**changes), filters, seeds))
 
 
-def fast() -> str:
-    """|speed| at fast reversals."""
-    slow = find_scenario("speed_magnitude")
-    scenario = slow.replace(name="fast_reversals", excitation=Steps(12.0), measurement_noise_cov=25.0)
-    return table_of(leaderboard(scenario, [EKF, UKF, MANY]))
-
-
-def outliers() -> str:
-    """Outliers in the thrust."""
-    return table_of(leaderboard(find_scenario("outliers"), [EKF, ROBUST, IMM, ENKF, PF]))
-
-
-def ambient() -> str:
-    """A flow that the filter does not know, and filters that estimate it."""
-    joint = [contender("ekf", unknown=FLOW), contender("enkf", unknown=FLOW, ensemble_size=100)]
-    return table_of(leaderboard(find_scenario("ambient"), [EKF, joint[0], ENKF, joint[1]]))
-
-
-def published() -> str:
-    """The published noise."""
-    ensembles = [SMALL, SMALL_INFLATED, SMALL_ADAPTIVE, SMALL_RESTING, SMALL_FINITE]
-    ensembles += [ENKF, INFLATED, IENKF, IENKF_INFLATED]
-    particles = [
-        contender("pf", proposal="optimal"),
-        contender("pf", resampling="gaussian", resampling_threshold=1.0),
-    ]
-    particles.append(contender("rbpf", sampled=(1,)))  # U_a
-    filters = [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY, *particles]
-    return table_of(leaderboard(find_scenario("published_noise"), filters))
-
-
-def reference() -> str:
-    """The published noise, beside a particle filter with so many particles that more change nothing."""
-    best = contender("pf", ensemble_size=REFERENCE_SIZE)
-    filters = [best, EKF, IEKF, UKF, ENKF, IENKF, GSF, PF, MANY]
-    return table_of(leaderboard(find_scenario("published_noise"), filters, REFERENCE_SEEDS))
+FAST = {"name": "fast_reversals", "excitation": Steps(12.0), "measurement_noise_cov": 25.0}
+ENSEMBLES = [
+    SMALL,
+    SMALL_INFLATED,
+    SMALL_ADAPTIVE,
+    SMALL_RESTING,
+    SMALL_FINITE,
+    ENKF,
+    INFLATED,
+    IENKF,
+    IENKF_INFLATED,
+]
+PARTICLES = [contender("pf", proposal="optimal"), contender("pf", resampling="gaussian", resampling_threshold=1.0)]
+MARGINAL = [contender("rbpf", sampled=(component,)) for component in (0, 1)]
+BY_SPEED = contender("gsf", component=0)  # the sum is split along omega_m
+JOINT_EKF, JOINT_ENKF = contender("ekf", unknown=FLOW), contender("enkf", unknown=FLOW, ensemble_size=100)
+REFERENCE = contender("pf", ensemble_size=REFERENCE_SIZE)  # so many particles that more change nothing
+COMPARED = {
+    "speed": compared("speed_magnitude", [EKF, UKF, BY_SPEED, ENKF, RANKED, PF, MANY, *MARGINAL]),
+    "fast": compared("speed_magnitude", [EKF, UKF, MANY], **FAST),
+    "outliers": compared("outliers", [EKF, ROBUST, IMM, ENKF, PF]),
+    "ambient": compared("ambient", [EKF, JOINT_EKF, ENKF, JOINT_ENKF]),
+    "published": compared("published_noise", [EKF, IEKF, UKF, *ENSEMBLES, GSF, PF, MANY, *PARTICLES, MARGINAL[1]]),
+    "reference": compared(
+        "published_noise", [REFERENCE, EKF, IEKF, UKF, ENKF, IENKF, GSF, PF, MANY], REFERENCE_SEEDS
+    ),
+}
 
 
 def startup() -> str:
@@ -193,7 +181,7 @@ def table_of(board: Leaderboard) -> str:
             row.evaluation.rmse, row.above_bound, row.ratios, (3, 4), strict=True
         ):
             cells.append(f"{about(rmse, decimals)} ({100 * above:+.0f} %)")
-            cells.append("" if row is board.rows[0] else about(ratio, 3))
+            cells.append("" if row is board.rows[0] else about(ratio))
         nees = f"{row.nees:.2f} (median)" if row.nees_is_median else unless_blank(row.nees, ".3g")
         cells += [nees, unless_blank(row.evaluation.nis.value, ".3g")]
         cells.append(unless_blank(row.evaluation.log_likelihood, ".0f"))
@@ -248,7 +236,7 @@ def constants() -> str:
         filters.append(contender("pf", unknown=known, ensemble_size=size))
         smoothed = contender("pf", unknown=known, ensemble_size=size, smoothed=(-1,), regularisation=1.0)
         filters.append(smoothed._replace(label=f"pf {size} smoothed + U_0"))
-    return table_of(leaderboard(find_scenario("ambient"), filters))
+    return compared("ambient", filters)()
 
 
 def particle_errors(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -> str:
@@ -429,7 +417,7 @@ def chart(path: Path) -> Path:
 
 
 FIGURES = {FILE: chart}
-TABLES = by_name(
-    *(speed, fast, outliers, ambient, published, reference, startup, every_filter, scores, scenarios),
-    *(conditional, accurate, constants, batch_reactor, horizon),
-)
+TABLES = {
+    **COMPARED,
+    **by_name(startup, every_filter, scores, scenarios, conditional, accurate, constants, batch_reactor, horizon),
+}
