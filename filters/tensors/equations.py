@@ -87,7 +87,7 @@ def values_of(
     values: dict[int, Tensor | float] = {}
 
     def tensor(value: Tensor | float) -> Tensor:
-        return value if isinstance(value, Tensor) else like.new_tensor(value)
+        return value if isinstance(value, Tensor) else number_like(value, like)
 
     for number in order:
         arguments = [values[a.place] for a in number.of]
@@ -294,12 +294,17 @@ def _components_of_points(x: Tensor, *arguments: Tensor) -> list[tuple[Tensor, .
     return [x.unbind(-2), *(tensor[..., None].unbind(-2) for tensor in arguments)]
 
 
+def number_like(value: Any, like: Tensor) -> Tensor:
+    """A number as a tensor (); it is filled in on the device, without a copy from the host."""
+    return like.new_full((), value) if isinstance(value, (int, float)) else like.new_tensor(value)
+
+
 def stacked(values: Sequence[Tensor | float], parts: list[tuple[Tensor, ...]]) -> Tensor:
     """Components of a result as one tensor (..., rows), for the batch of all arguments."""
     like, known = parts[0][0], [tensor for part in parts for tensor in part]
     shapes = (tensor.shape for tensor in (*known, *values) if isinstance(tensor, Tensor))
     batch = torch.broadcast_shapes(*shapes)
-    rows = (value if isinstance(value, Tensor) else like.new_tensor(value) for value in values)
+    rows = (value if isinstance(value, Tensor) else number_like(value, like) for value in values)
     return torch.stack([row.expand(batch) for row in rows], -1)
 
 

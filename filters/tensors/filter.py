@@ -15,9 +15,11 @@ from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.likelihood import likelihood
 from filters.pages.page_filter import with_page
-from filters.tensors.equations import equation_of
-from filters.tensors.stages import Draw, EnsembleStages, Stages, normals_of, root, where, wrapped_where
-from thruster_env.core.checks import as_floats, one_of, short_repr
+from filters.tensors.draws import round_keys
+from filters.tensors.equations import OfGraph, equation_of
+from filters.tensors.recursion import CompiledRecursion, Estimate, Numbers, Recursion
+from filters.tensors.stages import EnsembleStages, Stages, root, wrapped_where
+from thruster_env.core.checks import as_floats, one_of, short_repr, switch
 from thruster_env.core.sources import lower_pairs
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.programs import Place
@@ -155,6 +157,9 @@ DIMENSIONS = {"process_noise_cov": 2, "measurement_noise_cov": 2, "prior_mean": 
 """A filter's numbers, those of its model, and how many dimensions each has beside those of a batch."""
 
 
+MADE = ("_model", "_own", "_stages", "_traced", "_programs")  # again of a copy
+
+
 class TensorFilter:
     """A filter on batches of tensors, which torch differentiates; `filters.torch` makes one.
 
@@ -189,6 +194,7 @@ class TensorFilter:
         observe_jacobian: Callable | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
+        compiled: bool = False,
     ):
         """Make the filter for tensors.
 
@@ -201,16 +207,20 @@ class TensorFilter:
             observe_jacobian: dh/dx of such a function.
             dtype: torch.float64, or torch.float32.
             device: of all tensors.
+            compiled: whether `run` fuses a step's operations by `torch.compile`, once for each shape of the data.
 
         Raises:
-            ValueError: for a filter without a page or with random rotations, another dtype, or functions that are
-                to replace those of an affine approximation.
+            ValueError: for a filter without a page or with random rotations, another dtype, functions that are to
+                replace those of an affine approximation, or that are to be compiled.
         """
         if dtype not in (torch.float64, torch.float32):
             raise ValueError(f"dtype must be torch.float64 or torch.float32, but got {dtype}")
         self.filter, self._user_functions = filter_, (transition, transition_jacobian, observe, observe_jacobian)
         self._changed: dict[str, Tensor] = {}
+        self._compiled = switch("compiled", compiled)
         self._make()
+        if self._compiled and not self._traced:
+            raise ValueError("compiled=True must go with a model whose functions can be traced")
         if self._model is not filter_.model and any(self._user_functions):
             rule = "functions of tensors need a filter on the model itself"
             raise ValueError(f"{rule}, but got {filter_.name!r}, which uses an affine approximation")
@@ -224,6 +234,8 @@ class TensorFilter:
         transition, by_transition, observe, by_observe = self._user_functions
         f_equation = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
         h_equation = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
+        self._traced = all(isinstance(equation, OfGraph) for equation in (f_equation, h_equation))
+        self._programs: dict[Any, Any] = {}
         if isinstance(paged, EnsembleFilter):
             check_page_is_all(paged, "on tensors")
             self._stages: Stages = EnsembleStages(f_equation, h_equation, shape, paged.page_with())
@@ -232,7 +244,7 @@ class TensorFilter:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but graphs, which are made again."""
-        return {name: value for name, value in vars(self).items() if name not in ("_model", "_own", "_stages")}
+        return {name: value for name, value in vars(self).items() if name not in MADE}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -265,32 +277,32 @@ class TensorFilter:
             batch: its size or its shape.
             key: two whole numbers, or (..., 2) for a batch, on which an ensemble's random numbers depend.
         """
-        shape, key = (batch,) if isinstance(batch, int) else tuple(batch), np.asarray(key, dtype=np.float64)
-        if key.shape[-1:] != (2,):
-            raise ValueError(f"a key must be two whole numbers, (..., 2), but got shape {key.shape}")
+        shape, key = (batch,) if isinstance(batch, int) else tuple(batch), _checked_key(key)
         if self.filter.size:
             shape = torch.broadcast_shapes(shape, key.shape[:-1])
-        return self._prior(shape, key, 0)
+        return self._belief(self._recursion(key).prior(shape, 0), key, 0)
 
-    def _prior(self, batch: tuple[int, ...], key: np.ndarray, step: int) -> TensorBelief:
-        shape = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
+    def _recursion(self, key: np.ndarray, *, compiled: bool = False) -> Recursion:
+        """The steps with the numbers that the filter has now."""
         mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
-        prior = mean.expand(*shape, -1), self.prior_cov.expand(*shape, -1, -1)
-        mean, cov, extras = self._stages.start(self._known(), prior, self._normals(key, step))
-        return TensorBelief(
-            mean, cov, torch.zeros(shape, dtype=torch.int64, device=mean.device), extras, key, step
-        )
+        words = round_keys(key, mean.device)
+        numbers = Numbers(self._known(), mean, self.prior_cov, self.measurement_noise_cov, words)
+        arguments = self._stages, numbers, self.filter.size, self._model.substeps
+        return CompiledRecursion(*arguments, self._programs) if compiled else Recursion(*arguments)
 
-    def _normals(self, key: np.ndarray, step: int) -> Draw:
-        return normals_of(key, step, self.filter.size, self.prior_mean)
+    @staticmethod
+    def _belief(estimate: Estimate, key: np.ndarray, step: int, divergences: Tensor | None = None) -> TensorBelief:
+        if divergences is None:
+            mean = estimate.mean
+            divergences = torch.zeros(mean.shape[:-1], dtype=torch.int64, device=mean.device)
+        return TensorBelief(estimate.mean, estimate.cov, divergences, estimate.extras, key, step)
 
     def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
         """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
-        u = self._finite("u", u, (self._model.inputs,))
-        known, step = (belief.mean, belief.cov, belief.extras), belief.step + 1
-        draw, substeps = self._normals(belief.key, step), self._model.substeps
-        mean, cov, extras = self._stages.predict(self._known(), known, u, substeps, draw)
-        return TensorBelief(mean, cov, belief.divergences, extras, belief.key, step)
+        u, step = self._finite("u", u, (self._model.inputs,)), belief.step + 1
+        estimate = Estimate(belief.mean, belief.cov, belief.extras)
+        predicted = self._recursion(belief.key).predict(estimate, u, step)
+        return self._belief(predicted, belief.key, step, belief.divergences)
 
     def update(self, belief: TensorBelief, z: Any) -> tuple[TensorBelief, TensorInnovation]:
         """The belief after measurements z (..., m), NaN where missing, and the innovations.
@@ -298,21 +310,13 @@ class TensorFilter:
         A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
         """
         z = self._finite("z", z, (self._model.m,), missing_allowed=True)
-        known = belief.mean, belief.cov, belief.extras
-        draw = self._normals(belief.key, belief.step)
-        (mean, cov, extras), (v, s, level) = self._stages.update(self._known(), known, z, draw)
-        lost = ~_all_finite(mean, cov, v, s, level)
-        batch = lost.shape
-        counted = belief.divergences.expand(batch) + lost
-        if lost.any():
-            prior = self._prior(batch, belief.key, belief.step)
-            mean, v = where(lost, prior.mean, mean, 1), where(lost, torch.zeros_like(v), v, 1)
-            cov, s = where(lost, prior.cov, cov, 2), where(lost, self.measurement_noise_cov, s, 2)
-            level = torch.where(lost, 0.0, level)
-            sizes = self._stages.extra_dimensions
-            extras = {name: where(lost, prior.extras[name], extra, sizes[name]) for name, extra in extras.items()}
-        belief = TensorBelief(mean, cov, counted, extras, belief.key, belief.step)
-        return belief, TensorInnovation(v, s, level)
+        recursion, estimate = self._recursion(belief.key), Estimate(belief.mean, belief.cov, belief.extras)
+        updated = recursion.update(estimate, z, belief.step)
+        if updated.lost.any():
+            updated = recursion.restarted(updated, belief.step)
+        divergences = belief.divergences.expand(updated.lost.shape) + updated.lost
+        belief = self._belief(updated.estimate, belief.key, belief.step, divergences)
+        return belief, TensorInnovation(*updated.innovation)
 
     def run(self, inputs: Any = None, measurements: Any = None, keys: Any = None) -> TensorEstimates:
         """Filter trajectories, as `filters.run` does.
@@ -335,12 +339,11 @@ class TensorFilter:
         batch = z.shape[:-2]
         if keys is None:
             keys = filter_keys(range(prod(batch))).reshape(*batch, 2) if self.filter.size else (0, 0)
-        belief, outputs = self.init(batch, keys), []
-        for k in range(z.shape[-2]):
-            if k > 0:
-                belief = self.predict(belief, u[..., k - 1, :])
-            belief, innovation = self.update(belief, z[..., k, :])
-            outputs.append((belief.mean, belief.cov, *innovation))
+        recursion = self._recursion(_checked_key(keys), compiled=self._compiled)
+        at_once = z.device.type in SYNCHRONOUS
+        outputs, divergences = _filtered(recursion, u, z, restart=at_once)
+        if not at_once and divergences.any():
+            outputs, divergences = _filtered(recursion, u, z, restart=True)
         means, covs, values, innovation_covs, levels = zip(*outputs, strict=True)
         return TensorEstimates(
             torch.stack(means, -2),
@@ -348,7 +351,7 @@ class TensorFilter:
             torch.stack(values, -2),
             torch.stack(innovation_covs, -3),
             torch.stack(levels, -1),
-            belief.divergences,
+            divergences,
         )
 
     def log_likelihood(self, inputs: Any = None, measurements: Any = None) -> Tensor:
@@ -425,11 +428,34 @@ class TensorFilter:
         return tensor
 
 
-def _all_finite(mean: Tensor, cov: Tensor, *innovation: Tensor) -> Tensor:
-    """Which beliefs (...,) and innovations consist of finite numbers, with variances that are not negative."""
-    v, s, level = innovation
-    sums = mean.abs().sum(-1) + cov.abs().sum((-2, -1)) + v.abs().sum(-1) + s.abs().sum((-2, -1)) + level.abs()
-    return sums.isfinite() & (torch.diagonal(cov, dim1=-2, dim2=-1) >= 0).all(-1)
+def _checked_key(key: Any) -> np.ndarray:
+    key = np.asarray(key, dtype=np.float64)
+    if key.shape[-1:] != (2,):
+        raise ValueError(f"a key must be two whole numbers, (..., 2), but got shape {key.shape}")
+    return key
+
+
+SYNCHRONOUS = {"cpu"}
+"""Devices that answer at once whether a trajectory is lost; of others it is asked once a run, not in each step."""
+
+
+def _filtered(
+    recursion: Recursion, u: Tensor, z: Tensor, *, restart: bool
+) -> tuple[list[tuple[Tensor, ...]], Tensor]:
+    """Mean, covariance, innovation, S and log density of each step, and how often each trajectory is lost."""
+    outputs: list[tuple[Tensor, ...]] = []
+    inputs, measurements = (tensor.movedim(-2, 0).contiguous().unbind() for tensor in (u, z))
+    for k, measurement in enumerate(measurements):
+        if k == 0:
+            step = recursion.first(measurement)
+            divergences = torch.zeros_like(step.lost, dtype=torch.int64)
+        else:
+            step = recursion.step(step.estimate, inputs[k - 1], measurement, k)
+        if restart and step.lost.any():
+            step = recursion.restarted(step, k)
+        divergences = divergences + step.lost
+        outputs.append((step.estimate.mean, step.estimate.cov, *step.innovation))
+    return outputs, divergences
 
 
 def _is(tensor: Tensor, value: Any) -> bool:

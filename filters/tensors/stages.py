@@ -6,7 +6,9 @@ An operation without a rule here, such as a function of the model, computes on t
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -22,11 +24,12 @@ from filters.pages.kernels import Stage, stages_of
 from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as members_stages
 from filters.pages.page import NumbersMemory, Page, RowMemory
+from filters.tensors.draws import Draw
 from thruster_env.core.angles import TURN
 from thruster_env.core.matrices import RESOLUTION
-from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, normal_block
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import LANES, Shape, padded
+from thruster_env.model.shape import Shape
 
 # Values of a page's matrices: a batch of tensors (..., rows, columns) for each matrix.
 
@@ -46,15 +49,18 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
                 _argument_value(a, matrix, values) if isinstance(a, Matrix) else a for a in matrix.arguments
             )
             if matrix.operation in CONSTANT:
-                size = matrix.arguments[0].shape
-                values[matrix] = torch.as_tensor(matrix.operation.compute(np.zeros(size)), dtype=like.dtype).to(
-                    like.device
-                )
+                values[matrix] = _constant(matrix.operation, matrix.arguments[0].shape, like.dtype, like.device)
             elif matrix.operation in OF_SHAPE:
                 values[matrix] = OF_SHAPE[matrix.operation](len(matrix.shape) + matrix.member, *arguments)
             else:
                 values[matrix] = RULES.get(matrix.operation, matrix.operation.compute)(*arguments)
     return values
+
+
+@functools.lru_cache(maxsize=256)
+def _constant(operation: Operation, size: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The value of an operation of `CONSTANT`, copied to the device once."""
+    return torch.as_tensor(operation.compute(np.zeros(size)), dtype=dtype).to(device)
 
 
 def _argument_value(a: Matrix, result: Matrix, values: Mapping[Matrix, Any]) -> Any:
@@ -67,14 +73,43 @@ def _wrapped(x: Tensor) -> Tensor:
     return x - TURN * torch.ceil((x - math.pi) / TURN)
 
 
+SMALL, INNER = 3, 4
+"""Sizes up to which factors and products are written out: libraries are slow at batches of small matrices."""
+
+
 def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
-    return a @ b if dimensions == 2 else (a @ b[..., None])[..., 0]
+    return _matrix_product(a, b) if dimensions == 2 else _matrix_product(a, b[..., None])[..., 0]
+
+
+def _matrix_product(a: Tensor, b: Tensor) -> Tensor:
+    """A B; a short sum is written out, as factors of small matrices are."""
+    if a.shape[-1] > INNER:
+        return a @ b
+    terms = (a[..., :, k, None] * b[..., k, None, :] for k in range(a.shape[-1]))
+    return functools.reduce(operator.add, terms)
 
 
 def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
+    if root.shape[-1] <= SMALL:
+        rows = c if dimensions == 2 else c[..., None, :]
+        solution = _right_quotient(_right_quotient(rows, root, transposed=True), root)
+        return solution if dimensions == 2 else solution[..., 0, :]
     right = c.mT if dimensions == 2 else c[..., None]
     solution = torch.cholesky_solve(right, root)
     return solution.mT if dimensions == 2 else solution[..., 0]
+
+
+def _right_quotient(a: Tensor, lower: Tensor, *, transposed: bool = False) -> Tensor:
+    """A L^-1, or A L'^-1 if transposed, column by column."""
+    size = lower.shape[-1]
+    columns: list[Any] = [None] * size
+    for j in range(size) if transposed else reversed(range(size)):
+        rest = a[..., j]
+        for k in range(j) if transposed else range(j + 1, size):
+            factor = lower[..., j, k] if transposed else lower[..., k, j]
+            rest = rest - factor[..., None] * columns[k]
+        columns[j] = rest / lower[..., j, j, None]
+    return torch.stack(columns, -1)
 
 
 def wrapped_where(x: Tensor, angles: tuple[bool, ...]) -> Tensor:
@@ -92,8 +127,13 @@ def _on_one_side(dimensions: int, y: Tensor, angles: tuple[bool, ...]) -> Tensor
 
 
 def _flags(dimensions: int, angles: tuple[bool, ...], like: Tensor) -> Tensor:
-    flags = torch.tensor(angles, device=like.device)
+    flags = _flags_on(tuple(angles), like.device)
     return flags if dimensions == 1 else flags[:, None]
+
+
+@functools.lru_cache(maxsize=256)
+def _flags_on(angles: tuple[bool, ...], device: torch.device) -> Tensor:
+    return torch.tensor(angles, device=device)
 
 
 def _symmetric(a: Tensor) -> Tensor:
@@ -107,8 +147,22 @@ def _uncorrelated(mask: Tensor, r: Tensor) -> Tensor:
 
 def factor(s: Tensor) -> Tensor:
     """The lower triangular L with L L' = s; NaN where s is not positive definite."""
+    if s.shape[-1] <= SMALL:
+        return _small_factor(s)
     lower, failed = torch.linalg.cholesky_ex(s)
     return torch.where((failed == 0)[..., None, None], lower, math.nan)
+
+
+def _small_factor(s: Tensor) -> Tensor:
+    columns: list[Tensor] = []
+    for j in range(s.shape[-1]):
+        rest = s[..., j:, j]
+        for column in columns:
+            rest = rest - column[..., j:] * column[..., j, None]
+        pivot = rest[..., :1]
+        below = rest / torch.where(pivot > 0, pivot, math.nan).sqrt()
+        columns.append(torch.nn.functional.pad(below, (j, 0)))
+    return torch.stack(columns, dim=-1)
 
 
 def density(v: Tensor, root: Tensor, mask: Tensor) -> Tensor:
@@ -119,6 +173,8 @@ def density(v: Tensor, root: Tensor, mask: Tensor) -> Tensor:
 
 
 def _forward_quotient(lower: Tensor, v: Tensor) -> Tensor:
+    if lower.shape[-1] <= SMALL:
+        return _right_quotient(v[..., None, :], lower, transposed=True)[..., 0, :]
     return torch.linalg.solve_triangular(lower, v[..., None], upper=False)[..., 0]
 
 
@@ -172,7 +228,7 @@ def _hats(u: Tensor, nodes: Tensor) -> Tensor:
 
 
 def _covariance(x: Tensor, y: Tensor) -> Tensor:
-    return _deviations(x) @ _deviations(y).mT / (x.shape[-1] - 1)
+    return _matrix_product(_deviations(x), _deviations(y).mT) / (x.shape[-1] - 1)
 
 
 def _deviations(x: Tensor) -> Tensor:
@@ -220,7 +276,7 @@ RULES: dict[Operation, Callable] = {
     matrices.transposed: lambda a: a.mT,
     matrices.reciprocal: _reciprocal,
     operations.mirrored: _symmetric,
-    operations.congruence: lambda a, p, pa: _symmetric(a @ pa),
+    operations.congruence: lambda a, p, pa: _symmetric(_matrix_product(a, pa)),
     operations.present: lambda z: z == z,
     operations.uncorrelated: _uncorrelated,
     operations.factor: factor,
@@ -229,7 +285,7 @@ RULES: dict[Operation, Callable] = {
     densities.dot: lambda a, b: (a * b).sum(-1),
     points.root: root,
     points.outer: lambda a, b: a[..., :, None] * b[..., None, :],
-    points.square: lambda a: a @ a.mT,
+    points.square: lambda a: _matrix_product(a, a.mT),
     points.first: lambda a: a[..., 0],
     points.without_first: lambda a: a[..., 1:],
     scalars.choose: torch.where,
@@ -263,7 +319,6 @@ RULES: dict[Operation, Callable] = {
 
 
 NORMALS = Place("draws", 0)
-Draw = Callable[[int, int], Tensor]
 
 
 class Equation(Protocol):
@@ -330,19 +385,6 @@ class _Part:
     def __call__(self, tensors: Mapping[Place, Tensor], like: Tensor) -> dict[Place, Tensor]:
         values = work_out(self._order, {matrix: tensors[matrix.operation] for matrix in self.inputs}, like)
         return {target: values[matrix] for target, matrix in self._wanted.items()}
-
-
-def normals_of(key: np.ndarray, step: int, size: int, like: Tensor) -> Draw:
-    """A function that draws normals (..., rows, size) of a stream for keys (..., 2), those of `filters.run`."""
-    width = padded(size, LANES)
-
-    def draw(stream: int, rows: int) -> Tensor:
-        words = (key[..., k, None] for k in range(2))
-        normals = np.stack(normal_block(np.arange(rows * width // 4), step, stream, *words), axis=-1)
-        normals = normals.reshape(*key.shape[:-1], rows, width)[..., :size]
-        return torch.as_tensor(normals, dtype=like.dtype, device=like.device)
-
-    return draw
 
 
 class Stages:
