@@ -15,13 +15,12 @@ import multiprocessing
 import os
 import platform
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import perf_counter, time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -354,106 +353,183 @@ PROGRAMS: dict[str, Callable[[Case], Callable]] = {
 
 def cases(device: str, quick: bool) -> Iterator[Case]:
     """What is measured, the most informative first, for time may run out."""
-    sizes = (32,) if quick else (SIZES[3], SIZES[0], SIZES[2], SIZES[1])
-    for size in sizes:
-        for gradient in (False, True):
-            if gradient and size == SIZES[1]:
-                continue
+    if quick:
+        for kind in KINDS:
+            for gradient in (False, True):
+                yield from _of_size(kind, 32, gradient, (False, True), device)
+        return
+    for size, singles, gradients in (
+        (SIZES[3], (False, True), (False, True)),
+        (SIZES[0], (False,), (False, True)),
+        (SIZES[2], (False,), (False,)),
+    ):
+        for gradient in gradients:
             for kind in KINDS:
-                members = MEMBERS if kind == "enkf" else 0
-                batch = size // 10 if members and not quick else size
-                programs = ("eager", "compiled", *PEERS[kind])
-                for single in (False, True):
-                    for program in programs:
-                        yield Case(kind, program, batch, members, single, gradient, device)
-                if not (members and gradient):
-                    yield Case(kind, "machine code", batch, members, False, gradient, "cpu")
-    for members in (64,) if quick else SIZES[::-1]:
+                yield from _of_size(kind, size, gradient, singles, device)
+    for members in SIZES[::-1]:
         for single in (False, True):
             for program in ("eager", "compiled", "cuthbert"):
-                yield Case("enkf", program, 1, members, single, False, device)
+                if program == "eager" or members in (SIZES[3], SIZES[1]) and not single:
+                    yield Case("enkf", program, 1, members, single, False, device)
         yield Case("enkf", "machine code", 1, members, False, False, "cpu")
+    for kind in KINDS:
+        for case in _of_size(kind, SIZES[1], False, (False,), device):
+            if case.program in ("eager", "machine code", "torch-kf"):
+                yield case
 
 
-def measured(case: Case, seconds: float = 0.6, repetitions: int = 7) -> dict[str, Any]:
-    """A row: the median time of some runs within so many seconds, or the reason why there is none."""
+def _of_size(kind: str, size: int, gradient: bool, singles: tuple[bool, ...], device: str) -> Iterator[Case]:
+    members = MEMBERS if kind == "enkf" else 0
+    batch = max(size // 10, 32) if members else size
+    for single in singles:
+        for program in ("eager", "compiled", *PEERS[kind]):
+            if program == "compiled" and gradient and members and (single or size < SIZES[1]):
+                continue  # some minutes of compilation
+            yield Case(kind, program, batch, members, single, gradient, device)
+    if not (members and gradient):
+        yield Case(kind, "machine code", batch, members, False, gradient, "cpu")
+
+
+class Prepared(NamedTuple):
+    """A case that has run once.
+
+    Attributes:
+        call: runs it once more; None if it cannot.
+        row: its row without times.
+    """
+
+    call: Callable | None
+    row: dict[str, Any]
+
+
+def prepared(case: Case) -> Prepared:
+    """Run a case for the first time, or state why it cannot run."""
     row: dict[str, Any] = {**case._asdict(), "steps": STEPS}
-    package = case.program.replace("-", "_")
-    if case.program in ("dynamax", "cuthbert", "torch-kf") and find_spec(package) is None:
-        return row | {"skipped": f"{case.program} is not installed"}
+    if case.program in ("dynamax", "cuthbert", "torch-kf"):
+        if find_spec(case.program.replace("-", "_")) is None:
+            return Prepared(None, row | {"skipped": f"{case.program} is not installed"})
+        if case.program != "torch-kf":
+            _cached_jax(case)
     try:
         begin = perf_counter()
         call = PROGRAMS[case.program](case)
         values = call()
-        expected = data_of(case.kind).log_likelihoods[: len(values)]
-        deviation = float(np.max(np.abs(values - expected)) / np.max(np.abs(expected)))
         first = perf_counter() - begin
-        times: list[float] = []
+    except Exception as error:  # a row that fails says so, and the others go on
+        return Prepared(None, row | {"skipped": _reason(error)})
+    expected = data_of(case.kind).log_likelihoods[: len(values)]
+    deviation = float(np.max(np.abs(values - expected)) / np.max(np.abs(expected)))
+    return Prepared(call, row | {"first_seconds": first, "deviation": deviation})
+
+
+def timed(case: Prepared, seconds: float = 0.6, repetitions: int = 7) -> dict[str, Any]:
+    """A row with the median time of some runs, after one more that does not count."""
+    call, row = case
+    if call is None:
+        return row
+    times: list[float] = []
+    try:
         call()
         while len(times) < repetitions and (len(times) < 3 or sum(times) < seconds):
             begin = perf_counter()
             call()
             times.append(perf_counter() - begin)
-    except Exception as error:  # noqa: BLE001 - a row that fails says so, and the others go on
-        text = str(error).splitlines()[0][:120] if str(error) else ""
-        memory = any(part in f"{type(error).__name__} {error}" for part in ("OutOfMemory", "RESOURCE_EXHAUSTED"))
-        return row | {"skipped": "out of memory" if memory else f"{type(error).__name__}: {text}"}
-    return row | {
-        "seconds": median(times),
-        "first_seconds": first,
-        "steps_per_second": case.batch * STEPS * max(case.members, 1) / median(times),
-        "deviation": deviation,
-    }
+    except Exception as error:
+        return row | {"skipped": _reason(error)}
+    steps = row["batch"] * STEPS * max(row["members"], 1)
+    return row | {"seconds": median(times), "steps_per_second": steps / median(times)}
+
+
+def _reason(error: Exception) -> str:
+    if any(part in f"{type(error).__name__} {error}" for part in ("OutOfMemory", "RESOURCE_EXHAUSTED")):
+        return "out of memory"
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"
 
 
 def released() -> None:
     """Give memory back that the last row used."""
-    import torch
-
     gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
+    if find_spec("torch") is not None:
+        import torch
 
-
-def warm_up(case: Case) -> None:
-    """Compile what a case needs, so that it is in the caches of the disk."""
-    import torch
-
-    torch.set_num_threads(1)
-    if case.program in ("dynamax", "cuthbert"):
-        _cached_jax(case)
-    measured(case, seconds=0.0, repetitions=0)
-    released()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
 
 
 def _cached_jax(case: Case) -> None:
-    if find_spec("jax") is None:
-        return
+    """JAX, with programs that processes compiled before in the cache on the disk."""
     jax = _jax(case)
     jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", "/tmp/jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def _work(wanted: list[Case], until: float, connection: Any) -> None:
+    """Compile cases until a time, say so, wait, and then time those of torch, which cannot leave the process."""
+    import torch
+
+    torch.set_num_threads(1)
+    ready = []
+    for case in wanted:
+        if time() < until:
+            case_ready = prepared(case)
+            print(*case, case_ready.row.get("skipped") or f"{case_ready.row['first_seconds']:.0f} s", flush=True)
+            ready.append(case_ready if case.program == "compiled" else None)
+        elif case.program == "compiled":
+            ready.append(Prepared(None, {**case._asdict(), "steps": STEPS, "skipped": "not compiled in time"}))
+        released()
+    connection.send("ready")
+    connection.recv()
+    connection.send([timed(case) for case in ready if case is not None])
+
+
+def _compiled_rows(wanted: list[Case], processes: int, seconds: float) -> list[dict[str, Any]]:
+    """Rows of the compiled cases, compiled in several processes and timed one after another."""
+    context, workers = multiprocessing.get_context("spawn"), []
+    ours = [case for case in wanted if case.program == "compiled"]
+    peers = [case for case in wanted if case.program != "compiled"]
+    of_peers = max(processes // 4, 1)
+    shares = [peers[k::of_peers] for k in range(of_peers)]
+    shares += [ours[k :: processes - of_peers] for k in range(processes - of_peers)]
+    for share in shares:
+        mine, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(share, time() + seconds, theirs), daemon=True)
+        process.start()
+        theirs.close()
+        workers.append((process, mine))
+    latest = time() + 1.5 * seconds
+    answered = [mine for _, mine in workers if _received(mine, latest - time()) is not None]
+    rows: list[dict[str, Any]] = []
+    for mine in answered:
+        mine.send("go")
+        rows += _received(mine, 60.0) or []
+    for process, _ in workers:
+        process.terminate()
+    return rows
+
+
+def _received(connection: Any, seconds: float) -> Any:
+    """What a process sends within so many seconds; None if it does not, or has ended."""
+    try:
+        return connection.recv() if connection.poll(max(seconds, 0.0)) else None
+    except EOFError:
+        return None
+
+
 def measure(device: str, quick: bool, seconds: float, processes: int) -> Iterator[dict[str, Any]]:
-    """Rows of all cases, for so many seconds; compiled programs are first compiled in several processes."""
+    """Rows of all cases, for so many seconds; with several processes these compile beforehand."""
     begin, wanted = perf_counter(), list(cases(device, quick))
     if processes:
-        compiling = [
-            case for case in wanted if case.program in ("compiled", "dynamax", "cuthbert", "machine code")
-        ]
-        with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), max_tasks_per_child=12) as pool:
-            for future in [pool.submit(warm_up, case) for case in compiling]:
-                if future.exception() is not None:
-                    print(f"warm-up: {future.exception()}", flush=True)
-        print(f"compiled after {perf_counter() - begin:.0f} s", flush=True)
+        slow = [case for case in wanted if case.program in ("compiled", "dynamax", "cuthbert")]
+        slow.sort(key=lambda case: (case.program != "compiled", not case.gradient))
+        yield from _compiled_rows(slow, processes, 0.4 * seconds)
+        wanted = [case for case in wanted if case.program != "compiled"]
+        print(f"compiled and timed after {perf_counter() - begin:.0f} s", flush=True)
     for case in wanted:
         if perf_counter() - begin > seconds:
             yield {**case._asdict(), "steps": STEPS, "skipped": "time ran out"}
             continue
-        if case.program in ("dynamax", "cuthbert"):
-            _cached_jax(case)
-        yield measured(case)
+        yield timed(prepared(case))
         released()
 
 
