@@ -3,7 +3,13 @@
 Each row is one program for one filter, size, precision and direction: the median time of several runs after a
 warm-up, which waits for the device. Log-likelihoods are compared with those of `filters.run` in float64. All
 programs return means, covariances and log-likelihoods; with gradients, also the gradient of the summed negative
-log-likelihood along Q and R. Nothing of it is imported by the package, and peers may be missing.
+log-likelihood along Q and R. JAX keeps the memory that it had, so on one card
+
+    python -m benchmarks.gpu --out build/gpu --programs eager,compiled,torch-kf,"machine code" --processes 12
+    python -m benchmarks.gpu --out build/gpu --programs dynamax,cuthbert
+
+measures in two processes, and `--table build/gpu/gpu.json` prints the tables of docs/speed.md. Nothing of it is
+imported by the package, and peers may be missing.
 """
 
 from __future__ import annotations
@@ -516,9 +522,9 @@ def _received(connection: Any, seconds: float) -> Any:
         return None
 
 
-def measure(device: str, quick: bool, seconds: float, processes: int) -> Iterator[dict[str, Any]]:
-    """Rows of all cases, for so many seconds; with several processes these compile beforehand."""
-    begin, wanted = perf_counter(), list(cases(device, quick))
+def measure(wanted: list[Case], seconds: float, processes: int) -> Iterator[dict[str, Any]]:
+    """Rows of cases, for so many seconds; with several processes these compile beforehand."""
+    begin = perf_counter()
     if processes:
         slow = [case for case in wanted if case.program in ("compiled", "dynamax", "cuthbert")]
         slow.sort(key=lambda case: (case.program != "compiled", not case.gradient))
@@ -556,6 +562,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
     parser.add_argument("--seconds", type=float, default=420.0, help="after which no further row is measured")
     parser.add_argument("--processes", type=int, default=0, help="that compile beforehand")
+    parser.add_argument(
+        "--programs",
+        metavar="NAMES",
+        default=",".join(PROGRAMS),
+        help="to measure; JAX's separately, for it keeps memory",
+    )
     parser.add_argument("--table", type=Path, metavar="FILE", help="print the table of such a gpu.json")
     chosen = parser.parse_args(arguments)
     if chosen.table:
@@ -566,8 +578,11 @@ def main(arguments: list[str] | None = None) -> None:
     if chosen.out is None:
         parser.error("--out must be a folder, but got none")
     chosen.out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
-    for row in measure(chosen.device, chosen.quick, chosen.seconds, chosen.processes):
+    target, programs = chosen.out / "gpu.json", chosen.programs.split(",")
+    before = json.loads(target.read_text())["rows"] if target.exists() else []
+    rows = [row for row in before if row["program"] not in programs]
+    wanted = [case for case in cases(chosen.device, chosen.quick) if case.program in programs]
+    for row in measure(wanted, chosen.seconds, chosen.processes):
         rows.append(row)
         result = row.get("skipped") or f"{row['steps_per_second']:.3g}/s, off by {row['deviation']:.1g}"
         precision = "float32" if row["single"] else "float64"
@@ -575,7 +590,7 @@ def main(arguments: list[str] | None = None) -> None:
         what = row["kind"], row["program"], row["batch"], row["members"], precision, direction
         print(*what, result, f"first {row.get('first_seconds', 0.0):.1f} s", flush=True)
         content = {"machine": facts(chosen.device), "rows": rows}
-        (chosen.out / "gpu.json").write_text(json.dumps(content, indent=1) + "\n")
+        target.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.timing import rounded
 from thruster_env.core.text_tables import markdown_table
 
 NAMES = {"kf": "KF, 4 states", "ekf": "EKF", "ukf": "UKF", "enkf": "EnKF"}
@@ -33,6 +34,8 @@ def speeds(rows: Sequence[dict[str, Any]]) -> str:
     """Millions of steps per second, float64 / float32, a column for each program."""
     programs = list(dict.fromkeys(row["program"] for row in rows))
     programs = [*(name for name in OURS if name in programs), *(name for name in programs if name not in OURS)]
+    if not rows:
+        return ""
     cells = {(_key(row), row["program"], row["single"]): _cell(row) for row in rows}
     lines = []
     for key in sorted({_key(row) for row in rows}, key=lambda key: (list(NAMES).index(key[0]), *key[1:])):
@@ -54,7 +57,7 @@ def _cell(row: dict[str, Any]) -> str:
     if "skipped" in row:
         return "-"
     trajectories = row["steps_per_second"] / (max(row["members"], 1) if row["batch"] > 1 else 1)
-    return f"{trajectories / 1e6:.3g}"
+    return f"{'≥ ' if row.get('lower_bound') else ''}{rounded(trajectories / 1e6)}"
 
 
 def skipped_lines(rows: Sequence[dict[str, Any]]) -> str:

@@ -2,7 +2,9 @@
 
 algebra     what pages of filters say, of tensors (..., rows, columns)
 equations   a model's functions and their Jacobians, of tensors
+draws       an ensemble's random numbers, on the device
 stages      a page as functions of tensors
+recursion   a filter's steps for one set of numbers, as they stand or compiled
 filter      `TensorFilter`: init, predict, update, run, and the likelihood by the compiled recursion
 """
 

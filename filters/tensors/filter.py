@@ -339,7 +339,7 @@ class TensorFilter:
         batch = z.shape[:-2]
         if keys is None:
             keys = filter_keys(range(prod(batch))).reshape(*batch, 2) if self.filter.size else (0, 0)
-        recursion = self._recursion(_checked_key(keys), compiled=self._compiled)
+        recursion = self._recursion(_checked_key(keys), compiled=bool(self._compiled))
         at_once = z.device.type in SYNCHRONOUS
         outputs, divergences = _filtered(recursion, u, z, restart=at_once)
         if not at_once and divergences.any():

@@ -99,7 +99,9 @@ class CompiledRecursion(Recursion):
     The operations on tensors are recorded once, without the Python that issues them, and then fused.
     """
 
-    def __init__(self, stages: Stages, numbers: Numbers, size: int, substeps: int, programs: dict[Any, Callable]):
+    def __init__(
+        self, stages: Stages, numbers: Numbers, size: int, substeps: int, programs: dict[Any, tuple[Callable, Any]]
+    ):
         """Take the stages of a page, and programs by name and shapes, to which further ones are added."""
         super().__init__(stages, numbers, size, substeps)
         self._programs = programs

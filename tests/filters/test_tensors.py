@@ -354,3 +354,36 @@ def test_the_rest_of_filters_does_not_import_torch():
     code = "import sys, filters; filters.torch; print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_lost_trajectory_restarts_where_that_is_asked_once_a_run(monkeypatch):
+    """As on a GPU: the run without restarts is repeated with them."""
+    filter_, inputs, z = diverging("ekf")
+    expected = filters.torch(filter_).run(inputs, z)
+    monkeypatch.setattr("filters.tensors.filter.SYNCHRONOUS", set())
+    assert expected.divergences.any()
+    assert_same(filters.torch(filter_).run(inputs, z), [part.numpy() for part in expected])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_compiled_steps_have_the_estimates_and_gradients_of_others(name):
+    filter_ = made(name, scalar_model())
+    inputs, z = simulated(filter_.model, 3, count=3, missing=0.3)
+    results = []
+    for compiled in (False, True):
+        tensors = filters.torch(filter_, compiled=compiled)
+        q = tensors.process_noise_cov.clone().requires_grad_()
+        estimates = tensors.replace(process_noise_cov=q).run(inputs, z)
+        (gradient,) = torch.autograd.grad(estimates.log_likelihoods.sum(), q)
+        results.append([*(part.detach().numpy() for part in estimates), gradient.numpy()])
+    assert_same(*results)
+
+
+def test_only_functions_that_can_be_traced_are_compiled():
+    def drift(x, u, c):
+        return (torch.tanh(x[0]),)
+
+    with pytest.raises(ValueError, match="compiled=True must go with a model whose functions can be traced"):
+        filters.torch(made("ekf", scalar_model()), transition=drift, compiled=True)
