@@ -147,20 +147,6 @@ def in_body_axes_tangent(attitude, d_attitude, psi, d_psi, vector, d_vector):
     )
 
 
-@inlined
-def planar_kinematics(nu, psi):
-    """The papers' rates of x, y, z [m/s] and psi [rad/s], which turn by yaw alone.
-
-        x' = u cos psi - v sin psi,  y' = u sin psi + v cos psi,  z' = w,  psi' = r
-
-    True for phi = theta = 0 only: a vehicle that dives by pitching stays at its depth here. Source: Ngatini,
-    Nurhadi (2019), equations 1 to 4.
-    """
-    u, v, w, _, _, r = nu
-    c_psi, s_psi = cosine_and_sine(psi)
-    return u * c_psi - v * s_psi, u * s_psi + v * c_psi, w, r
-
-
 # The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
 
 

@@ -70,7 +70,6 @@ def check_finite(what: str, *parts: np.ndarray) -> None:
 # `ReplayEnv`: a recorded run as a Gymnasium env, for filter wrappers as any other env.
 
 
-ID = "Replay-v0"
 ANY_DT = 0.01  # [s], of a model that is asked for its quantities before the sample time of the log is known
 
 

@@ -8,10 +8,10 @@ from thruster_env.auv.dynamics import (
     down,
     in_body_axes,
     in_earth_axes,
-    planar_kinematics,
 )
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.streams import cosine_and_sine
+from tuning.experiments.vehicle.estimators import planar_kinematics
 
 
 def random_angles(count=100):

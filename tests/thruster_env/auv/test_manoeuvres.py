@@ -11,13 +11,13 @@ from thruster_env.auv.dynamics import (
     motion_rates,
     motion_rates_tangent,
     navigation_substep,
-    planar_kinematics,
     required_substeps,
     top_speed,
     velocity_rates_tangent,
 )
 from thruster_env.auv.parameters import derive_constants
 from thruster_env.auv.presets import LAUV, PRESETS, REMUS100, REMUS100_PRESTERO, SEGOROGENI, SEGOROGENI_PAPERS
+from tuning.experiments.vehicle.estimators import planar_kinematics
 
 THRUST, TORQUE, DEGREE = 2.845, -0.017, math.pi / 180
 C = derive_constants(SEGOROGENI)

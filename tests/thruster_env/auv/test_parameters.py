@@ -5,7 +5,7 @@ import pytest
 
 from tests.thruster_env.auv.textbook import random_states, without_drag_and_lift
 from thruster_env.auv.forces import forces
-from thruster_env.auv.parameters import PRINTED_INVERSE, VehicleParameters, checked, derive_constants, mass_matrix
+from thruster_env.auv.parameters import VehicleParameters, checked, derive_constants, mass_matrix
 from thruster_env.auv.presets import (
     LAUV,
     PRESETS,
@@ -17,6 +17,7 @@ from thruster_env.auv.presets import (
     preset_parameters,
     recipe,
 )
+from tuning.experiments.vehicle.tables import PRINTED_INVERSE
 
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)
 

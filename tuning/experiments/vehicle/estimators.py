@@ -21,9 +21,10 @@ from filters.engine.belief import Kernels, memory_places
 from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
-from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes, planar_kinematics
+from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.streams import cosine_and_sine
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_model
@@ -258,3 +259,16 @@ def fuzzy(world: str = "vehicle") -> list[Estimator]:
         Estimator("fuzzy 0..1 own", FuzzyKalmanFilter(model=model, offsets=False, blending="output", **bounds)),
         Estimator("fuzzy narrow offsets", FuzzyKalmanFilter(model=model, **narrow)),
     ]
+
+
+def planar_kinematics(nu, psi):
+    """The papers' rates of x, y, z [m/s] and psi [rad/s], which turn by yaw alone.
+
+        x' = u cos psi - v sin psi,  y' = u sin psi + v cos psi,  z' = w,  psi' = r
+
+    True for phi = theta = 0 only: a vehicle that dives by pitching stays at its depth here. Source: Ngatini,
+    Nurhadi (2019), equations 1 to 4.
+    """
+    u, v, w, _, _, r = nu
+    c_psi, s_psi = cosine_and_sine(psi)
+    return u * c_psi - v * s_psi, u * s_psi + v * c_psi, w, r
