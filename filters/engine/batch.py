@@ -136,10 +136,9 @@ def trajectories(
         raise ValueError(f"{rule}, but got {keys.shape}, {inputs.shape}, {z.shape}")
     count, times, m = z.shape
     if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
-        raise ValueError(
-            f"inputs and measurements must have shapes {(count, times - 1, model.inputs)} and "
-            f"{(count, times, model.m)}, but got {inputs.shape} and {z.shape}"
-        )
+        shapes = f"{(count, times - 1, model.inputs)} and {(count, times, model.m)}"
+        rule = f"inputs and measurements must have shapes {shapes}"
+        raise ValueError(f"{rule}, but got {inputs.shape} and {z.shape}")
     if not np.isfinite(inputs).all() or np.isinf(z).any():
         raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
     if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():

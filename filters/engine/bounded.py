@@ -105,13 +105,11 @@ def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpre
 
 def _constraint(n: int, mean: int, cov: int, bounds: tuple[Bound, ...], bounded_by: str) -> Callable:
     """The function that constrains the mean and the covariance at these offsets of a row."""
-    return (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, cov, bounds)
+    states, low, high = (tuple(getattr(bound, name) for bound in bounds) for name in ("place", "low", "high"))
+    return (_truncation if bounded_by == TRUNCATION else _projection)(n, mean, cov, states, low, high)
 
 
-def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
-    states = tuple(bound.place for bound in bounds)
-    low, high = tuple(bound.low for bound in bounds), tuple(bound.high for bound in bounds)
-
+def _truncation(n: int, mean: int, cov: int, states: tuple, low: tuple, high: tuple) -> Callable:
     @inlined
     def constrain(row):
         # A state's bounds act as a Gaussian factor: a precision and an information. The cavity is without it.
@@ -143,10 +141,7 @@ def _truncation(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Calla
     return constrain
 
 
-def _projection(n: int, mean: int, cov: int, bounds: tuple[Bound, ...]) -> Callable:
-    states = tuple(bound.place for bound in bounds)
-    low, high = tuple(bound.low for bound in bounds), tuple(bound.high for bound in bounds)
-
+def _projection(n: int, mean: int, cov: int, states: tuple, low: tuple, high: tuple) -> Callable:
     @inlined
     def constrain(row):
         forces = np.zeros(len(states))  # x = x_f + P (the forces at the bounds), each zero or at its bound

@@ -290,10 +290,8 @@ def checked_corners(model: StateSpaceModel, low: Any, high: Any, premises: Any) 
         low = model.prior_mean - model.scales if low is None else low
         high = model.prior_mean + model.scales if high is None else high
     if low is None or high is None:
-        raise ValueError(
-            "a fuzzy filter must know the range of the states, but got neither low and high nor "
-            "a model with state_low and state_high"
-        )
+        rule = "a fuzzy filter must know the range of the states"
+        raise ValueError(f"{rule}, but got neither low and high nor a model with state_low and state_high")
     low, high = vector("low", low, model.n), vector("high", high, model.n)
     if not (low < high).all():
         raise ValueError(

@@ -26,14 +26,7 @@ from thruster_env.graphs.graphs import Number, needed_by
 
 ARRAYS = ("rows", "change", "numbers", "move")  # arguments of programs with derivatives
 OF_STEPS = ("rows", "given", "numbers")  # arguments of programs that run a filter
-OF_MEMBERS = (
-    "rows",
-    "given",
-    "numbers",
-    "table",
-    "draws",
-    "size",
-)  # arguments of programs with loops over members
+OF_MEMBERS = ("rows", "given", "numbers", "table", "draws", "size")  # those of programs with loops over members
 BY_MEMBERS = ("table", "draws")  # of these, those with a row for each number and a column for each member
 SIDE_BY_SIDE = ("rows", "change", "given")  # of all, those with a number for each run at each place
 SPECIAL = {

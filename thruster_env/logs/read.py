@@ -267,10 +267,8 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     back = np.flatnonzero(steps <= 0 if doubled else steps < 0)
     if len(back):
         row = int(back[0]) + 1
-        raise ValueError(
-            f"times must increase from row to row, but {follows(clocked[row - 1], clocked[row])} in "
-            f"{table.location(row, column.header)}"
-        )
+        order, where = follows(clocked[row - 1], clocked[row]), table.location(row, column.header)
+        raise ValueError(f"times must increase from row to row, but {order} in {where}")
     count = (clocked[-1] - clocked[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
         rule = f"a log must be at most {MOST_STEPS} steps long"

@@ -85,9 +85,8 @@ class Table:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 has_comma = texts[row].count(",") == 1 and _is_number(texts[row].replace(",", "."))
                 rule = "columns must hold numbers" + ", with decimal points" * has_comma
-                raise ValueError(
-                    f"{rule}, but got {short_repr(cells[row])} in {self.location(row, column)}"
-                ) from None
+                where = self.location(row, column)
+                raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}") from None
         if np.isinf(numbers).any():
             row = int(np.argmax(np.isinf(numbers)))
             raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.location(row, column)}")
