@@ -141,9 +141,7 @@ def _fast(table: BollardTable) -> np.ndarray:
 
 
 FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")
-SMALL_ERROR = (
-    0.02  # relative; larger errors are errors of the model, and are weighted linearly, not by their square
-)
+SMALL_ERROR = 0.02  # relative; larger ones are the model's, and are weighted linearly, not by their square
 DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
 
 
@@ -235,28 +233,15 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
 
     def errors(numbers):
         guess = predict(identified_by(numbers), rows)
-        return np.concatenate(
-            [
-                np.log(guess.thrust_from_speed / rows.thrust),
-                np.log(guess.thrust / rows.thrust),
-                np.log(guess.current_from_speed / rows.current),
-            ]
-        )
+        thrusts = guess.thrust_from_speed / rows.thrust, guess.thrust / rows.thrust
+        return np.log(np.concatenate([*thrusts, guess.current_from_speed / rows.current]))
 
     start = np.array([0.5, 0.2, 0.1, 50.0, 2000.0, 0.01, 1.0])
     least = np.array([1e-3, 0.0, -0.9, 1e-3, 1.0, 0.0, 0.1])
     most = np.array([10.0, 10.0, 0.9, 1e5, 1e7, 0.9 / table.supply.max(), 10.0])
-    fit = least_squares(
-        errors,
-        start,
-        bounds=(least, most),
-        x_scale=start,
-        loss="soft_l1",
-        f_scale=SMALL_ERROR,
-        xtol=1e-12,
-        ftol=1e-12,
-        gtol=1e-12,
-    )
+    ends = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+    shape = {"bounds": (least, most), "x_scale": start, "loss": "soft_l1", "f_scale": SMALL_ERROR}
+    fit = least_squares(errors, start, **shape, **ends)
     return identified_by(fit.x)
 
 

@@ -154,19 +154,13 @@ def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
     data, table = problem.data(seeds), []
     for word, sigma in (("untuned", SIGMA.start), ("tuned", tuned_sigma())):
         for name, numbers in (("ekf", {}), ("ukf", POINTS)):
-            estimates = run(
-                make_filter(name, model(sigma), **numbers), data.filter_keys, data.inputs, data.measurements
-            )
-            other = stone_soup_means(
-                name, data.measurements, sigma, DT, DEVIATIONS, PRIOR_MEAN, PRIOR_COV, numbers
-            )
+            filter_, prior = make_filter(name, model(sigma), **numbers), (PRIOR_MEAN, PRIOR_COV)
+            estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+            other = stone_soup_means(name, data.measurements, sigma, DT, DEVIATIONS, *prior, numbers)
             squares, theirs = (_squares(means, data) for means in (estimates.means, other))
             (ours,) = rmse_intervals(squares[:, None])
-            label, runs, lost = (
-                f"{name}, {word}, sigma_a {sigma:.3g}",
-                np.sqrt(squares),
-                estimates.divergences.sum(),
-            )
+            label, runs = f"{name}, {word}, sigma_a {sigma:.3g}", np.sqrt(squares)
+            lost = estimates.divergences.sum()
             spread = float(np.median(runs)), float(runs.std(ddof=1))
             table.append(Row(label, float(np.sqrt(theirs.mean())), ours, ours.value, int(lost), *spread, ""))
             on_row(table[-1])

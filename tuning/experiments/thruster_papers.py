@@ -537,10 +537,8 @@ def all_series(*, members: int = MEMBERS, seed: int = 0) -> list[Series]:
 
 def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
     """Truth, KF and EnKF over time as PNG: a column for each noise level, a row for each case and state."""
-    cases, levels = (
-        list(dict.fromkeys(simulated.case for simulated in runs)),
-        list(dict.fromkeys(simulated.q for simulated in runs)),
-    )
+    cases = list(dict.fromkeys(simulated.case for simulated in runs))
+    levels = list(dict.fromkeys(simulated.q for simulated in runs))
     figure = new_figure((3.3 * len(levels) + 0.6, 2.15 * 2 * len(cases) + 0.6))
     axes = figure.subplots(2 * len(cases), len(levels), sharex=True, sharey="row", squeeze=False)
     tidy(axes.flat)
@@ -549,9 +547,8 @@ def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
         errors = simulated.rmse("kf"), simulated.rmse("enkf")
         for state, (label, unit) in enumerate(STATES):
             axis = axes[first + state, column]
-            for (name, line), values in zip(
-                LINES.items(), (simulated.truth, simulated.kf, simulated.enkf), strict=True
-            ):
+            drawn = simulated.truth, simulated.kf, simulated.enkf
+            for (name, line), values in zip(LINES.items(), drawn, strict=True):
                 axis.plot(simulated.time, values[:, state], label=name, **line)
             text = f"RMSE: KF {errors[0][state]:.3f}, EnKF {errors[1][state]:.3f} {unit}"
             axis.set_title(f"q = {simulated.q:g}\n{text}" if first + state == 0 else text, fontsize=9)

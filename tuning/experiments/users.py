@@ -36,23 +36,9 @@ from tuning.evaluation.evaluate import Evaluation, score_ratio
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 
-PANEL = tuple(
-    f"tests.users.{name}:problem"
-    for name in (
-        "altitude",
-        "battery",
-        "chain",
-        "compartments",
-        "geared_motor",
-        "heat_exchanger",
-        "lateral",
-        "lidar",
-        "lorenz63",
-        "pendulum",
-        "range_bearing",
-        "reactor",
-    )
-)
+PANEL_NAMES = """altitude battery chain compartments geared_motor heat_exchanger lateral lidar lorenz63 pendulum
+range_bearing reactor"""
+PANEL = tuple(f"tests.users.{name}:problem" for name in PANEL_NAMES.split())
 FILTERS = ("ekf", "ukf", "enkf", "ekf-robust")
 TRIALS = 50
 QUICK_TRIALS = 4

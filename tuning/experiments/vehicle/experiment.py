@@ -151,9 +151,7 @@ def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
 
 
 MOST_RUNS = 10_000
-AT_A_TIME = (
-    4  # runs: 31560 steps of eight states with their covariances are 23 MB a run, and Ctrl-C waits for them
-)
+AT_A_TIME = 4  # runs: 31560 steps of eight states and covariances are 23 MB a run, and Ctrl-C waits for them
 SETTLED = 2000  # steps, after which velocities are scored
 MEASURED_PLACES = tuple("uvwpqr".index(name) for name in MEASURED)
 
@@ -415,9 +413,8 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
     rows = -(-len(runs) // columns)
     side = 4.2 if columns > 1 else 7.0
     figure = new_figure((side * columns + 0.5, 0.84 * side * rows + 0.4))
-    figure.get_layout_engine().set(
-        rect=(0.0, 0.0, 1.0 - 0.5 / figure.get_figwidth(), 1.0)
-    )  # labels of depth stick out
+    width = 1.0 - 0.5 / figure.get_figwidth()  # labels of depth stick out
+    figure.get_layout_engine().set(rect=(0.0, 0.0, width, 1.0))
     for panel, drawn in enumerate(runs, start=1):
         axis = figure.add_subplot(rows, columns, panel, projection="3d")
         for label, line in drawn.positions.items():

@@ -151,9 +151,7 @@ def with_interval(estimate: Interval) -> str:
     return f"{value} [{low}, {high}]" if value else ""
 
 
-GOLDEN = math.sqrt(
-    (math.sqrt(5.0) - 1.0) / 2.0 * NOISE
-)  # P = 0.618 R where Q = R and the state itself is measured
+GOLDEN = math.sqrt((math.sqrt(5.0) - 1.0) / 2.0 * NOISE)  # P = 0.618 R: Q = R, and the state itself is measured
 MEAN_ONLY = math.sqrt(2.0 / 3.0 * NOISE)  # the same for a gain of 1/2
 NO_POSTERIOR_BOUND = (
     "The bound is the Riccati recursion along the noise-free path. The posterior Cramer-Rao bound is useless "
@@ -174,12 +172,8 @@ def statements(paper: str, results: list[PathResult]) -> list[str]:
     """Statements that compare a paper's tables with ours."""
     by_path = {result.path: result for result in results if result.world == "vehicle"}
     if paper == NGATINI2019.name:
-        return [
-            *_of_transformation(by_path["IV"]),
-            *_of_members(by_path["IV"]),
-            *_of_attitude(by_path["IV"]),
-            _of_matrix(),
-        ]
+        iv = by_path["IV"]
+        return [*_of_transformation(iv), *_of_members(iv), *_of_attitude(iv), _of_matrix()]
     (other,) = [result for result in results if result.world != "vehicle"]
     return [*_of_paths(by_path), *_of_bounds(by_path), *_of_other_world(other)]
 
@@ -355,17 +349,10 @@ def members() -> str:
     labels = [MEASUREMENTS, "EKF8", *(f"EnKF8 N={count}" for count in TABLE_III)]
     rows = []
     for label in labels:
-        scores, printed = iv.scores[label], _printed("ngatini2019", "IV", label)
-        rows.append(
-            [
-                label,
-                _row(printed.rmse[name] for name in POSE) if printed else "",
-                _row(scores.rmse("planar")),
-                _row(scores.rmse("full")),
-                with_interval(scores.nees_interval),
-                f"{printed.seconds:g}" if printed else "",
-            ]
-        )
+        scores, printed = iv.scores[label], printed_row("ngatini2019", "IV", label)
+        theirs = _row(printed.rmse[name] for name in POSE) if printed else ""
+        ours = _row(scores.rmse("planar")), _row(scores.rmse("full")), with_interval(scores.nees_interval)
+        rows.append([label, theirs, *ours, f"{printed.seconds:g}" if printed else ""])
     rows.append(["bound", "", "", _row(iv.bound.pose), "", ""])
     return markdown_table(["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
 
@@ -391,16 +378,9 @@ def paths() -> str:
         indices = [POSE.index(name) for name in names]
         errors = [_row(entry.scores.rmse(field)[indices]) for field in ("planar", "planar_both", "full")]
         printed = entry.printed
-        rows.append(
-            [
-                f"{entry.path} ({', '.join(names)})",
-                entry.label,
-                _row(printed.rmse.values()) if printed else "",
-                *errors,
-                f"{printed.seconds:.3g}" if printed else "",
-                entry.why,
-            ]
-        )
+        theirs = _row(printed.rmse.values()) if printed else ""
+        seconds = f"{printed.seconds:.3g}" if printed else ""
+        rows.append([f"{entry.path} ({', '.join(names)})", entry.label, theirs, *errors, seconds, entry.why])
     columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published"]
     return markdown_table([*columns, "why they differ"], rows)
 
@@ -412,17 +392,10 @@ def ends() -> str:
         for label, printed in zip((ENKF, FKF), PRINTED_PATHS[result.path][:2], strict=True):
             names = list(printed.final_percent)
             columns = [POSE.index(name) for name in names]
-            ours = [
-                _row(
-                    100
-                    * getattr(result.scores[label], field)[:, columns].mean(axis=0)
-                    / np.abs(result.end[columns])
-                )
-                for field in ("planar_end", "full_end")
-            ]
-            rows.append(
-                [f"{result.path} ({', '.join(names)})", label, _row(printed.final_percent.values()), *ours]
-            )
+            fields = (getattr(result.scores[label], field)[:, columns] for field in ("planar_end", "full_end"))
+            ours = [_row(100 * errors.mean(axis=0) / np.abs(result.end[columns])) for errors in fields]
+            theirs = _row(printed.final_percent.values())
+            rows.append([f"{result.path} ({', '.join(names)})", label, theirs, *ours])
     return markdown_table(["path", "", "published", "by yaw alone", "full"], rows)
 
 
@@ -456,21 +429,13 @@ def _velocities(result: PathResult, base: str = "") -> str:
 
 
 def _ratio(scores: Scores, base: Scores) -> str:
-    return (
-        ""
-        if scores is base or np.isnan(scores.full).any()
-        else with_interval(position_ratio(scores, base, "full"))
-    )
+    if scores is base or np.isnan(scores.full).any():
+        return ""
+    return with_interval(position_ratio(scores, base, "full"))
 
 
 def _of_vehicle() -> list[PathResult]:
     return [result for result in results("ngatini2017") if result.world == "vehicle"]
-
-
-def _printed(paper: str, path: str, label: str) -> PrintedRow | None:
-    return next(
-        entry.printed for entry in findings(paper, results(paper)) if (entry.path, entry.label) == (path, label)
-    )
 
 
 def _row(values: Iterable[float]) -> str:
