@@ -17,7 +17,7 @@ import math
 import tuning
 from filters import EstimateState, StateSpaceModel
 from tuning.problems.env_problem import EnvProblem
-from tuning.problems.scenario import Steps
+from tuning.problems.excitation import Steps
 
 TRIALS = 25
 DT = 0.05  # [s]

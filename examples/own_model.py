@@ -24,8 +24,8 @@ import numpy as np
 
 import tuning
 from filters import StateSpaceModel, make_filter
+from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.scenario import Steps
 
 TRIALS = 25
 SEEDS = 50

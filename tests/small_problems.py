@@ -3,8 +3,8 @@
 import numpy as np
 
 from tests.models import wide_model
+from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.scenario import Steps
 from tuning.thruster.scenario import find_scenario
 
 UNITS = {"states": ["p", ("q", "q", "m"), "r"], "measurements": [("one", "a", "N"), "b"]}

@@ -35,7 +35,7 @@ from thruster_env.thruster.parameters import PRESETS
 from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP
-from tuning.problems.scenario import held_levels
+from tuning.problems.excitation import held_levels
 
 SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
 PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}

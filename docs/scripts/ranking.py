@@ -25,10 +25,10 @@ from thruster_env.model.simulate import simulate
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.experiments import mixed_linear
 from tuning.problems.data import held_out_seeds
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.problems.scenario import Steps
 from tuning.reporting.error_tables import unless_blank
 from tuning.search.parameters import KALMAN_SIZES, ensemble_sizes_of
 from tuning.thruster.scenario import SCENARIOS, find_scenario

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tuning.problems.find import PLANT_PACKAGES
+from tuning.problems.plant_packages import PLANT_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = "thruster_env", "filters", "tuning"  # a floor knows those before it

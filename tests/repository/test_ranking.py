@@ -13,7 +13,7 @@ from filters.registry import FILTERS
 from thruster_env.core.text_tables import with_tables
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.data import held_out_seeds
-from tuning.problems.scenario import EXCITATIONS
+from tuning.problems.excitation import EXCITATIONS
 from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 

@@ -12,7 +12,7 @@ from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from tuning.cli import evaluate as consistency
-from tuning.cli.output import choice_table
+from tuning.cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison

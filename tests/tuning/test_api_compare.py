@@ -22,9 +22,9 @@ from tuning.evaluation.compare import default_filters
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.knowledge import KNOWS, known
 from tuning.evaluation.residuals import model_error
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.scenario import Steps
 from tuning.reporting.leaderboard import as_json as boards_as_json
 from tuning.search.plan import Plan
 from tuning.search.space import given_choice

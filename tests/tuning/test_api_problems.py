@@ -20,9 +20,9 @@ from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.api.problems import problem_of, problems_of
 from tuning.problems.assumed import may_estimate_constants
+from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.scenario import Dwells, Levels, MultiSine, Steps
 
 
 def cart(dt=0.1):

@@ -19,8 +19,8 @@ from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem, RunsProblem
-from tuning.problems.scenario import Steps
 from tuning.search import trials as tuning_trials
 from tuning.search.among_types import (
     ESTIMATED,

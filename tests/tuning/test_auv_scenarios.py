@@ -15,8 +15,8 @@ from tuning.auv.scenario import SAILING, SCENARIOS, computed_scale, find_scenari
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.check import checked_problem
+from tuning.problems.excitation import EXCITATIONS, Levels
 from tuning.problems.find import find_problem, scenario_of
-from tuning.problems.scenario import EXCITATIONS, Levels
 
 
 def short(name, **changes):

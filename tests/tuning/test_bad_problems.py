@@ -11,10 +11,10 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.run import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
-from tuning.problems.scenario import Steps
 from tuning.search.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -17,8 +17,8 @@ from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify, validate
 from tuning.identification.starts import starts_of
 from tuning.problems.data import Data
+from tuning.problems.excitation import held_levels
 from tuning.problems.parameter import Parameter
-from tuning.problems.scenario import held_levels
 from tuning.thruster.logs import ThrusterFamily
 
 OWN = ("motor_damping", "voltage_gain", "lift_coefficient")

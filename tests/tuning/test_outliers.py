@@ -70,10 +70,10 @@ def test_a_mean_nis_that_a_burst_carries_is_said_with_log_times_and_channel(logs
     problem, clean = LogProblem(dirty, MODEL), LogProblem(logs, MODEL)
     assert uneven_nis(with_r(1.0).filter(clean), clean) is None
     uneven = uneven_nis(with_r(8.0).filter(problem), problem)
-    assert uneven.mean > 0.7 and uneven.rest < 0.25 and uneven.count <= 4 and uneven.blocks >= 70
+    assert uneven.mean > 0.7 and uneven.rest < 0.25 and uneven.carrying <= 4 and uneven.blocks >= 70
     said = uneven_sentence(uneven, 1)
     assert (
-        f"{uneven.count} of {uneven.blocks} blocks carry the mean NIS" in said
+        f"{uneven.carrying} of {uneven.blocks} blocks carry the mean NIS" in said
         and "are of z_1, in run0 from 60" in said
     )
     assert "so that R or Q is too large for the others" in said and "--outliers missing" in said

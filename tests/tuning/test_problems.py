@@ -19,8 +19,8 @@ from tuning.likelihood.family import Family
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
+from tuning.problems.excitation import BinarySequence, MultiSine
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.scenario import BinarySequence, MultiSine
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters, parameters_of, untuned_choice
 

@@ -23,8 +23,8 @@ from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.problems.data import held_out_seeds, training_seeds
+from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.scenario import Steps
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import oracle_choice, untuned_choice

@@ -4,7 +4,7 @@ import pytest
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.problems.scenario import BinarySequence, Steps
+from tuning.problems.excitation import BinarySequence, Steps
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult

@@ -30,10 +30,10 @@ from tuning.evaluation.baselines import (
     scaled_default,
 )
 from tuning.evaluation.tuned import read_tuned
+from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
-from tuning.problems.scenario import Steps
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.units import apart
 from tuning.search import validation

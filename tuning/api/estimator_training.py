@@ -20,7 +20,7 @@ from tuning.evaluation.baselines import ORACLE
 from tuning.learning.training import HELD_OUT, LONGER, NOISIER, Check, Standing
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Table as PageTable
-from tuning.reporting.report import write_training_report
+from tuning.reporting.training_report import write_training_report
 
 if TYPE_CHECKING:
     import pandas

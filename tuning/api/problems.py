@@ -12,7 +12,8 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.modules import is_code
 from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
-from tuning.problems.find import built_in, find_problem, logs_package, named
+from tuning.problems.find import find_problem, named
+from tuning.problems.plant_packages import built_in, logs_package
 from tuning.problems.problem import Problem
 
 RULE = (

@@ -30,7 +30,7 @@ from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, fin
 from tuning.methods.task import Budget, Refused, Task
 from tuning.problems.assumed import AssumedProblem, within
 from tuning.problems.data import Data
-from tuning.problems.find import built_in
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
 from tuning.search.compiling import compile_filters

@@ -39,9 +39,10 @@ from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import set_field
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
+from tuning.problems.excitation import EXCITATIONS, Excitation, Levels
 from tuning.problems.find import find_in
 from tuning.problems.problem import GIVEN, PATH_BOUND
-from tuning.problems.scenario import EXCITATIONS, BaseScenario, Excitation, Levels, plain
+from tuning.problems.scenario import BaseScenario, plain
 
 # Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers.
 

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from tuning.cli.output import printed_whole
+from tuning.cli.printing import printed_whole
 
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),

@@ -14,12 +14,14 @@ from filters.registry import FILTERS, filter_type
 from thruster_env.core.checks import at_least
 from tuning.api.compare import INTERRUPTED, left_out_lines, run_comparison
 from tuning.cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
-from tuning.cli.output import PROBLEMS, announce_compilation, emit, progress_console
+from tuning.cli.output import announce_compilation, emit, progress_console
+from tuning.cli.problems import PROBLEMS
 from tuning.evaluation.compare import DEFAULT_FILTERS, MOST_STATES
 from tuning.evaluation.knowledge import KNOWS
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.assumed import unknown_in
-from tuning.problems.find import built_in, find_problem
+from tuning.problems.find import find_problem
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS

@@ -31,15 +31,9 @@ from tuning.cli.options import (
     filter_option,
     one_file,
 )
-from tuning.cli.output import (
-    PROBLEMS,
-    announce_compilation,
-    check_picture,
-    choice_table,
-    emit,
-    progress_console,
-    working,
-)
+from tuning.cli.output import announce_compilation, check_picture, emit, progress_console, working
+from tuning.cli.problems import PROBLEMS
+from tuning.cli.tables import choice_table
 from tuning.evaluation.baselines import GIVEN, ORACLE, TUNED, given_noise
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison

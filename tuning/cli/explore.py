@@ -25,7 +25,8 @@ from tuning.cli.options import (
     SeedOption,
     filter_option,
 )
-from tuning.cli.output import PROBLEMS, announce_compilation, working
+from tuning.cli.output import announce_compilation, working
+from tuning.cli.problems import PROBLEMS
 from tuning.exploring.bench import Bench
 from tuning.search.storage import is_alive
 

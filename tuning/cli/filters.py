@@ -19,7 +19,8 @@ from filters.filter import Filter
 from filters.registry import FILTERS, filter_type
 from thruster_env.core.text_tables import console, table
 from tuning.cli.options import INPUT, JsonOption, spelt
-from tuning.cli.output import PROBLEMS, emit
+from tuning.cli.output import emit
+from tuning.cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES

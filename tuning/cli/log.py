@@ -31,9 +31,10 @@ from tuning.cli.options import (
     OUTPUT,
     JsonOption,
 )
-from tuning.cli.output import check_picture, check_targets, emit, printed_whole
+from tuning.cli.output import check_picture, check_targets, emit
+from tuning.cli.printing import printed_whole
 from tuning.logs.read import read_named
-from tuning.problems.find import logs_package
+from tuning.problems.plant_packages import logs_package
 
 # What `thruster log` shows of a recorder's file: its topics and their fields.
 

@@ -39,7 +39,7 @@ from tuning.cli.options import (
 )
 from tuning.cli.output import announce_compilation, check_targets, emit, progress_console, warn_beyond
 from tuning.problems.data import held_out_seeds
-from tuning.problems.scenario import EXCITATIONS, excitation_of
+from tuning.problems.excitation import EXCITATIONS, excitation_of
 from tuning.thruster.scenario import voltages_of
 
 STEPS = 500

@@ -16,7 +16,7 @@ from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MEASUREMENT_NOISE, D
 from thruster_env.thruster.simulation import simulate
 from tuning.cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
 from tuning.cli.output import announce_compilation, check_targets, emit, warn_beyond
-from tuning.problems.scenario import held_levels
+from tuning.problems.excitation import held_levels
 
 MOST_STEPS = 10_000_000  # which take a gigabyte
 TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")

@@ -12,7 +12,8 @@ from rich.console import RenderableType
 from tuning.api.train_estimator import DEFAULT, FOLDER, train_estimator
 from tuning.api.train_estimator import RUNS as TRAINING_RUNS
 from tuning.cli.options import FILTER, INPUT, LEARNING, OUTPUT, RUNS, JsonOption, OfPresetOption, SeedOption
-from tuning.cli.output import PROBLEMS, announce_compilation, check_targets, emit
+from tuning.cli.output import announce_compilation, check_targets, emit
+from tuning.cli.problems import PROBLEMS
 from tuning.search.plan import HELD_OUT_SEEDS
 
 PAGE = ".html"  # the end of a page's name

@@ -22,7 +22,8 @@ from tuning.cli.options import (
     filter_option,
     spelt,
 )
-from tuning.cli.output import PROBLEMS, announce_compilation, check_targets, emit, progress_console
+from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
+from tuning.cli.problems import PROBLEMS
 from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.tuned import check_keepable
 from tuning.methods.registry import DEFAULT, METHODS

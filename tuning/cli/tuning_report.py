@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from filters.consistency.intervals import slightly, span
 from thruster_env.core.modules import is_code
 from tuning.api.run import Tuning
-from tuning.cli.output import choice_table, front_table, gradient_table, kinds_table
+from tuning.cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -35,7 +35,7 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.assumed import within
-from tuning.problems.find import built_in
+from tuning.problems.plant_packages import built_in
 from tuning.reporting.choice_words import consistency_sentence, gains, model_doubts, residual_sentences
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.units import apart

@@ -6,7 +6,7 @@ the tuned filter still looks right, because the burst makes up for what is too s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,12 +40,12 @@ class Tails(NamedTuple):
 
     share: float
     p_value: float
-    count: int  # of those beyond, over the length of their clusters
+    clusters: int  # of those beyond: their number over the length of a cluster
 
     @property
     def are_heavy(self) -> bool:
         """Whether they are heavier than normal ones: not by chance, and by more than matters."""
-        enough = self.count >= FEWEST and self.share > LEAST_SHARE * NORMAL_SHARE
+        enough = self.clusters >= FEWEST and self.share > LEAST_SHARE * NORMAL_SHARE
         return enough and self.p_value < LEVEL
 
 
@@ -82,7 +82,7 @@ def heavy_tails(residuals: np.ndarray, names: Sequence[str]) -> dict[str, float]
     return {name: part.share for name, part in tails.items() if part.are_heavy}
 
 
-def tails_in_words(shares: dict[str, float]) -> str:
+def tails_in_words(shares: Mapping[str, float]) -> str:
     """Shares of residuals beyond four robust deviations, and that of normal ones."""
     parts = [f"{100 * share:.2g} % of {name}" for name, share in shares.items()]
     return f"{', '.join(parts)} lie beyond four robust standard deviations, where 0.006 % is right"
@@ -115,7 +115,7 @@ class UnevenNis(NamedTuple):
     Attributes:
         mean: over the number of channels, of all blocks.
         rest: the same without the blocks that stand out.
-        count: of the blocks that stand out ...
+        carrying: of the blocks that stand out ...
         blocks: ... among so many.
         channel: symbol of the measurement with the largest innovations there.
         spans: logs and times of these innovations, the worst first, in words.
@@ -123,7 +123,7 @@ class UnevenNis(NamedTuple):
 
     mean: float
     rest: float
-    count: int
+    carrying: int
     blocks: int
     channel: str
     spans: tuple[str, ...]
@@ -186,12 +186,12 @@ def _spans(
 
 def uneven_sentence(uneven: UnevenNis, channels: int) -> str:
     """A mean NIS that a few blocks carry, where, and what to do."""
-    blocks = f"{uneven.count} of {uneven.blocks} blocks {'carries' if uneven.count == 1 else 'carry'}"
+    blocks = f"{uneven.carrying} of {uneven.blocks} blocks {'carries' if uneven.carrying == 1 else 'carry'}"
     means = [rounded(channels * mean) for mean in (uneven.mean, uneven.rest)]
     where = f"in {'; '.join(uneven.spans)}" if uneven.spans else "spread over them"
     effect = ", so that R or Q is too large for the others" if uneven.rest < 1.0 / LIFTED else ""
     return (
-        f"{blocks} the mean NIS, {means[0]}; without {'it' if uneven.count == 1 else 'them'} it is {means[1]}, "
+        f"{blocks} the mean NIS, {means[0]}; without {'it' if uneven.carrying == 1 else 'them'} it is {means[1]}, "
         f"where {channels} is right{effect}. The large innovations are of {uneven.channel}, {where}. If that is "
         "garbage, leave it out (--outliers missing, outliers='missing' in Python, where the findings name it; "
         "otherwise make these cells of the log empty), or take --filter ekf-robust."

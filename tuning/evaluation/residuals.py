@@ -107,14 +107,15 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
         q = np.zeros_like(q)
     if not _is_regular(r):
         return Estimated(reason="the measurements have no noise")
-    means = (rows.mean(axis=0) for rows in model_residuals[:2])
+    mean_w, mean_v = (rows.mean(axis=0) for rows in model_residuals[:2])
     names = (
         [f"w of {state.symbol}" for state in model.states],
         [f"v of {channel.symbol}" for channel in model.measurements],
     )
     w, v = (heavy_tails(*pair) for pair in zip(model_residuals[:2], names, strict=True))
-    correlations = (_correlation(rows) for rows in model_residuals[2:])
-    return Estimated(q, r, *means, *correlations, tails={**(w if q.any() else {}), **v})
+    of_w, of_v = (_correlation(rows) for rows in model_residuals[2:])
+    tails = {**(w if q.any() else {}), **v}
+    return Estimated(q, r, mean_w, mean_v, of_w, of_v, tails=tails)
 
 
 @lru_cache(maxsize=16)

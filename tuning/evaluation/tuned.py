@@ -38,7 +38,8 @@ from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.summary import ROLES, comparison_as_data, sizes_as_data, summary, versions
 from tuning.problems.assumed import augmented, name_and_unknown, suited
-from tuning.problems.find import built_in, find_given, find_problem, scenario_of
+from tuning.problems.find import find_given, find_problem, scenario_of
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan

@@ -25,7 +25,7 @@ from thruster_env.thruster.logged import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
 from tuning.identification.identify import identify
 from tuning.identification.result import Identification
-from tuning.problems.scenario import held_levels
+from tuning.problems.excitation import held_levels
 from tuning.thruster.logs import ThrusterFamily
 
 PRESET, SENSORS = "tunnel_physical", ("thrust", "speed")

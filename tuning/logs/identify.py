@@ -18,9 +18,9 @@ from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
 from tuning.logs.problem import runs_by_name, without_rescaled
 from tuning.logs.read import read_named
-from tuning.problems.find import logs_package
 from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.parameter import Parameter
+from tuning.problems.plant_packages import logs_package
 
 EVERY_THIRD = 3
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin

@@ -28,10 +28,10 @@ from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.check import average_bound, check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step, estimates_in_parts
 from tuning.problems.digest import digest_of
+from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import BOUND, OPEN_LOOP
-from tuning.problems.scenario import Excitation, excitation_of
 
 SCALE_SEEDS = range(200)  # seeds of the inputs for which the scale is the bound, where none is given
 Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None

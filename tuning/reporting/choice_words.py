@@ -23,7 +23,7 @@ from tuning.evaluation.regression import is_far_below
 from tuning.evaluation.residuals import noise_estimation
 from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
 from tuning.problems.assumed import may_estimate_constants, within
-from tuning.problems.find import logs_package
+from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Problem
 from tuning.search.measures import LEVEL
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, NIS_BAND, PROPER, nis_ratio

@@ -1,22 +1,15 @@
-"""The report of a tuning: one page with all results, and its tables as Markdown.
-
-The report of a trained estimator: scores on held-out, longer and noisier runs, its training, and one run.
-"""
+"""The report of a tuning: one page with all results, and its tables as Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from matplotlib.figure import Figure
-
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from filters.filter import Filter
 from filters.registry import filter_type
 from thruster_env.core.files import check_target, write_whole
 from tuning.evaluation.evaluate import evaluate, likelihood_gain, score_ratio
@@ -24,13 +17,10 @@ from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.summary import stored_comparison, stored_sizes
 from tuning.likelihood.identifiability import identify, sentences, too_many
-from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
-from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page, of_estimates
+from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.search_figures import Sketchbook
 from tuning.reporting.sections import (
-    AXES,
-    READ,
     advice,
     facts_section,
     held_out_section,
@@ -43,7 +33,6 @@ from tuning.reporting.sections import (
 )
 from tuning.reporting.subject import Subject, find_subject, is_file
 from tuning.reporting.tables import errors_table, known_table, numbers_table
-from tuning.reporting.time_figures import draw_estimates
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import at_ends
 from tuning.search.trials import measure
@@ -277,40 +266,3 @@ def _value(interval: Interval | None) -> str:
     if interval.low == interval.high:
         return rounded(interval.value)
     return f"{rounded(interval.value)} [{rounded(interval.low)}, {rounded(interval.high)}]"
-
-
-def write_training_report(
-    page: str | Path,
-    title: str,
-    advice: Sequence[str],
-    table: Table,
-    training: Figure,
-    pair: Mapping[str, Filter],
-    problem: Problem,
-    seed: int,
-) -> Path:
-    """Write a page on a trained estimator.
-
-    Args:
-        page: the .html file.
-        title: of the page.
-        advice: its summary.
-        table: scores of all filters.
-        training: picture of the checks.
-        pair: the first filter and the estimator, for a picture of one run.
-        problem: on whose runs it was trained.
-        seed: of a held-out run.
-    """
-    book, data, dt = Sketchbook(), data_of(problem, [seed]), problem.dt
-    scored = np.flatnonzero(np.isfinite(problem.scale or ())).tolist()
-    where = f"{problem.name}, held-out {problem.seed_word.removesuffix('s')} {seed}"
-    caption = f"Truth, estimate and 95 % band, if there is a covariance, on {where}. {AXES} {READ}"
-    run = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, of_estimates(pair, data, 0, dt))
-    course = book.picture(training, "Scores of validation runs during the training.", "The score falls.")
-    sections = [
-        Section("Held-out runs", [table, Words(advice)]),
-        Section("The training", [course]),
-        Section("One run over time", [run]),
-    ]
-    write_whole(page, html_page(title, advice, sections))
-    return Path(page)

@@ -24,8 +24,8 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.summary import versions
 from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
 from tuning.problems.assumed import within
-from tuning.problems.find import built_in
 from tuning.problems.log_problem import LogProblem
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem, score_label
 from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
 from tuning.reporting.matlab import matlab_function

@@ -47,17 +47,10 @@ from thruster_env.thruster.simulation import NEXT_REFERENCE, READINGS, Copies, s
 from thruster_env.thruster.task import Task
 from tuning.problems.check import average_bound
 from tuning.problems.data import Data
+from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Excitation, MultiSine
 from tuning.problems.find import find_in
 from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
-from tuning.problems.scenario import (
-    EXCITATIONS,
-    BaseScenario,
-    BinarySequence,
-    Dwells,
-    Excitation,
-    MultiSine,
-    plain,
-)
+from tuning.problems.scenario import BaseScenario, plain
 
 # Voltages of the thruster's scenarios: any excitation of one input, and the closed loop that only it has.
 

@@ -47,7 +47,7 @@ class Recorded:
         self.is_timed = TIME in named  # by a vector for all fields, in place of those beside them
         while True:
             read_units = {name: _unit(name, samples) for name, samples in self.samples.items()}
-            unit_of = {name: unit for name, unit in read_units.items() if unit is not None} | units
+            unit_of = {name: unit for name, unit in read_units.items() if unit is not None} | dict(units)
             file_units = {name: samples.unit for name, samples in self.samples.items() if samples.unit}
             try:
                 columns = find_columns(wanted, [*self.samples], named, unit_of, str(self.path), needs_time)
@@ -62,7 +62,7 @@ class Recorded:
         """Whether all columns but that of times have times of their own."""
         return all(self.samples[column.header].times is not None for key, column in columns.items() if key != TIME)
 
-    def table(self, columns: Mapping[str, Column]) -> tuple[Table, dict[str, Column]]:
+    def table(self, columns: Mapping[str, Column]) -> tuple[Table, Mapping[str, Column]]:
         """The rows of a log and their columns: at the times of all samples, from when all inputs are known.
 
         The measurement with most samples gives the grid: the log begins and ends with it. Before it, an input's

@@ -267,7 +267,7 @@ def main() -> None:
             values = np.ascontiguousarray(read(int(line)))
             description, data = {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]}, b""
             if values.dtype.kind in SENT:
-                description, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
+                description, data = {"dtype": values.dtype.str}, values.tobytes()
         except Exception as error:
             answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         else:

@@ -14,10 +14,10 @@ from tuning.experiments.benchmark import noise_free_problem
 from tuning.experiments.lidar import drawn, lidar_problem
 from tuning.experiments.pendulum import model as pendulum
 from tuning.methods.registry import ALONE
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.problems.scenario import Steps
 
 NOTHING: Mapping[str, bool] = {}
 FULL: Mapping[str, bool] = {"full_q": True, "full_r": True}
