@@ -75,8 +75,8 @@ class Recorded:
         Raises:
             ValueError: if a field has no times, or they run backwards, or inputs and measurements do not overlap.
         """
-        if not self.is_timed and self.has_times(columns):
-            columns = {key: column for key, column in columns.items() if key != TIME}
+        without_time = {key: column for key, column in columns.items() if key != TIME}
+        columns = without_time if not self.is_timed and self.has_times(columns) else dict(columns)
         fields = {column.header: self.samples[column.header] for column in columns.values()}
         choice = chosen_clock({name: samples.clocked for name, samples in fields.items()}, self.stamps, self.path)
         fields = {name: samples.by(choice.clock) for name, samples in fields.items()}

@@ -265,9 +265,13 @@ def main() -> None:
     for line in sys.stdin:
         try:
             values = np.ascontiguousarray(read(int(line)))
-            description, data = {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]}, b""
             if values.dtype.kind in SENT:
-                description, data = {"dtype": values.dtype.str}, values.tobytes()
+                description, data = {"dtype": values.dtype.str}, values.reshape(-1).view(np.uint8).data
+            else:
+                description, data = (
+                    {"texts": [str(cell)[:LONGEST] for cell in values.reshape(-1)]},
+                    memoryview(b""),
+                )
         except Exception as error:
             answer({"error": _line(error), "is_memory": isinstance(error, MemoryError)})
         else:
