@@ -169,8 +169,8 @@ def _damage(
     rest = set(content[len(content) - after :].tolist()) if 0 < after < LONGEST else set()
     is_rest = rest in (set(), {0}, {255})
     nameless = sum(len(kind_offsets) for kind, kind_offsets in enumerate(offsets) if kind not in formats)
-    places = f"{hole_count} place{'s' * (hole_count != 1)}"
-    texts = [f"{lost} bytes in {places} of the log belong to no message"] * (lost > 0)
+    location = f"{hole_count} place{'s' * (hole_count != 1)}"
+    texts = [f"{lost} bytes in {location} of the log belong to no message"] * (lost > 0)
     texts += [f"the format of {name!r} is not as long as its messages" for name in unlike]
     texts += [f"the format of {name!r} has not as many names as numbers" for name in unnamed]
     texts += [f"{nameless} messages of the log have no format"] * (nameless > 0)
